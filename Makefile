@@ -1,0 +1,42 @@
+# Everything runs from a clean clone: the first target that needs it makes .venv with the pinned versions.
+PYTHON ?= python3
+VENV   := .venv
+BIN    := $(VENV)/bin
+PIP    := $(BIN)/pip --disable-pip-version-check install --quiet -c constraints.txt
+WORKERS ?= 2
+
+.PHONY: demo test test-all bench lint format clean
+.DELETE_ON_ERROR:
+
+$(VENV)/.core: pyproject.toml constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(PIP) -e .
+	touch $@
+
+$(VENV)/.test: $(VENV)/.core
+	$(PIP) -e '.[recon,test]'
+	touch $@
+
+demo: $(VENV)/.core  ## simulate, match and synchronise a small world; writes demo/
+	$(BIN)/otsync demo --out demo
+
+test: $(VENV)/.test lint  ## under ten minutes on two cores
+	$(BIN)/python -m pytest -n $(WORKERS) -m "not slow"
+
+test-all: $(VENV)/.test lint  ## every test, the slow ones too
+	$(BIN)/python -m pytest -n $(WORKERS)
+
+bench: $(VENV)/.test  ## what is timed; writes bench/out/
+	$(BIN)/otsync bench all --out bench/out
+
+lint: $(VENV)/.test
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: $(VENV)/.test
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info demo bench/out
