@@ -9,12 +9,13 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any
 
 import numba as nb
 import numpy as np
 
-_JIT = {"nogil": True, "cache": True, "error_model": "numpy"}
+_jit = partial(nb.njit, nogil=True, cache=True, error_model="numpy")
 
 
 def over_blocks(work: Callable[..., Any], blocks: Iterable[Any], threads: int | None = None) -> None:
@@ -29,7 +30,7 @@ def over_blocks(work: Callable[..., Any], blocks: Iterable[Any], threads: int | 
         list(pool.map(work, blocks))
 
 
-@nb.njit(fastmath={"contract", "reassoc", "nsz"}, **_JIT)
+@_jit(fastmath={"contract", "reassoc", "nsz"})
 def max_distance_block(a, b, wa, wb, gaps, i0, i1, j0, j1, out):
     """D_track of rows i0:i1 of ``a`` against columns j0:j1 of ``b``.
 
@@ -63,7 +64,7 @@ def max_distance_block(a, b, wa, wb, gaps, i0, i1, j0, j1, out):
             out[i0 + i, j0 + j] = np.nan if gaps and met[i, j] == 0 else np.sqrt(best[i, j])
 
 
-@nb.njit(**_JIT)
+@_jit()
 def open_end_path(cost, level):
     """Warping path with free ends: from the first row or column to the last row or column.
 

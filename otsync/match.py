@@ -177,8 +177,9 @@ class EntropicFGW:
         if problem.flat:
             return no_information(problem.M)
         plan = np.outer(problem.p, problem.q)
-        reg, failed, k = max(0.1, self.reg), False, 0
-        for k in range(1, self.max_iter + 1):
+        reg, failed, iterations = max(0.1, self.reg), False, 0
+        while iterations < self.max_iter:
+            iterations += 1
             cost = problem.gradient(plan)
             after, _, failed = sinkhorn(problem.p, problem.q, cost, reg * max(float(np.ptp(cost)), FLAT))
             change = float(np.abs(after - plan).sum())
@@ -186,7 +187,7 @@ class EntropicFGW:
             if reg == self.reg and (change < self.tol or failed):
                 break
             reg = max(self.reg, 0.7 * reg)
-        return problem.matches(plan, k, failed=failed)
+        return problem.matches(plan, iterations, failed=failed)
 
 
 @dataclass(frozen=True)
@@ -291,7 +292,7 @@ def normalised_structure(a: TrackSet, b: TrackSet) -> tuple[Float[np.ndarray, "N
     The median, never the maximum: one track 50 times too far away would wipe the structure out.
     """
     assert a.xyz is not None and b.xyz is not None
-    raw = [track_distance(s.xyz, s.seen) for s in (a, b)]
+    raw = [track_distance(a.xyz, a.seen), track_distance(b.xyz, b.seen)]
     known = [d[np.isfinite(d) & (d > 0)] for d in raw]
     median = float(np.median([np.median(k) for k in known if k.size])) if any(k.size for k in known) else 1.0
     Ca, Cb = (fill_unseen(d).astype(float) / median for d in raw)
