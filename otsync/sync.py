@@ -51,8 +51,8 @@ def synchronize(
         given = given_matches(matches, (reference, v), tracks)
         if matches is None or given is not None:
             jobs.append(Job((reference, v), tracks[reference], tracks[v], matcher, aligner, refiner, given))
-    alignments = dict(map(run, jobs))
-    return star(tracks, reference, alignments, time.perf_counter() - started)
+    answers = list(map(run, jobs))
+    return star(tracks, reference, answers, time.perf_counter() - started)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,23 +68,29 @@ class Job:
     matches: Matches | None
 
 
-def run(job: Job) -> tuple[Pair, Alignment]:
+def run(job: Job) -> tuple[Pair, Matches, Alignment]:
     """Match, align and refine one pair. An exception becomes the status FAILED, told in the log."""
+    matches = Matches(np.zeros((0, 2), int), status=Status.FAILED, flags=(Status.FAILED,))
     try:
-        matches = job.matches if job.matches is not None else match(job.a, job.b, job.matcher, throw=False)
+        found_matches = job.matches if job.matches is not None else match(job.a, job.b, job.matcher, throw=False)
+        matches = found_matches.without_plan()
         if not matches.status.ok:
-            return job.pair, Alignment(float("nan"), status=matches.status, flags=matches.flags, stats=matches.stats)
+            failed = Alignment(float("nan"), status=matches.status, flags=matches.flags, stats=matches.stats)
+            return job.pair, matches, failed
         found = align(job.a, job.b, matches, job.aligner, throw=False)
         if job.refiner is not None and np.isfinite(found.offset):
             found = refine(job.a, job.b, matches, found, job.refiner, throw=False)
-        return job.pair, found
+        return job.pair, matches, found
     except Exception as error:
         log.warning("pair %s: %s: %s", job.pair, type(error).__name__, error)
-        return job.pair, Alignment(float("nan"), status=Status.FAILED, flags=(Status.FAILED,))
+        return job.pair, matches, Alignment(float("nan"), status=Status.FAILED, flags=(Status.FAILED,))
 
 
-def star(tracks: Sequence[TrackSet], reference: int, alignments: dict[Pair, Alignment], seconds: float) -> Offsets:
+def star(
+    tracks: Sequence[TrackSet], reference: int, answers: list[tuple[Pair, Matches, Alignment]], seconds: float
+) -> Offsets:
     """Every video's offset is its pair's with the reference."""
+    alignments = {pair: alignment for pair, _, alignment in answers}
     V = len(tracks)
     offset, rate, sigma = np.full(V, np.nan), np.ones(V), np.full(V, np.nan)
     offset[reference] = sigma[reference] = 0.0
@@ -109,6 +115,7 @@ def star(tracks: Sequence[TrackSet], reference: int, alignments: dict[Pair, Alig
         status=tuple(status),
         flags=tuple(flags),
         alignments=alignments,
+        matches={pair: matches for pair, matches, _ in answers},
         stats={"seconds": seconds, "pairs": float(len(alignments))},
     )
 
