@@ -5,9 +5,9 @@ python examples/01_match_tracks.py --n 500
 
 import tyro
 from otsync.metrics import match_quality
-from otsync.simulate import matching_world
 
 from otsync import FusedGromovWasserstein, PartialFGW, match
+from otsync.simulate import matching_world
 
 
 def main(n: int = 500, seed: int = 0) -> None:

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import tyro
 from otsync.metrics import offset_error
-from otsync.simulate import simulate
 
 from otsync import Offsets, synchronize
 from otsync.report import write_report
+from otsync.simulate import simulate
 
 
 def main(

@@ -12,9 +12,9 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 from otsync.metrics import match_quality
-from otsync.simulate import matching_world
 
 from otsync import FusedGromovWasserstein, OptimalTransport, match
+from otsync.simulate import matching_world
 
 MATCHERS = {"features only (EMD)": OptimalTransport(), "fused (FGW)": FusedGromovWasserstein()}
 

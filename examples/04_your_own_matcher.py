@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import tyro
-from otsync.simulate import simulate
 
 from otsync import Matches, OptimalTransport, TrackSet, match, synchronize
+from otsync.simulate import simulate
 
 
 @dataclass(frozen=True)
