@@ -63,12 +63,12 @@ def track_distance(
     same = other is None
     if other is None or other_visible is None:
         other, other_visible = xyz, visible
-    dtype = np.float32 if xyz.dtype == other.dtype == np.float32 else np.float64
+    dtype = np.dtype(np.float32 if xyz.dtype == other.dtype == np.float32 else np.float64)
     gaps = not (visible.all() and other_visible.all())
-    scale = dtype(max(binary_scale(xyz[visible]), binary_scale(other[other_visible])))
+    scale = dtype.type(max(binary_scale(xyz[visible]), binary_scale(other[other_visible])))
 
     def columns(x: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        x = np.where(seen[..., None], x, 0).astype(dtype) / scale
+        x = np.divide(np.where(seen[..., None], x, 0), scale, dtype=dtype)
         return np.ascontiguousarray(x.transpose(2, 1, 0)), np.ascontiguousarray(seen.T).astype(dtype)
 
     a, wa = columns(xyz, visible)

@@ -65,8 +65,8 @@ def existing(path: str | os.PathLike[str]) -> Path:
         return path
     if path.is_dir():
         raise ValueError(f"{path}: expected a file; found a folder.")
-    beside = sorted(p.name for p in path.parent.iterdir())[:8] if path.parent.is_dir() else []
-    hint = f"that folder holds {', '.join(beside)}" if beside else "that folder does not exist or is empty"
+    beside = sorted(p.name for p in path.parent.glob(f"*{path.suffix}"))[:8] if path.parent.is_dir() else []
+    hint = f"beside it lie {', '.join(beside)}" if beside else f"its folder holds no {path.suffix or 'such'} files"
     raise FileNotFoundError(f"{path}: no such file; {hint}. Check the path.")
 
 

@@ -9,12 +9,13 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any
 
 import numba as nb
 import numpy as np
 
-_JIT = {"nogil": True, "cache": True, "error_model": "numpy"}
+_jit = partial(nb.njit, nogil=True, cache=True, error_model="numpy")
 
 
 def over_blocks(work: Callable[..., Any], blocks: Iterable[Any], threads: int | None = None) -> None:
@@ -29,7 +30,7 @@ def over_blocks(work: Callable[..., Any], blocks: Iterable[Any], threads: int | 
         list(pool.map(work, blocks))
 
 
-@nb.njit(fastmath={"contract", "reassoc", "nsz"}, **_JIT)
+@_jit(fastmath={"contract", "reassoc", "nsz"})
 def max_distance_block(a, b, wa, wb, gaps, i0, i1, j0, j1, out):
     """D_track of rows i0:i1 of ``a`` against columns j0:j1 of ``b``.
 
@@ -63,12 +64,14 @@ def max_distance_block(a, b, wa, wb, gaps, i0, i1, j0, j1, out):
             out[i0 + i, j0 + j] = np.nan if gaps and met[i, j] == 0 else np.sqrt(best[i, j])
 
 
-@nb.njit(**_JIT)
+@_jit()
 def open_end_path(cost, level):
     """Warping path with free ends: from the first row or column to the last row or column.
 
     Maximises the sum of ``level - cost`` over a monotone path (semi-global alignment), so that frames outside the
-    overlap cost nothing and a long overlap is worth having. Returns (P,2) frame pairs.
+    overlap cost nothing and a long overlap is worth having. A diagonal step counts twice (Sakoe and Chiba's
+    symmetric form): then a path's weight is the frames it spans, and a staircase gains nothing over a line.
+    Returns (P,2) frame pairs.
     """
     n, m = cost.shape
     total = np.empty((n, m))
@@ -77,12 +80,12 @@ def open_end_path(cost, level):
         for j in range(m):
             gain = level - cost[i, j]
             if i > 0 and j > 0:
-                best, move = total[i - 1, j - 1], 1
-                if total[i - 1, j] > best:
-                    best, move = total[i - 1, j], 2
-                if total[i, j - 1] > best:
-                    best, move = total[i, j - 1], 3
-                total[i, j] = best + gain
+                best, move = total[i - 1, j - 1] + 2 * gain, 1
+                if total[i - 1, j] + gain > best:
+                    best, move = total[i - 1, j] + gain, 2
+                if total[i, j - 1] + gain > best:
+                    best, move = total[i, j - 1] + gain, 3
+                total[i, j] = best
                 step[i, j] = move
             else:
                 total[i, j] = gain

@@ -79,6 +79,10 @@ class Matches:
         order = np.argsort(-self.score, kind="stable")[:n]
         return Matches(self.pairs[order], self.score[order], self.plan, self.status, self.flags, self.stats)
 
+    def without_plan(self) -> Matches:
+        """The same matches without the plan, which is as large as both videos' tracks multiplied."""
+        return Matches(self.pairs, self.score, None, self.status, self.flags, self.stats)
+
     def swapped(self) -> Matches:
         """The same matches with a and b exchanged."""
         plan = None if self.plan is None else self.plan.T
@@ -134,7 +138,7 @@ class Offsets:
         reference: index of the video whose clock is the world's.
         component: (V,) index of the video whose clock ``seconds[v]`` refers to. All ``reference`` when the videos
             hang together; a disconnected group has a reference of its own.
-        alignments: per pair (i, j) the pair's own answer.
+        alignments: per pair (i, j) the pair's own answer. matches: what it was made from, without plans.
         status, flags: per video. stats: of the whole.
     """
 
@@ -148,6 +152,7 @@ class Offsets:
     status: tuple[Status, ...]
     flags: tuple[tuple[Status, ...], ...]
     alignments: Mapping[tuple[int, int], Alignment] = field(default_factory=dict)
+    matches: Mapping[tuple[int, int], Matches] = field(default_factory=dict)
     stats: Stats = field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -216,7 +221,7 @@ class Offsets:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Offsets:
-        """Read ``offsets.json``; curves, paths and cost maps are not in the file. ValueError names file and field."""
+        """Read ``offsets.json``; matches, curves, paths and cost maps are not in the file. ValueError names file and field."""
         data = read_json(path)
         if not isinstance(data, dict) or data.get("format") != FORMAT:
             raise ValueError(f"{path}: expected an offsets file written by otsync (format {FORMAT!r}); found another.")
