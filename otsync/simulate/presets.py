@@ -25,10 +25,9 @@ class Preset:
     wrong: float
     matches: int
 
-    @property
-    def tracks(self) -> int:
-        """Tracks a video: a few more than are matched."""
-        return round(1.4 * self.matches)
+    def tracks(self, figures: int) -> int:
+        """Tracks a video: enough that ``matches`` of them have a partner on the same limb, seen from the other side."""
+        return round((1.6 if figures < 2 else 2.4) * self.matches)
 
 
 def _tracker(bias: float, drift: float, jitter: float, lateral: float, slide: float) -> tuple[e.Effect, ...]:
