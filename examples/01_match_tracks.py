@@ -4,9 +4,9 @@ python examples/01_match_tracks.py --n 500
 """
 
 import tyro
-from otsync.metrics import match_quality
 
 from otsync import FusedGromovWasserstein, PartialFGW, match
+from otsync.metrics import match_quality
 from otsync.simulate import matching_world
 
 

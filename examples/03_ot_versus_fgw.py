@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import tyro
 from matplotlib.figure import Figure
-from otsync.metrics import match_quality
 
 from otsync import FusedGromovWasserstein, OptimalTransport, match
+from otsync.metrics import match_quality
 from otsync.simulate import matching_world
 
 MATCHERS = {"features only (EMD)": OptimalTransport(), "fused (FGW)": FusedGromovWasserstein()}

@@ -11,6 +11,7 @@ from ..align import DTW, Aligner, ConstantShift, align
 from ..match import FusedGromovWasserstein, Matcher, OptimalTransport, match
 from ..metrics import match_quality
 from ..simulate import matching_world, simulate
+from . import record
 from .record import run_python, table, write_rows
 
 CLASSES = ("boxes", "juggle", "softball", "tennis", "basketball", "football")
@@ -24,8 +25,20 @@ ALIGNERS: dict[str, Aligner] = {
 }
 
 
-def run(out: Path, *, n: int = 2000, worlds: int = 3, seeds: int = 5, first_seed: int = 7000) -> int:
-    """Measure everything, print the tables, write CSV and JSON; seeds start at ``first_seed`` (nothing is tuned on them)."""
+def run(
+    out: Path,
+    *,
+    n: int = 2000,
+    worlds: int = 3,
+    seeds: int = 5,
+    first_seed: int = 7000,
+    gate: bool = False,
+    rebase: bool = False,
+) -> int:
+    """Measure everything, print the tables, write CSV and JSON; seeds start at ``first_seed`` (nothing is tuned on them).
+
+    ``gate``: compare with the committed baseline, 1 when something got worse. ``rebase``: make this the baseline.
+    """
     ablation = matching_ablation(n, range(first_seed, first_seed + worlds))
     print(f"Features alone against fused, N = {n}, mean of {worlds} fresh worlds:\n{table(ablation)}\n")
     write_rows(out, "core_matching", ablation, {"n": n, "seeds": worlds, "first_seed": first_seed})
@@ -37,10 +50,22 @@ def run(out: Path, *, n: int = 2000, worlds: int = 3, seeds: int = 5, first_seed
     timing = [import_time(), *no_effect_time()]
     print(table(timing))
     write_rows(out, "core_timing", timing)
-    return 0
+    figures = {
+        "p50_gain": ablation[1]["p50"] - ablation[0]["p50"],
+        "flips_ratio": ablation[1]["flips"] / ablation[0]["flips"],
+        "dtw_clean_median": next(r for r in summary if r["preset"] == "clean")["median"],
+    }
+    if rebase:
+        record.save_baseline("core", figures)
+    return record.gate("core", figures, worse) if gate else 0
 
 
-def matching_ablation(n: int, seeds: range) -> list[dict[str, object]]:
+def worse(key: str, measured: float, baseline: float) -> bool:
+    """Accuracy may vary by .03 between platforms' roundings, ratios and medians by a fifth."""
+    return measured < baseline - 0.03 if key == "p50_gain" else measured > 1.2 * baseline
+
+
+def matching_ablation(n: int, seeds: range) -> list[dict]:
     """Mean quality of each matcher over the same worlds, in the feature model of the design."""
     rows = []
     worlds = [matching_world(n, seed=seed) for seed in seeds]
@@ -99,13 +124,13 @@ def summarise(rows: list[dict]) -> list[dict]:
     return summary
 
 
-def import_time() -> dict[str, object]:
+def import_time() -> dict:
     """Median seconds of `import otsync` in five fresh interpreters."""
     code = "import time; t = time.perf_counter(); import otsync; print(time.perf_counter() - t)"
     return {"what": "import otsync", "seconds": float(np.median([float(run_python(code)) for _ in range(5)]))}
 
 
-def no_effect_time(repeats: int = 15) -> list[dict[str, object]]:
+def no_effect_time(repeats: int = 15) -> list[dict]:
     """Seconds of a world with all of mid's effects and without any, alternating in one run; medians."""
     spent: dict[str, list[float]] = {"simulate, mid's effects": [], "simulate, effects=()": []}
     for k in range(repeats):
