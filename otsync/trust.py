@@ -35,5 +35,5 @@ class Trust:
     motion: float = 0.02
     moved: float = 2 / 30
     spread: float = 0.5 / 30
-    correlation: float = 0.15
+    correlation: float = 0.45
     rate_sigmas: float = 4.0
