@@ -157,7 +157,7 @@ class RayCompression:
 
 @dataclass(frozen=True)
 class IdentitySwitch:
-    """A ``share`` of the tracks jumps once, to the nearest track of another part, and follows it from then on.
+    """A ``share`` of the tracks jumps once, to some track of another part, and follows that one from then on.
 
     The truth still calls such a track by its first identity.
     """
@@ -166,17 +166,16 @@ class IdentitySwitch:
 
     def __call__(self, obs: Observation, rng: np.random.Generator) -> Observation:
         n, frames = obs.xyz.shape[:2]
-        switched = np.flatnonzero(rng.random(n) < self.share)
-        when = rng.integers(frames // 5, max(frames - frames // 5, frames // 5 + 1), n)[switched]
         part = obs.surface.part
-        there = obs.xyz[:, when].swapaxes(0, 1)  # (S,N,3): everybody at the instant of each switch
-        gap = np.linalg.norm(there - there[np.arange(len(switched)), switched][:, None], axis=2)
-        gap[part[switched][:, None] == part] = np.inf
-        if not len(switched) or not np.isfinite(gap).any(1).all():
-            return obs
+        when = rng.integers(frames // 5, max(frames - frames // 5, frames // 5 + 1), n)
+        order = rng.permutation(n)
         xyz = obs.xyz.copy()
-        for n_, k, to in zip(switched, when, gap.argmin(1), strict=True):
-            xyz[n_, k:] = obs.xyz[to, k:]
+        for i in np.flatnonzero(rng.random(n) < self.share):
+            # the first of another part, from a random place in a random order
+            others = np.roll(order, -i)
+            others = others[part[others] != part[i]]
+            if len(others):
+                xyz[i, when[i] :] = obs.xyz[others[0], when[i] :]
         return replace(obs, xyz=xyz)
 
 
