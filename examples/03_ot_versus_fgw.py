@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import tyro
 from matplotlib.figure import Figure
-from otsync.metrics import match_quality
 
 from otsync import FusedGromovWasserstein, OptimalTransport, match
+from otsync.metrics import match_quality
 from otsync.simulate import matching_world
 
 MATCHERS = {"features only (EMD)": OptimalTransport(), "fused (FGW)": FusedGromovWasserstein()}
@@ -26,7 +26,7 @@ def main(n: int = 1000, seeds: tuple[int, ...] = (0, 1, 2), out: Path = Path("ou
         a, b, truth = matching_world(n, seed=seed)
         for name, matcher in MATCHERS.items():
             found[name] = match(a, b, matcher)
-            rows[name].append(match_quality(found[name], truth, a, b))
+            rows[name].append(match_quality(found[name], truth))
 
     print(f"{n} tracks a video, mean of {len(seeds)} worlds")
     print(f"{'':22}" + "".join(f"{key:>11}" for key in rows["fused (FGW)"][0]))
