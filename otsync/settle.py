@@ -28,6 +28,9 @@ MOVED = 1.5 * FRAME
 ASTRAY = 1.0 * FRAME
 """A pair further than this, and than four sigmas, from the solution is fitted anew from there."""
 
+CONFIRMED = 1.5 * FRAME
+"""Doubtful pairs this close to the solution by themselves confirm it."""
+
 CAPTURED = 3.0 * FRAME
 """The new fit counts when it ends this close to where it began."""
 
@@ -47,7 +50,7 @@ NO_LINK = frozenset(
         Status.FAILED,
     }
 )
-"""A pair with one of these says nothing about time: it links no videos."""
+"""A pair with one of these links no videos by itself."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,11 +104,33 @@ def settle(
         linked = _relocate(linked, x, rates, refit)
         x = _by_component(n, linked, rates, anchor, x)[0]
     by_pair = {a.pair: a for a in answers} | {a.pair: a for a in linked}
-    links = [a for a in linked if lone or not NO_LINK & set(a.refined.flags)]
+    links = linked if lone else _links(n, linked, x, rates)
     chosen = _best_tied(n, links, rates) if reference is None else reference
     x, sigma, component = _by_component(n, links, rates, chosen, None if chosen != anchor else x)
     final = tuple(by_pair[a.pair] for a in answers)
     return _judge(n, final, links, x, sigma, rates, component, chosen, graph, trust)
+
+
+def _links(n: int, answers: list[Answer], x: np.ndarray, rates: np.ndarray) -> list[Answer]:
+    """The pairs that link videos: sound ones, and doubtful ones that confirm each other.
+
+    A doubtful fit alone links nothing. But when most pairs, and at least three, between two groups of videos agree with
+    one solution by themselves, chance did not make them.
+    """
+    sound = [a for a in answers if not NO_LINK & set(a.refined.flags)]
+    group = components(n, [a.pair for a in sound])
+    between: dict[Pair, list[tuple[Answer, bool]]] = {}
+    for a in answers:
+        i, j = sorted((int(group[a.pair[0]]), int(group[a.pair[1]])))
+        if i != j:
+            e = as_edge(a, rates)
+            agrees = "relocated" not in a.refined.stats and abs(x[e.b] - x[e.a] - e.offset) <= CONFIRMED
+            between.setdefault((i, j), []).append((a, agrees))
+    for doubtful in between.values():
+        confirmed = [a for a, agrees in doubtful if agrees]
+        if len(confirmed) >= max(3, len(doubtful) / 2):
+            sound += confirmed
+    return sorted(sound, key=lambda a: a.pair)
 
 
 def as_edge(answer: Answer, rates: np.ndarray) -> Edge:
