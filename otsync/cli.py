@@ -116,6 +116,8 @@ class Match:
 
     def run(self) -> int:
         a, b = TrackSet.load(self.a), TrackSet.load(self.b)
+        if sys.stderr.isatty():  # one solve has no steps to count
+            print(f"matching {len(a)} x {len(b)} tracks ...", file=sys.stderr)
         found = match(a, b, self.matcher, throw=False)
         print(f"{len(found)} matches between {len(a)} and {len(b)} tracks")
         print("  ".join(f"{name} {value:.6g}" for name, value in found.stats.items()))
