@@ -12,7 +12,7 @@ from typing import Literal, Protocol
 
 import numpy as np
 
-from .clock import nominal_fps
+from .clock import nominal_fps, strongest
 from .costs import binary_scale
 from .fit import Clock, Fit, fit_clock, overlap_seconds, velocity_correlation
 from .splines import SMOOTHING, TrackSplines
@@ -86,17 +86,20 @@ class SplineRefine:
         smoothing: of the splines, see :class:`otsync.splines.TrackSplines`.
         rate: ``fixed`` takes the clocks as declared; ``fit`` frees the rate for overlaps of 20 s and more and keeps it
             when it is significant. With ``fixed`` a significant rate on such clips raises RATE_MISMATCH.
+        limit: of more matches only so many are used, the best by score.
         trust: limits behind the flags.
     """
 
     windows: tuple[float, ...] = (20 / 30, 10 / 30, 40 / 30)
     smoothing: float = SMOOTHING
     rate: Literal["fixed", "fit"] = "fixed"
+    limit: int = 500
     trust: Trust = field(default_factory=Trust)
 
     def __call__(self, a: TrackSet, b: TrackSet, matches: Matches, alignment: Alignment) -> Alignment:
         if not math.isfinite(alignment.offset):
             return alignment
+        matches = strongest(matches, self.limit)
         curves = self.splines(a, b, matches)
         start = Clock(alignment.offset, alignment.rate)
         fit = fit_clock(*curves, start, self.windows[0])

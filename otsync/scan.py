@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float, Int
 
-from .clock import CommonClock, common_clock
+from .clock import CommonClock, common_clock, strongest
 from .costs import binary_scale, velocity
 from .splines import TrackSplines
 from .trust import Trust
@@ -52,15 +52,18 @@ class LikelihoodScan:
         max_lag: largest |offset| in seconds; None: whatever leaves ``min_overlap`` seconds in common.
         min_overlap: seconds.
         peaks: how many competing offsets to keep as ``hypotheses``.
+        limit: of more matches only so many are read, the best by score; time is proportional to them.
         trust: limits behind the flags.
     """
 
     max_lag: float | None = None
     min_overlap: float = MIN_OVERLAP
     peaks: int = 5
+    limit: int = 500
     trust: Trust = field(default_factory=Trust)
 
     def __call__(self, a: TrackSet, b: TrackSet, matches: Matches) -> Alignment:
+        matches = strongest(matches, self.limit)
         pair, scale = normalised(common_clock(a, b, matches))
         lags = pair.lags(max(1, round(self.min_overlap * pair.fps)), self.max_lag)
         if len(matches) == 0 or len(lags) == 0:
