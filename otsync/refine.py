@@ -90,7 +90,7 @@ class SplineRefine:
         trust: limits behind the flags.
     """
 
-    windows: tuple[float, ...] = (20 / 30, 10 / 30, 40 / 30)
+    windows: tuple[float, ...] = (14 / 30, 10 / 30, 28 / 30)
     smoothing: float = SMOOTHING
     rate: Literal["fixed", "fit"] = "fixed"
     limit: int = 500
