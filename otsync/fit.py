@@ -96,12 +96,14 @@ class Fit:
     Args:
         clock: the answer. covariance: (P,P) of offset (and rate), jackknifed over matches and over time, the two added.
         weights: (M,) of the matches. iterations: done.
+        blur: rms residual over rms speed, s: how far off a single sample of a typical match tells the time.
     """
 
     clock: Clock
     covariance: Float[np.ndarray, "P P"]
     weights: Float[np.ndarray, " M"]
     iterations: int
+    blur: float
 
     @property
     def effective_matches(self) -> float:
@@ -139,7 +141,7 @@ def fit_clock(
         # from the offset at the centre of the overlap to that at b's time zero
         move = np.array([[1.0, -centre], [0.0, 1.0]])
         covariance = move @ covariance @ move.T
-    return Fit(clock, covariance, system.match_weights, n)
+    return Fit(clock, covariance, system.match_weights, n, system.blur)
 
 
 def _centre(a: TrackSplines, b: TrackSplines, clock: Clock) -> float:
@@ -154,7 +156,7 @@ class System:
 
     Args:
         H, g: (P,P), (P,) the whole. by_match: (M,P,P), (M,P) and by_time: (B,P,P), (B,P) its parts.
-        match_weights: (M,).
+        match_weights: (M,). blur: see :class:`Fit`.
     """
 
     H: Float[np.ndarray, "P P"]
@@ -162,6 +164,7 @@ class System:
     by_match: tuple[np.ndarray, np.ndarray]
     by_time: tuple[np.ndarray, np.ndarray]
     match_weights: Float[np.ndarray, " M"]
+    blur: float
 
     def step(self) -> Float[np.ndarray, " P"]:
         return -np.linalg.solve(_regular(self.H), self.g)
@@ -235,7 +238,11 @@ def _linearise(sides: tuple[Side, Side], clock: Clock, centre: float, fit_rate: 
     group = neighbours(sides[0].own.mean + sides[1].own.mean, GROUPS)
     np.add.at(H_group, group, H_match)
     np.add.at(g_group, group, g_match)
-    return System(H_match.sum(0), g_match.sum(0), (H_group, g_group), (H_time, g_time), weight)
+    noise_power, speed = (
+        sum(float(weight @ x.sum(1)) for x in xs) for xs in ((p[0] for p in parts), (p[2][0, 0] for p in parts))
+    )
+    blur = np.sqrt(noise_power / speed) if speed > 0 else np.inf
+    return System(H_match.sum(0), g_match.sum(0), (H_group, g_group), (H_time, g_time), weight, float(blur))
 
 
 def neighbours(x: Float[np.ndarray, "M 3"], groups: int) -> Int[np.ndarray, " M"]:
@@ -249,8 +256,6 @@ def neighbours(x: Float[np.ndarray, "M 3"], groups: int) -> Int[np.ndarray, " M"
         nearest[d < closest] = k
         closest = np.minimum(closest, d)
     return nearest
-
-
 
 
 def velocity_correlation(a: TrackSplines, b: TrackSplines, fit: Fit, window: float) -> float:

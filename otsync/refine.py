@@ -22,6 +22,10 @@ from .types import Alignment, Matches, Refused, Status, TrackSet, gravest, in_or
 LEAST_SIGMA = 0.02 / 30
 """Seconds; no sigma is reported below this."""
 
+COMMON_ERRORS = 4.0
+"""Seconds; blur²/COMMON_ERRORS joins sigma: errors that whole videos share (drifting depth, limbs, smoothing) grow with
+the square of the noise, and neither residuals nor other windows show them."""
+
 LONG = 600 / 30
 """Seconds of overlap from which a rate can be told from an offset."""
 
@@ -116,6 +120,7 @@ class SplineRefine:
             "effective_matches": fit.effective_matches,
             "moved": abs(fit.clock.offset - alignment.offset),
             "spread": spread,
+            "blur": fit.blur,
             "correlation": velocity_correlation(*curves, fit, VELOCITY),
             "overlap": overlap_seconds(*curves, fit.clock),
             "iterations": float(fit.iterations),
@@ -125,7 +130,7 @@ class SplineRefine:
             alignment,
             offset=fit.clock.offset,
             rate=fit.clock.rate,
-            sigma=math.sqrt(variance + spread**2 + LEAST_SIGMA**2),
+            sigma=math.sqrt(variance + spread**2 + (fit.blur**2 / COMMON_ERRORS) ** 2 + LEAST_SIGMA**2),
             fps=fps,
             status=gravest(flags),
             flags=flags,
@@ -164,6 +169,7 @@ class SplineRefine:
     def _flags(self, stats: dict[str, float]) -> tuple[Status, ...]:
         t = self.trust
         found = {
+            Status.WEAK: stats["blur"] > t.blur,
             Status.MOVED: stats["moved"] > t.moved,
             Status.SPREAD: stats["spread"] > t.spread,
             Status.SHORT_OVERLAP: stats["overlap"] < t.overlap - 1e-9,

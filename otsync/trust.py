@@ -23,11 +23,12 @@ class Trust:
         moved: MOVED when the sub-frame fit ends further from the scan's peak than this, s.
         spread: SPREAD when fits with other detrending windows differ by more than this, s.
         correlation: POOR_FIT below this pooled correlation of the matched velocities at the answer.
+        blur: WEAK when the rms residual of the fit is more than this many seconds of rms motion.
         rate_gain: RATE_MISMATCH when another common ratio of frame rates raises the score's peak by this factor.
         rate_sigmas: a fitted rate counts when it differs from the declared one by more than this many sigmas.
     """
 
-    evidence: float = 10.0
+    evidence: float = 25.0
     margin: float = 0.1
     disagreement: float = 3 / 30
     alias: float = 3 / 30
@@ -37,5 +38,6 @@ class Trust:
     moved: float = 2 / 30
     spread: float = 0.5 / 30
     correlation: float = 0.45
+    blur: float = 5.6 / 30
     rate_sigmas: float = 4.0
     rate_gain: float = 1.3
