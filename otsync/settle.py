@@ -174,7 +174,7 @@ def _first_guess(n: int, answers: list[Answer], anchor: int, rates: np.ndarray, 
         inside = [edges[k] for k in own]
         members = int((component == root).sum())
         residual = np.array([x[e.b] - x[e.a] - e.offset for e in inside])
-        settled = agreeing(inside, Solution(x, x, residual), ASTRAY) & [e.trusted for e in inside]
+        settled = agreeing(inside, Solution(x, x, residual), ASTRAY) & np.array([e.trusted for e in inside], bool)
         if len(inside) < members or settled.all():
             continue
         weight = [
