@@ -94,7 +94,7 @@ class Fit:
     """Where the iteration ended.
 
     Args:
-        clock: the answer. covariance: (P,P) of offset (and rate), jackknifed over matches and over time, the two added.
+        clock: the answer. covariance: (P,P) of offset (and rate), jackknifed over matches or over time, the larger.
         weights: (M,) of the matches. iterations: done.
         blur: rms residual over rms speed, s: how far off a single sample of a typical match tells the time.
     """
@@ -155,7 +155,7 @@ class System:
     """Weighted normal equations, by match and by block of time.
 
     Args:
-        H, g: (P,P), (P,) the whole. by_match: (M,P,P), (M,P) and by_time: (B,P,P), (B,P) its parts.
+        H, g: (P,P), (P,) the whole. by_match: (G,P,P), (G,P) and by_time: (B,P,P), (B,P) its parts.
         match_weights: (M,). blur: see :class:`Fit`.
     """
 
@@ -170,19 +170,19 @@ class System:
         return -np.linalg.solve(_regular(self.H), self.g)
 
     def covariance(self) -> Float[np.ndarray, "P P"]:
-        """Jackknife over matches plus jackknife over blocks of time (cluster-robust, Bell and McCaffrey 2002).
+        """The larger of two jackknives, over groups of matches and over blocks of time (Bell and McCaffrey 2002).
 
         Leaving a cluster out moves the answer by (H - H_c)⁻¹ g_c: a block that holds most of the motion, a single
         swing, cannot pass for many independent ones.
         """
-        total = np.zeros_like(self.H)
+        found = []
         for Hc, gc in (self.by_match, self.by_time):
             leverage = np.einsum("pq,cqp->c", np.linalg.inv(_regular(self.H)), Hc) / len(self.H)
             shrink = np.minimum(1.0, MOST_LEVERAGE / np.maximum(leverage, 1e-12))
             rest = self.H - shrink[:, None, None] * Hc
             moved = np.linalg.solve(rest + 1e-12 * np.trace(self.H) * np.eye(len(self.H)), gc[..., None])[..., 0]
-            total += moved.T @ moved
-        return total
+            found.append(moved.T @ moved)
+        return max(found, key=lambda c: float(c[0, 0]))
 
 
 def _regular(H: np.ndarray) -> np.ndarray:
