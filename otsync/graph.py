@@ -197,6 +197,15 @@ class CurveSum:
             score += np.interp(offset, *c, left=0.0, right=0.0)
         return candidates, score
 
+    def standing(self, v: int, x: Float[np.ndarray, " V"]) -> tuple[float, float]:
+        """What x[v] scores with the others held, and the best local maximum more than four steps away from it."""
+        candidates, score = self.of_video(v, x)
+        here = int(np.argmin(np.abs(candidates - x[v])))
+        near = slice(max(here - 1, 0), here + 2)
+        padded = np.pad(score, 1, constant_values=-np.inf)
+        top = (score >= padded[:-2]) & (score >= padded[2:]) & (np.abs(candidates - x[v]) > 4.5 * self.step)
+        return float(score[near].max()), float(score[top].max(initial=0.0))
+
     def ascend(self, x: Float[np.ndarray, " V"], fixed: int, sweeps: int = 20) -> Float[np.ndarray, " V"]:
         """Coordinate ascent from x; the video ``fixed`` stays."""
         x = x.copy()
@@ -267,7 +276,7 @@ def cycle_errors(edges: Sequence[Edge]) -> Float[np.ndarray, " C"]:
     return np.array(sums)
 
 
-def agreeing(edges: Sequence[Edge], solution: Solution, least: float) -> Bool[np.ndarray, " E"]:
+def agreeing(edges: Sequence[Edge], residual: Float[np.ndarray, " E"], least: float) -> Bool[np.ndarray, " E"]:
     """Edges within four sigmas, or ``least`` seconds, of the solution."""
     sigma = np.array([e.sigma for e in edges])
-    return np.abs(solution.residual) <= np.maximum(least, 4 * sigma)
+    return np.abs(residual) <= np.maximum(least, 4 * sigma)
