@@ -19,7 +19,7 @@ from .splines import SMOOTHING, TrackSplines
 from .trust import Trust
 from .types import Alignment, Matches, Refused, Status, TrackSet, gravest, in_order
 
-LEAST_SIGMA = 0.02 / 30
+LEAST_SIGMA = 0.012 / 30
 """Seconds; no sigma is reported below this."""
 
 COMMON_ERRORS = 4.0

@@ -14,7 +14,8 @@ class Trust:
 
     Args:
         evidence: WEAK below this rise of the score's peak over its median, in nats a match.
-        margin: AMBIGUOUS when the second peak comes this close to the first, as a share of the first's rise.
+        margin: AMBIGUOUS when another peak comes this close to the first, as a share of the first's rise, altogether
+            or per common frame.
         disagreement: DISAGREE when slow velocities or windowed positions peak further away than this, s.
         alias: ALIAS when the score divided by the overlap peaks further away than this, s.
         overlap: SHORT_OVERLAP below this many seconds in common.
