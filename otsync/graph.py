@@ -49,11 +49,11 @@ class Graph:
         if self.extra and n <= self.complete:
             return [(i, j) for i in range(n) for j in range(i + 1, n)]
         found = {(min(centre, v), max(centre, v)) for v in range(n) if v != centre}
-        ring = np.random.default_rng(self.seed).permutation(n)
+        ring = np.random.default_rng(self.seed).permutation([v for v in range(n) if v != centre])
         for s in range(1, (self.extra + 1) // 2 + 1):
             # strides 1, 4, 9, ...: neighbours of neighbours are far apart, cycles are long and short
-            for i in range(n):
-                a, b = int(ring[i]), int(ring[(i + s * s) % n])
+            for i in range(n - 1):
+                a, b = int(ring[i]), int(ring[(i + s * s) % (n - 1)])
                 if a != b:
                     found.add((min(a, b), max(a, b)))
         return sorted(found)

@@ -26,7 +26,7 @@ MOVED = 1.5 * FRAME
 """A video that the summed curves put further than this from the robust solution has moved."""
 
 ASTRAY = 1.0 * FRAME
-"""A pair further than this, and than four sigmas, from the solution is fitted anew from there."""
+"""A pair further than this from the solution, and than four sigmas or CAPTURED, is fitted anew from there."""
 
 CONFIRMED = 1.5 * FRAME
 """Doubtful pairs this close to the solution by themselves confirm it."""
@@ -39,7 +39,7 @@ INFLATION = 1.5
 
 ROUNDS = 2
 
-NO_LINK = frozenset(
+NOTHING_COMMON = frozenset(
     {
         Status.POOR_FIT,
         Status.STATIC,
@@ -50,7 +50,7 @@ NO_LINK = frozenset(
         Status.FAILED,
     }
 )
-"""A pair with one of these links no videos by itself."""
+"""A pair with one of these shows no common motion: it makes no video trusted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,17 +112,16 @@ def settle(
 
 
 def _links(n: int, answers: list[Answer], x: np.ndarray, rates: np.ndarray, anchor: int, trust: Trust) -> list[Answer]:
-    """The pairs that link videos: sound ones, and doubtful ones that agree between videos that stand out.
+    """The pairs that link videos: those that vouch for themselves, and flagged ones between videos that stand out.
 
-    A video stands out when the sum of all its pairs' curves peaks at its place as an undoubted pair's curve would. That
-    keeps an estimate for videos without any sound pair, on the clock of the anchor's group; they are never trusted
-    for it, since the curves of a stranger with the many views of one scene add up as well. Groups that are sound in
-    themselves are never joined by doubtful pairs.
+    A flagged pair must agree with the solution. A video stands out when the sum of all its pairs' curves peaks at its place as an undoubted pair's curve would. That
+    keeps an estimate for videos that no pair vouches for, on the clock of the anchor's group. Groups held together by
+    pairs that vouch are never joined by flagged ones: the curves of strangers with the views of one scene add up too.
     """
     edges = [as_edge(a, rates) for a in answers]
     curves = CurveSum(n, edges, FRAME)
     stands = np.array([undoubted(curves, v, x, trust) for v in range(n)])
-    sound = np.array([is_sound(a) for a in answers], bool)
+    sound = np.array([e.trusted for e in edges], bool)
     group = components(n, [a.pair for a, ok in zip(answers, sound, strict=True) if ok])
     size = np.bincount(group, minlength=n)[group]
     main = group[anchor] if size[anchor] > 1 else group[int(np.argmax(size))]
@@ -134,12 +133,14 @@ def _links(n: int, answers: list[Answer], x: np.ndarray, rates: np.ndarray, anch
 
 
 def is_sound(answer: Answer) -> bool:
-    """Whether the pair links its videos by itself."""
-    return not NO_LINK & set(answer.refined.flags)
+    """Whether the fit shows a common motion at all, whatever else is flagged."""
+    return not NOTHING_COMMON & set(answer.refined.flags)
 
 
 def undoubted(curves: CurveSum, v: int, x: np.ndarray, trust: Trust) -> bool:
     """Whether the summed curves of v's pairs peak at x[v], high enough and without a rival."""
+    if not curves.around[v]:
+        return True  # aligners without curves: nothing to doubt by
     here, rival = curves.standing(v, x)
     return here >= trust.evidence and (here - rival) >= trust.margin * here
 
@@ -210,7 +211,7 @@ def _relocate(answers: list[Answer], x: np.ndarray, rates: np.ndarray, refit: Re
     for answer in answers:
         e = as_edge(answer, rates)
         predicted = x[e.b] - x[e.a]
-        if abs(predicted - e.offset) <= max(ASTRAY, 4 * e.sigma):
+        if abs(predicted - e.offset) <= max(ASTRAY, min(4 * e.sigma, CAPTURED)):
             kept.append(answer)
         else:
             tasks.append((answer, predicted / rates[e.a], rates[e.b] / rates[e.a]))

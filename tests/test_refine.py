@@ -92,9 +92,7 @@ def test_the_step_is_the_gradient_of_the_residual():
 def test_exchanging_the_videos_flips_the_sign(preset):
     (a, b), truth = simulate("tennis", preset=preset, offsets=[0, 0.37], seed=11)
     m = truth.matches(0, 1)
-    there, back = (
-        refine(*x, align(*x, throw=False), throw=False) for x in ((a, b, m), (b, a, m.swapped()))
-    )
+    there, back = (refine(*x, align(*x, throw=False), throw=False) for x in ((a, b, m), (b, a, m.swapped())))
     assert there.offset == pytest.approx(-back.offset, abs=ANTISYMMETRY)
     assert there.sigma == pytest.approx(back.sigma, rel=0.02)
 
@@ -139,9 +137,7 @@ def test_gaps_are_never_bridged():
     seen[:, 40:70] = False
     garbage = b.xyz.copy()
     garbage[:, 40:70] += 10.0
-    first, second = (
-        refine(a, dataclasses.replace(b, xyz=x, visible=seen), m, near(0.3)) for x in (b.xyz, garbage)
-    )
+    first, second = (refine(a, dataclasses.replace(b, xyz=x, visible=seen), m, near(0.3)) for x in (b.xyz, garbage))
     assert first.offset == second.offset
     assert first.offset == pytest.approx(0.3, abs=0.05 / 30)
 
