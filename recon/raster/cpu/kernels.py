@@ -1,0 +1,316 @@
+"""Compositing of one tile after another, forward and backward, any number of channels.
+
+A tile's state is a stack of planes of TILE_HEIGHT x TILE_WIDTH floats: transmittance, then channels. A splat visits the
+rows of the tile that its ellipse crosses, and on each row only the chunks of LANES pixels that cover the exact span.
+The pixels of a chunk are the lanes; channels are a loop. A chunk that would stick out of the tile is moved to the left:
+pixels beside the span are too faint to be drawn, so they may be computed in vain but never twice.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from recon.raster.cpu import simd
+from recon.raster.cpu.lists import (
+    MARGIN,
+    MEAN_X,
+    MEAN_Y,
+    OPACITY,
+    PER_VAR_X,
+    PER_VAR_Y,
+    REACH2,
+    RECORD,
+    SLOPE,
+    TILE_HEIGHT,
+    TILE_WIDTH,
+    VAR_X,
+)
+from recon.raster.cpu.simd import LANES
+from recon.raster.cpu.threads import kernel
+from recon.raster.rendering import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
+
+F32, I32 = np.float32, np.int32
+PLANE = TILE_WIDTH * TILE_HEIGHT
+ZERO, ONE, HALF = F32(0), F32(1), F32(0.5)
+LEAST, MOST, FINISHED = F32(ALPHA_MIN), F32(ALPHA_MAX), F32(TRANSMITTANCE_MIN)
+HALF_LOG2E = F32(-0.5 * math.log2(math.e))  # sigma to a power of two: exp(-d^2 / (2 var)) = 2^(HALF_LOG2E d^2 / var)
+LAST_X = F32(TILE_WIDTH - 1)
+SHAPE_GRADIENTS = 6  # moments kept per intersection, before the channels
+
+_raster_kernel = kernel(fastmath={"contract", "reassoc", "arcp", "nsz"})
+_inline = kernel(fastmath={"contract", "reassoc", "arcp", "nsz"}, inline="never")
+
+
+@_inline
+def _row_spans(records, at, mx, my, last_x, centres, lefts, rights):
+    """For every row of the tile: the splat's centre on it, and the first and last pixel of its span.
+
+    mx, my: the mean, with the centre of the tile's first pixel as origin.
+    """
+    reach2, per_y = records[at + REACH2], records[at + PER_VAR_Y]
+    var_x, slope = records[at + VAR_X], records[at + SLOPE]
+    for y in range(0, TILE_HEIGHT, LANES):
+        dy = simd.counting_from(F32(y) - my)
+        centre = dy * slope + mx
+        half = simd.square_root(simd.maximum((reach2 - dy * dy * per_y) * var_x, ZERO)) + MARGIN
+        simd.store(centres, y, centre)
+        # limited before the conversion: a huge splat leaves the range of int32
+        simd.store(lefts, y, simd.to_int(simd.round_up(simd.minimum(simd.maximum(centre - half, ZERO), LAST_X + ONE))))
+        simd.store(rights, y, simd.to_int(simd.round_down(simd.maximum(simd.minimum(centre + half, last_x), -ONE))))
+
+
+@_inline
+def _rows_reached(records, at, my, last_y):
+    """First and last row of the tile that the splat reaches."""
+    half = math.sqrt(records[at + REACH2] / records[at + PER_VAR_Y]) + MARGIN
+    top = max(math.ceil(my - half), ZERO)
+    bottom = min(math.floor(my + half), last_y)
+    return I32(min(top, F32(TILE_HEIGHT))), I32(max(bottom, -ONE))
+
+
+@_raster_kernel
+def forward(
+    first, last, tile_starts, ranks, records, features, n_channels, with_depth, tiling, image, depth, transmittance,
+    last_drawn,
+):  # fmt: skip
+    """Composite tiles first..last front to back.
+
+    features [R * D] in rank order, the depth as the last channel when `with_depth`. tiling = (width, height, tiles
+    across, tiles per camera). Writes image, depth, transmittance, and last_drawn: per pixel the position in
+    `ranks` of the last splat that was drawn, or -1. All arrays flat.
+    """
+    width, height, across, per_camera = tiling
+    n_colors = n_channels - 1 if with_depth else n_channels
+    planes = np.empty((1 + n_channels) * PLANE, np.float32)
+    drawn_last = np.empty(PLANE, np.int32)
+    centres = np.empty(TILE_HEIGHT, np.float32)
+    lefts, rights = np.empty(TILE_HEIGHT, np.int32), np.empty(TILE_HEIGHT, np.int32)
+    for tile in range(first, last):
+        camera = tile // per_camera
+        tile_y = (tile - camera * per_camera) // across
+        tile_x = tile - camera * per_camera - tile_y * across
+        wide, tall = min(TILE_WIDTH, width - tile_x * TILE_WIDTH), min(TILE_HEIGHT, height - tile_y * TILE_HEIGHT)
+        planes[:] = ZERO
+        drawn_last[:] = -1
+        for y in range(tall):
+            planes[y * TILE_WIDTH : y * TILE_WIDTH + wide] = ONE  # outside the image stays 0: finished
+        origin_x, origin_y = F32(tile_x * TILE_WIDTH) + HALF, F32(tile_y * TILE_HEIGHT) + HALF
+        for k in range(tile_starts[tile], tile_starts[tile + 1]):
+            if (k - tile_starts[tile]) & 31 == 31 and not _any_alive(planes):
+                break
+            rank = ranks[k]
+            at = rank * RECORD
+            mx, my = records[at + MEAN_X] - origin_x, records[at + MEAN_Y] - origin_y
+            opacity = records[at + OPACITY]
+            fall_x, fall_y = HALF_LOG2E * records[at + PER_VAR_X], HALF_LOG2E * records[at + PER_VAR_Y]
+            top, bottom = _rows_reached(records, at, my, F32(tall - 1))
+            _row_spans(records, at, mx, my, F32(wide - 1), centres, lefts, rights)
+            for y in range(top, bottom + 1):
+                chunks = (rights[y] - lefts[y] + LANES) // LANES
+                if rights[y] < lefts[y]:
+                    continue
+                dy = F32(y) - my
+                power_y = fall_y * dy * dy
+                x = min(lefts[y], I32(TILE_WIDTH - chunks * LANES))
+                for _ in range(chunks):
+                    i = y * TILE_WIDTH + x
+                    before = simd.load(planes, i)
+                    dx = simd.counting_from(F32(x) - centres[y])
+                    alpha = simd.minimum(simd.exp2_nonpositive(dx * dx * fall_x + power_y) * opacity, MOST)
+                    touched = (alpha >= LEAST) & (before > ZERO)
+                    weight = alpha * before
+                    after = before - weight
+                    goes_on = after > FINISHED
+                    drawn = touched & goes_on
+                    # a finished pixel keeps its transmittance with a negative sign
+                    simd.store(planes, i, simd.select(touched, simd.select(goes_on, after, ZERO - before), before))
+                    simd.store(drawn_last, i, simd.select(drawn, I32(k), simd.load(drawn_last, i)))
+                    weight = simd.select(drawn, weight, ZERO)
+                    for c in range(n_channels):
+                        j = i + (c + 1) * PLANE
+                        simd.store(planes, j, simd.load(planes, j) + weight * features[rank * n_channels + c])
+                    x += LANES
+        for y in range(tall):
+            pixel = (camera * height + tile_y * TILE_HEIGHT + y) * width + tile_x * TILE_WIDTH
+            for x in range(wide):
+                i = y * TILE_WIDTH + x
+                transmittance[pixel + x] = abs(planes[i])
+                last_drawn[pixel + x] = drawn_last[i]
+                for c in range(n_colors):
+                    image[(pixel + x) * n_colors + c] = planes[i + (c + 1) * PLANE]
+                if with_depth:
+                    depth[pixel + x] = planes[i + n_channels * PLANE]
+
+
+@_inline
+def _any_alive(planes):
+    """True while a pixel of the tile can still take a splat."""
+    alive = simd.spread(ZERO) > ZERO
+    highest = simd.spread(ZERO)
+    for i in range(0, PLANE, LANES):
+        highest = simd.maximum(simd.load(planes, i), highest)
+    alive = highest > ZERO
+    return simd.any_lane(alive)
+
+
+@_raster_kernel
+def backward(
+    first, last, tile_starts, ranks, slots, records, features, n_channels, with_depth, tiling, transmittance,
+    last_drawn, v_image, v_depth, v_transmittance, gradients,
+):  # fmt: skip
+    """Walk tiles first..last back to front; writes one row of `gradients` [I * (6 + D)] per intersection.
+
+    The transmittance before a splat is recovered by dividing by 1 - alpha. What lies behind a splat enters its alpha's
+    gradient only through one number per pixel, `behind` = (colour behind, background included) . dL/dcolour.
+
+    A row holds sums over the pixels of s = alpha dL/dalpha times 1, d, dy, d^2, d dy, dy^2, where d = dx - slope dy;
+    then dL/dfeature. :func:`reduce` turns sums of rows into gradients.
+    """
+    width, height, across, per_camera = tiling
+    n_colors = n_channels - 1 if with_depth else n_channels
+    row = SHAPE_GRADIENTS + n_channels
+    planes = np.empty((2 + n_channels) * PLANE, np.float32)  # transmittance, behind, dL/dchannel
+    drawn_last = np.empty(PLANE, np.int32)
+    v_features = np.empty(n_channels * LANES, np.float32)
+    centres = np.empty(TILE_HEIGHT, np.float32)
+    lefts, rights = np.empty(TILE_HEIGHT, np.int32), np.empty(TILE_HEIGHT, np.int32)
+    none = simd.spread(ZERO)
+    for tile in range(first, last):
+        camera = tile // per_camera
+        tile_y = (tile - camera * per_camera) // across
+        tile_x = tile - camera * per_camera - tile_y * across
+        wide, tall = min(TILE_WIDTH, width - tile_x * TILE_WIDTH), min(TILE_HEIGHT, height - tile_y * TILE_HEIGHT)
+        planes[:] = ZERO
+        planes[:PLANE] = ONE
+        drawn_last[:] = -1
+        furthest = -1
+        for y in range(tall):
+            pixel = (camera * height + tile_y * TILE_HEIGHT + y) * width + tile_x * TILE_WIDTH
+            for x in range(wide):
+                i = y * TILE_WIDTH + x
+                planes[i] = transmittance[pixel + x]
+                planes[i + PLANE] = v_transmittance[pixel + x] * transmittance[pixel + x]
+                drawn_last[i] = last_drawn[pixel + x]
+                furthest = max(furthest, last_drawn[pixel + x])
+                for c in range(n_colors):
+                    planes[i + (c + 2) * PLANE] = v_image[(pixel + x) * n_colors + c]
+                if with_depth:
+                    planes[i + (n_channels + 1) * PLANE] = v_depth[pixel + x]
+        origin_x, origin_y = F32(tile_x * TILE_WIDTH) + HALF, F32(tile_y * TILE_HEIGHT) + HALF
+        for k in range(max(furthest + 1, tile_starts[tile]), tile_starts[tile + 1]):
+            gradients[slots[k] * row : (slots[k] + 1) * row] = ZERO
+        for k in range(furthest, tile_starts[tile] - 1, -1):
+            rank = ranks[k]
+            at = rank * RECORD
+            mx, my = records[at + MEAN_X] - origin_x, records[at + MEAN_Y] - origin_y
+            opacity = records[at + OPACITY]
+            fall_x, fall_y = HALF_LOG2E * records[at + PER_VAR_X], HALF_LOG2E * records[at + PER_VAR_Y]
+            top, bottom = _rows_reached(records, at, my, F32(tall - 1))
+            _row_spans(records, at, mx, my, F32(wide - 1), centres, lefts, rights)
+            m, m_x, m_y, m_xx, m_xy, m_yy = none, none, none, none, none, none
+            for c in range(0, n_channels * LANES, LANES):
+                simd.store(v_features, c, none)
+            for y in range(top, bottom + 1):
+                chunks = (rights[y] - lefts[y] + LANES) // LANES
+                if rights[y] < lefts[y]:
+                    continue
+                dy = F32(y) - my
+                power_y = fall_y * dy * dy
+                x = min(lefts[y], I32(TILE_WIDTH - chunks * LANES))
+                for _ in range(chunks):
+                    i = y * TILE_WIDTH + x
+                    x += LANES
+                    dx = simd.counting_from(F32(x - LANES) - centres[y])
+                    uncapped = simd.exp2_nonpositive(dx * dx * fall_x + power_y) * opacity
+                    alpha = simd.minimum(uncapped, MOST)
+                    drawn = (alpha >= LEAST) & (simd.load(drawn_last, i) >= I32(k))
+                    alpha = simd.select(drawn, alpha, ZERO)
+                    per_left = ONE / (ONE - alpha)
+                    before = simd.load(planes, i) * per_left
+                    simd.store(planes, i, before)
+                    weight = alpha * before
+                    inner = none
+                    for c in range(n_channels):
+                        v_channel = simd.load(planes, i + (c + 2) * PLANE)
+                        inner = inner + v_channel * features[rank * n_channels + c]
+                        v_feature = simd.load(v_features, c * LANES) + weight * v_channel
+                        simd.store(v_features, c * LANES, v_feature)
+                    behind = simd.load(planes, i + PLANE)
+                    simd.store(planes, i + PLANE, behind + inner * weight)
+                    v_alpha = inner * before - behind * per_left
+                    # at the cap alpha no longer depends on the splat's shape or opacity
+                    s = simd.select(drawn & (uncapped <= MOST), uncapped * v_alpha, ZERO)
+                    s_x, s_y = s * dx, s * dy
+                    m, m_x, m_y = m + s, m_x + s_x, m_y + s_y
+                    m_xx, m_xy, m_yy = m_xx + s_x * dx, m_xy + s_x * dy, m_yy + s_y * dy
+            out = slots[k] * row
+            gradients[out] = simd.total(m)
+            gradients[out + 1] = simd.total(m_x)
+            gradients[out + 2] = simd.total(m_y)
+            gradients[out + 3] = simd.total(m_xx)
+            gradients[out + 4] = simd.total(m_xy)
+            gradients[out + 5] = simd.total(m_yy)
+            for c in range(n_channels):
+                gradients[out + SHAPE_GRADIENTS + c] = simd.total(simd.load(v_features, c * LANES))
+
+
+@_raster_kernel
+def gather_channels(first, last, order, features, period, depths, channels):
+    """channels[r] = features of splat order[r], and its depth when there is one more column.
+
+    `period`: N when all cameras share the features, 0 when every splat has its own.
+    """
+    d = features.shape[1]
+    for r in range(first, last):
+        splat = order[r]
+        source = splat % period if period > 0 else splat
+        for c in range(d):
+            channels[r, c] = features[source, c]
+        if channels.shape[1] > d:
+            channels[r, d] = depths[splat]
+
+
+@_raster_kernel
+def reduce(
+    first, last, n_cameras, n, shared, with_depth, rank_of_splat, slot_starts, records, gradients, row,
+    v_means2d, v_rows, v_opacities, v_depths, v_features,
+):  # fmt: skip
+    """Sum the rows of Gaussians first..last and turn moments into gradients; arrays flat.
+
+    `shared`: the features are the same in every camera, so that their gradients add up over the cameras.
+    """
+    n_colors = row - SHAPE_GRADIENTS - (1 if with_depth else 0)
+    total = np.empty(row, np.float32)
+    for g in range(first, last):
+        if shared:
+            v_features[g * n_colors : (g + 1) * n_colors] = ZERO
+        for camera in range(n_cameras):
+            splat = camera * n + g
+            total[:] = ZERO
+            rank = rank_of_splat[splat]
+            if rank >= 0:
+                for slot in range(slot_starts[rank], slot_starts[rank + 1]):
+                    for j in range(row):
+                        total[j] += gradients[slot * row + j]
+            per_x, slope, per_y, opacity = ZERO, ZERO, ZERO, ONE
+            if rank >= 0:
+                at = rank * RECORD
+                per_x, slope, per_y = records[at + PER_VAR_X], records[at + SLOPE], records[at + PER_VAR_Y]
+                opacity = records[at + OPACITY]
+            # sigma = d^2 / (2 var_x) + dy^2 / (2 var_y), s = -dL/dsigma, d = dx - slope dy
+            v_means2d[splat * 2] = per_x * total[1]
+            v_means2d[splat * 2 + 1] = per_y * total[2] - slope * per_x * total[1]
+            v_rows[splat * 3] = HALF * per_x * per_x * total[3]
+            v_rows[splat * 3 + 1] = per_x * total[4]
+            v_rows[splat * 3 + 2] = HALF * per_y * per_y * total[5]
+            v_opacities[splat] = total[0] / opacity
+            if with_depth:
+                v_depths[splat] = total[row - 1]
+            out = g * n_colors if shared else splat * n_colors
+            for c in range(n_colors):
+                if shared:
+                    v_features[out + c] += total[SHAPE_GRADIENTS + c]
+                else:
+                    v_features[out + c] = total[SHAPE_GRADIENTS + c]
