@@ -13,10 +13,11 @@ from torch.autograd.function import once_differentiable
 
 from recon.raster.cpu import kernels, lists
 from recon.raster.cpu import project as projection
+from recon.raster.cpu.simd import LANES
 from recon.raster.cpu.threads import for_each, ranges
 from recon.raster.rendering import Settings, Splats
 
-GAUSSIANS_PER_PART = 4096  # of the projection: fixed, so that sums over parts do not depend on the threads
+GAUSSIANS_PER_PART = 1024  # of the projection: fixed, so that sums over parts do not depend on the threads
 TILES_PER_PART = 4  # small parts balance the load: tiles differ by orders of magnitude
 
 
@@ -132,7 +133,7 @@ class _Rasterize(torch.autograd.Function):
         d = ctx.features_shape[-1]
         row = kernels.SHAPE_GRADIENTS + d + ctx.with_depth
         incoming = [_array(t).reshape(-1) for t in (v_image, v_depth, v_transmittance)]
-        gradients = np.empty(len(tiles.ranks) * row, np.float32)
+        gradients = np.empty(len(tiles.ranks) * row + LANES, np.float32)
         for_each(
             kernels.backward,
             ranges(n_cameras * tiles.tiles_per_camera, TILES_PER_PART),

@@ -14,11 +14,11 @@ import numpy as np
 
 from recon.raster.cpu import simd
 from recon.raster.cpu.lists import (
+    HALF_Y,
     MARGIN,
     MEAN_X,
     MEAN_Y,
     OPACITY,
-    PER_VAR_X,
     PER_VAR_Y,
     REACH2,
     RECORD,
@@ -32,7 +32,9 @@ from recon.raster.cpu.threads import kernel
 from recon.raster.rendering import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 
 F32, I32 = np.float32, np.int32
-PLANE = TILE_WIDTH * TILE_HEIGHT
+PIXELS = TILE_WIDTH * TILE_HEIGHT
+# planes do not start a power of two apart: their lines would all fall into the same two sets of the L1 cache
+PLANE = PIXELS + LANES
 ZERO, ONE, HALF = F32(0), F32(1), F32(0.5)
 LEAST, MOST, FINISHED = F32(ALPHA_MIN), F32(ALPHA_MAX), F32(TRANSMITTANCE_MIN)
 HALF_LOG2E = F32(-0.5 * math.log2(math.e))  # sigma to a power of two: exp(-d^2 / (2 var)) = 2^(HALF_LOG2E d^2 / var)
@@ -64,7 +66,7 @@ def _row_spans(records, at, mx, my, last_x, centres, lefts, rights):
 @_inline
 def _rows_reached(records, at, my, last_y):
     """First and last row of the tile that the splat reaches."""
-    half = math.sqrt(records[at + REACH2] / records[at + PER_VAR_Y]) + MARGIN
+    half = records[at + HALF_Y]
     top = max(math.ceil(my - half), ZERO)
     bottom = min(math.floor(my + half), last_y)
     return I32(min(top, F32(TILE_HEIGHT))), I32(max(bottom, -ONE))
@@ -104,7 +106,7 @@ def forward(
             at = rank * RECORD
             mx, my = records[at + MEAN_X] - origin_x, records[at + MEAN_Y] - origin_y
             opacity = records[at + OPACITY]
-            fall_x, fall_y = HALF_LOG2E * records[at + PER_VAR_X], HALF_LOG2E * records[at + PER_VAR_Y]
+            fall_x, fall_y = HALF_LOG2E / records[at + VAR_X], HALF_LOG2E * records[at + PER_VAR_Y]
             top, bottom = _rows_reached(records, at, my, F32(tall - 1))
             _row_spans(records, at, mx, my, F32(wide - 1), centres, lefts, rights)
             for y in range(top, bottom + 1):
@@ -149,7 +151,7 @@ def _any_alive(planes):
     """True while a pixel of the tile can still take a splat."""
     alive = simd.spread(ZERO) > ZERO
     highest = simd.spread(ZERO)
-    for i in range(0, PLANE, LANES):
+    for i in range(0, PIXELS, LANES):
         highest = simd.maximum(simd.load(planes, i), highest)
     alive = highest > ZERO
     return simd.any_lane(alive)
@@ -206,7 +208,7 @@ def backward(
             at = rank * RECORD
             mx, my = records[at + MEAN_X] - origin_x, records[at + MEAN_Y] - origin_y
             opacity = records[at + OPACITY]
-            fall_x, fall_y = HALF_LOG2E * records[at + PER_VAR_X], HALF_LOG2E * records[at + PER_VAR_Y]
+            fall_x, fall_y = HALF_LOG2E / records[at + VAR_X], HALF_LOG2E * records[at + PER_VAR_Y]
             top, bottom = _rows_reached(records, at, my, F32(tall - 1))
             _row_spans(records, at, mx, my, F32(wide - 1), centres, lefts, rights)
             m, m_x, m_y, m_xx, m_xy, m_yy = none, none, none, none, none, none
@@ -282,23 +284,25 @@ def reduce(
     `shared`: the features are the same in every camera, so that their gradients add up over the cameras.
     """
     n_colors = row - SHAPE_GRADIENTS - (1 if with_depth else 0)
-    total = np.empty(row, np.float32)
+    total = np.empty(row + LANES, np.float32)
     for g in range(first, last):
         if shared:
             v_features[g * n_colors : (g + 1) * n_colors] = ZERO
         for camera in range(n_cameras):
             splat = camera * n + g
-            total[:] = ZERO
             rank = rank_of_splat[splat]
-            if rank >= 0:
-                for slot in range(slot_starts[rank], slot_starts[rank + 1]):
-                    for j in range(row):
-                        total[j] += gradients[slot * row + j]
+            begin, end = 0, 0
             per_x, slope, per_y, opacity = ZERO, ZERO, ZERO, ONE
             if rank >= 0:
+                begin, end = slot_starts[rank], slot_starts[rank + 1]
                 at = rank * RECORD
-                per_x, slope, per_y = records[at + PER_VAR_X], records[at + SLOPE], records[at + PER_VAR_Y]
+                per_x, slope, per_y = ONE / records[at + VAR_X], records[at + SLOPE], records[at + PER_VAR_Y]
                 opacity = records[at + OPACITY]
+            for j in range(0, row, LANES):  # the last vector runs into the next row; its spare lanes are not used
+                column = simd.spread(ZERO)
+                for slot in range(begin, end):
+                    column = column + simd.load(gradients, slot * row + j)
+                simd.store(total, j, column)
             # sigma = d^2 / (2 var_x) + dy^2 / (2 var_y), s = -dL/dsigma, d = dx - slope dy
             v_means2d[splat * 2] = per_x * total[1]
             v_means2d[splat * 2 + 1] = per_y * total[2] - slope * per_x * total[1]

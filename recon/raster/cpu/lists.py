@@ -17,8 +17,8 @@ from recon.raster.rendering import ALPHA_MIN
 
 TILE_WIDTH, TILE_HEIGHT = 32, 16  # pixels
 RECORD = 8  # floats of a packed splat
-MEAN_X, MEAN_Y, PER_VAR_X, SLOPE, PER_VAR_Y, OPACITY, REACH2, VAR_X = range(RECORD)
-PART = 8192  # splats of one part
+MEAN_X, MEAN_Y, VAR_X, SLOPE, PER_VAR_Y, OPACITY, REACH2, HALF_Y = range(RECORD)
+PART = 2048  # splats of one part
 
 F32 = np.float32
 MARGIN = F32(0.01)  # pixels added to every extent: a splat at the rounding edge of a row is tested, not lost
@@ -51,18 +51,25 @@ def build(means2d, rows, depths, opacities, radii, width: int, height: int) -> T
     parts = ranges(r, PART)
     counts = np.zeros((len(parts), n_tiles), np.int64)
     slot_starts = np.zeros(r + 1, np.int64)
+    tiles_of_part: list[np.ndarray] = [np.empty(0, np.int32)] * len(parts)
     numbered = [(*part, p) for p, part in enumerate(parts)]
     grid = (n, across, down)
     flat = (means2d.reshape(-1, 2), rows.reshape(-1, 3), opacities.reshape(-1))
-    for_each(_pack_and_count, numbered, order, *flat, grid, records, rank_of_splat, counts, slot_starts)
 
+    def count(first: int, last: int, part: int) -> None:
+        tiles_of_part[part] = _pack_and_count(
+            first, last, order, *flat, grid, records, rank_of_splat, counts[part], slot_starts
+        )
+
+    for_each(count, numbered)
     np.cumsum(slot_starts, out=slot_starts)
     tile_starts = np.zeros(n_tiles + 1, np.int64)
     np.cumsum(counts.sum(0), out=tile_starts[1:])
+    # cursors[p]: where part p begins to write in every list
     cursors = tile_starts[:-1] + np.cumsum(counts, axis=0) - counts
     total = int(tile_starts[-1])
     ranks, slots = np.empty(total, np.int32), np.empty(total, np.int64)
-    for_each(_fill, numbered, order, records, grid, cursors, slot_starts, ranks, slots)
+    for_each(_fill, [(*part, cursors[p], tiles_of_part[p]) for p, part in enumerate(parts)], slot_starts, ranks, slots)
     return TileLists(order, rank_of_splat, records, tile_starts, ranks, slots, slot_starts, across, across * down)
 
 
@@ -71,8 +78,8 @@ def depth_order(depths: np.ndarray, radii: np.ndarray) -> np.ndarray:
 
     One sort of 64-bit keys: for positive floats the bits order like the values, and the index below them breaks ties.
     """
-    drawn = np.flatnonzero(radii.max(-1) > 0) if len(radii) else np.zeros(0, np.int64)
-    keys = (depths[drawn].view(np.uint32).astype(np.uint64) << np.uint64(32)) | drawn.astype(np.uint64)
+    keys = np.empty(len(depths), np.uint64)
+    keys = keys[: _depth_keys(depths.view(np.uint32), radii, keys)]
     keys.sort()
     return (keys & np.uint64(0xFFFFFFFF)).astype(np.int64)
 
@@ -81,80 +88,84 @@ _list_kernel = kernel(fastmath={"contract", "nsz"})
 _inline = kernel(fastmath={"contract", "nsz"}, inline="never")
 
 
-@_inline
-def _tile_rows(record, at, down):
-    """First and past-the-last tile row that the splat's ellipse reaches."""
-    half = math.sqrt(record[at + REACH2] / record[at + PER_VAR_Y]) + MARGIN
-    y = record[at + MEAN_Y]
-    low = max(F32(0), math.floor((y - half) / F32(TILE_HEIGHT)))
-    high = min(F32(down), math.floor((y + half) / F32(TILE_HEIGHT)) + F32(1))
-    return np.int64(low), np.int64(max(high, low))
+@_list_kernel
+def _depth_keys(depth_bits, radii, keys):
+    """Write (depth bits, index) of the drawn splats to keys; returns how many there are."""
+    n = 0
+    for i in range(len(depth_bits)):
+        keys[n] = (np.uint64(depth_bits[i]) << np.uint64(32)) | np.uint64(i)
+        n += radii[i, 0] > 0
+    return n
 
 
 @_inline
-def _tile_columns(record, at, tile_row, across):
-    """First and past-the-last tile column of the ellipse within one row of tiles.
-
-    The ellipse's rightmost point lies at dy = slope var_y sqrt(reach2 / A), A = var_x + slope^2 var_y, its leftmost
-    opposite; outside the tile row the extreme is on the row's edge, as the ellipse is convex.
-    """
-    reach2, var_x, slope = record[at + REACH2], record[at + VAR_X], record[at + SLOPE]
-    per_y = record[at + PER_VAR_Y]
-    top = F32(tile_row * TILE_HEIGHT) - record[at + MEAN_Y]
-    bottom = top + F32(TILE_HEIGHT)
-    extreme = slope / per_y * math.sqrt(reach2 / (var_x + slope * slope / per_y))
-    right, left = min(max(extreme, top), bottom), min(max(-extreme, top), bottom)
-    half_right = math.sqrt(max((reach2 - right * right * per_y) * var_x, F32(0))) + MARGIN
-    half_left = math.sqrt(max((reach2 - left * left * per_y) * var_x, F32(0))) + MARGIN
-    x = record[at + MEAN_X]
-    low = math.floor((x + slope * left - half_left) / F32(TILE_WIDTH))
-    high = math.floor((x + slope * right + half_right) / F32(TILE_WIDTH)) + F32(1)
-    low, high = max(low, F32(0)), min(high, F32(across))
-    return np.int64(low), np.int64(max(high, low))
+def _tile_range(low, high, size, count):
+    """First and past-the-last tile of `count` tiles of `size` pixels that meet the interval [low, high]."""
+    first = max(F32(0), math.floor(low * (F32(1) / size)))
+    last = min(F32(count), math.floor(high * (F32(1) / size)) + F32(1))
+    return np.int64(first), np.int64(max(first, last))
 
 
 @_list_kernel
-def _pack_and_count(
-    first, last, part, order, means2d, rows, opacities, grid, records, rank_of_splat, counts, slot_starts
-):
+def _pack_and_count(first, last, order, means2d, rows, opacities, grid, records, rank_of_splat, counts, slot_starts):
+    """Pack ranks first..last, and list the tiles that each one's ellipse meets, one tile row after the other.
+
+    On one row of tiles the ellipse spans an interval of x: its rightmost point lies at dy = B sqrt(reach2 / A), its
+    leftmost opposite; outside the tile row the extreme is on the row's edge, as the ellipse is convex.
+    """
     n, across, down = grid
+    tiles = np.empty(4 * (last - first) + 64, np.int32)
+    listed = 0
     for r in range(first, last):
         m = order[r]
         rank_of_splat[m] = r
+        x, y = means2d[m, 0], means2d[m, 1]
+        var_x, slope, var_y = rows[m, 0], rows[m, 1], rows[m, 2]
+        reach2 = F32(2) * math.log(max(opacities[m] * F32(1 / ALPHA_MIN), F32(1)))
+        half_y = math.sqrt(reach2 * var_y) + MARGIN
+        per_var_y = F32(1) / var_y
         at = r * RECORD
-        records[at + MEAN_X] = means2d[m, 0]
-        records[at + MEAN_Y] = means2d[m, 1]
-        records[at + PER_VAR_X] = F32(1) / rows[m, 0]
-        records[at + SLOPE] = rows[m, 1]
-        records[at + PER_VAR_Y] = F32(1) / rows[m, 2]
+        records[at + MEAN_X] = x
+        records[at + MEAN_Y] = y
+        records[at + VAR_X] = var_x
+        records[at + SLOPE] = slope
+        records[at + PER_VAR_Y] = per_var_y
         records[at + OPACITY] = opacities[m]
-        records[at + REACH2] = F32(2) * math.log(max(opacities[m] / F32(ALPHA_MIN), F32(1)))
-        records[at + VAR_X] = rows[m, 0]
-        base = (m // n) * down
-        touched = 0
-        row_low, row_high = _tile_rows(records, at, down)
+        records[at + REACH2] = reach2
+        records[at + HALF_Y] = half_y
+        extreme = slope * var_y * math.sqrt(reach2 / (var_x + slope * slope * var_y))
+        row_low, row_high = _tile_range(y - half_y, y + half_y, F32(TILE_HEIGHT), down)
+        before = listed
         for row in range(row_low, row_high):
-            low, high = _tile_columns(records, at, row, across)
+            top = F32(row * TILE_HEIGHT) - y
+            bottom = top + F32(TILE_HEIGHT)
+            right, left = min(max(extreme, top), bottom), min(max(-extreme, top), bottom)
+            half_right = math.sqrt(max((reach2 - right * right * per_var_y) * var_x, F32(0))) + MARGIN
+            half_left = math.sqrt(max((reach2 - left * left * per_var_y) * var_x, F32(0))) + MARGIN
+            low, high = _tile_range(
+                x + slope * left - half_left, x + slope * right + half_right, F32(TILE_WIDTH), across
+            )
+            if listed + high - low > len(tiles):
+                larger = np.empty(2 * len(tiles) + high - low, np.int32)
+                larger[:listed] = tiles[:listed]
+                tiles = larger
+            base = (m // n * down + row) * across
             for column in range(low, high):
-                counts[part, (base + row) * across + column] += 1
-            touched += high - low
-        slot_starts[r + 1] = touched
+                tiles[listed] = base + column
+                counts[base + column] += 1
+                listed += 1
+        slot_starts[r + 1] = listed - before
+    return tiles
 
 
 @_list_kernel
-def _fill(first, last, part, order, records, grid, cursors, slot_starts, ranks, slots):
-    n, across, down = grid
+def _fill(first, last, cursors, tiles, slot_starts, ranks, slots):
+    """Append ranks first..last to the lists of their tiles; cursors [T] say where to write."""
+    base = slot_starts[first]
     for r in range(first, last):
-        at = r * RECORD
-        base = (order[r] // n) * down
-        slot = slot_starts[r]
-        row_low, row_high = _tile_rows(records, at, down)
-        for row in range(row_low, row_high):
-            low, high = _tile_columns(records, at, row, across)
-            for column in range(low, high):
-                tile = (base + row) * across + column
-                i = cursors[part, tile]
-                cursors[part, tile] = i + 1
-                ranks[i] = r
-                slots[i] = slot
-                slot += 1
+        for slot in range(slot_starts[r], slot_starts[r + 1]):
+            tile = tiles[slot - base]
+            i = cursors[tile]
+            cursors[tile] = i + 1
+            ranks[i] = r
+            slots[i] = slot
