@@ -18,7 +18,7 @@ from recon.raster.cpu.threads import for_each, ranges
 from recon.raster.rendering import Settings, Splats
 
 GAUSSIANS_PER_PART = 1024  # of the projection: fixed, so that sums over parts do not depend on the threads
-TILES_PER_PART = 4  # small parts balance the load: tiles differ by orders of magnitude
+PARTS = 64  # of the tiles: many, because tiles differ by orders of magnitude in their work
 
 
 def project(
@@ -46,6 +46,10 @@ def rasterize(
 
 def _array(t: Tensor, dtype: torch.dtype = torch.float32) -> np.ndarray:
     return t.detach().to(dtype).contiguous().numpy()
+
+
+def _tile_parts(n_tiles: int) -> list[tuple[int, int]]:
+    return ranges(n_tiles, max(1, n_tiles // PARTS))
 
 
 class _Project(torch.autograd.Function):
@@ -113,7 +117,7 @@ class _Rasterize(torch.autograd.Function):
         tiling = (width, height, tiles.tiles_across, tiles.tiles_per_camera)
         for_each(
             kernels.forward,
-            ranges(n_cameras * tiles.tiles_per_camera, TILES_PER_PART),
+            _tile_parts(n_cameras * tiles.tiles_per_camera),
             *(tiles.tile_starts, tiles.ranks, tiles.records, channels, d + with_depth, with_depth, tiling),
             *(image.reshape(-1), depth.reshape(-1), transmittance.reshape(-1), last_drawn),
         )
@@ -136,7 +140,7 @@ class _Rasterize(torch.autograd.Function):
         gradients = np.empty(len(tiles.ranks) * row + LANES, np.float32)
         for_each(
             kernels.backward,
-            ranges(n_cameras * tiles.tiles_per_camera, TILES_PER_PART),
+            _tile_parts(n_cameras * tiles.tiles_per_camera),
             *(tiles.tile_starts, tiles.ranks, tiles.slots, tiles.records, ctx.channels, d + ctx.with_depth),
             *(ctx.with_depth, ctx.tiling, ctx.transmittance, ctx.last_drawn, *incoming, gradients),
         )

