@@ -7,6 +7,7 @@ import logging
 from types import ModuleType
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -53,7 +54,9 @@ def render(
     options = Settings(**settings)
     _check_shapes(means, quats, scales, opacities, colors, viewmats, Ks, width, height, backgrounds, options)
     name = _choose(backend, means)
-    means, quats, scales, opacities, colors = _drop_nonfinite(means, quats, scales, opacities, colors)
+    means, quats, scales, opacities, colors = _drop_nonfinite(
+        (means, quats, scales, opacities, colors), options.sh_degree
+    )
     if name == "gsplat":
         from recon.raster import gsplat_backend
 
@@ -65,12 +68,9 @@ def render(
     features = colors
     if options.sh_degree is not None:
         features = sh.view_colors(options.sh_degree, means, colors, viewmats)
-    image, depths, transmittance = engine.rasterize(splats, features, width, height, options.depth is not None)
+    image, depths, alphas = engine.rasterize(splats, features, width, height, options.depth)
     if backgrounds is not None:
-        image = image + transmittance * backgrounds[:, None, None, :]
-    alphas = 1 - transmittance
-    if depths is not None and options.depth == "expected":
-        depths = depths / alphas.clamp_min(1e-10)
+        image = image + (1 - alphas) * backgrounds[:, None, None, :]
     return Rendering(image, alphas, depths, splats.means2d, splats.radii, name)
 
 
@@ -110,30 +110,32 @@ def _has_numba() -> bool:
     return importlib.util.find_spec("numba") is not None
 
 
-def _drop_nonfinite(*gaussians: Tensor) -> tuple[Tensor, ...]:
+def _drop_nonfinite(gaussians: tuple[Tensor, ...], sh_degree: int | None) -> tuple[Tensor, ...]:
     """Replace Gaussians that hold a NaN or an infinity by ones that are not drawn; the rest pass untouched.
 
     The sum over a tensor is finite when all its entries are (save for sums beyond the largest float, which only cost
     the slower exact test), and takes a small fraction of the time of a rendering.
     """
     with torch.no_grad():
-        if all(bool(t.sum().isfinite()) for t in gaussians):
+        if all(_finite_sum(t) for t in gaussians):
             return gaussians
-        means = gaussians[0]
+        means, colors = gaussians[0], gaussians[4]
+        per_camera = colors.ndim == 4 or colors.ndim == 3 and (sh_degree is None)
         good = torch.ones(len(means), dtype=torch.bool, device=means.device)
-        for t in gaussians:
-            entries = t.isfinite()
-            if t.ndim > 1 and t.shape[0] != len(means) or t.ndim == 4:  # one set of colours per camera
-                entries = entries.all(0)
-            good &= entries.reshape(len(means), -1).all(-1)
-    means, quats, scales, opacities, colors = gaussians
+        for t in (*gaussians[:4], colors.movedim(0, 1) if per_camera else colors):
+            good &= t.isfinite().reshape(len(means), -1).all(-1)
 
-    def keep(t: Tensor) -> Tensor:
-        return torch.where(good.reshape(-1, *[1] * (t.ndim - 1)), t, 0.0)
+    def keep(t: Tensor, axis: int = 0) -> Tensor:
+        return torch.where(good.reshape(-1, *[1] * (t.ndim - 1 - axis)), t, 0.0)
 
-    per_camera = colors.shape[0] != len(means) or colors.ndim == 4
-    mask = good.reshape(*([1] if per_camera else []), -1, *[1] * (colors.ndim - 1 - per_camera))
-    return keep(means), keep(quats), keep(scales), keep(opacities), torch.where(mask, colors, 0.0)
+    return *(keep(t) for t in gaussians[:4]), keep(colors, int(per_camera))
+
+
+def _finite_sum(t: Tensor) -> bool:
+    if t.is_cuda:
+        return bool(t.sum().isfinite())
+    with np.errstate(all="ignore"):
+        return bool(np.isfinite(t.detach().numpy().sum()))  # torch would wake its own pool, which then competes with ours
 
 
 def _check_shapes(
@@ -191,6 +193,6 @@ def _check_shapes(
         expect("backgrounds", backgrounds, (c, d))
         cameras["backgrounds"] = backgrounds
     for name, tensor in cameras.items():
-        if not bool(tensor.detach().sum().isfinite()):
+        if not _finite_sum(tensor):
             raise ValueError(f"{name}: expected finite entries, got NaN or infinity: a camera or colour of the caller "
                              f"has diverged")

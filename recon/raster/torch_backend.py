@@ -22,16 +22,16 @@ KEEP_ELEMENTS = 20_000_000  # pairs of a whole rendering above which blocks are 
 
 
 def rasterize(
-    splats: Splats, features: Tensor, width: int, height: int, with_depth: bool
+    splats: Splats, features: Tensor, width: int, height: int, depth: str | None
 ) -> tuple[Tensor, Tensor | None, Tensor]:
     """Composite splats front to back; differentiable in everything but the radii.
 
-    features [N,D] or [C,N,D]. Returns sums of weight * feature [C,H,W,D], of weight * depth [C,H,W,1] (or None), and
-    the transmittance that is left [C,H,W,1].
+    features [N,D] or [C,N,D]; depth as in :class:`Settings`. Returns sums of weight * feature [C,H,W,D], the depth
+    [C,H,W,1] (or None), and the alpha [C,H,W,1], one minus the transmittance that is left.
     """
     n_cameras, n = splats.depths.shape
     channels = features.expand(n_cameras, n, features.shape[-1])
-    if with_depth:
+    if depth:
         channels = torch.cat([channels, splats.depths[..., None]], -1)
     across, down = -(-width // TILE), -(-height // TILE)
     flat = Splats(*(t.flatten(0, 1) for t in splats))
@@ -71,10 +71,11 @@ def rasterize(
         t = t.reshape(n_cameras, down, across, TILE, TILE, -1).transpose(2, 3)
         return t.reshape(n_cameras, down * TILE, across * TILE, -1)[:, :height, :width]
 
-    image, transmittance = untile(full), untile(left_full)
-    if with_depth:
-        return image[..., :-1], image[..., -1:], transmittance
-    return image, None, transmittance
+    image, alphas = untile(full), 1 - untile(left_full)
+    if depth is None:
+        return image, None, alphas
+    sums = image[..., -1:]
+    return image[..., :-1], sums if depth == "accumulated" else sums / alphas.clamp_min(1e-10), alphas
 
 
 @torch.no_grad()
@@ -122,7 +123,6 @@ def _composite(
     alive = after.detach() > TRANSMITTANCE_MIN  # stops before the splat that would finish the pixel
     before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], 1)
     weight = alpha * before * alive
-    # the smallest transmittance among the splats drawn; a pixel that draws none keeps 1
-    left = torch.where(alive, after, 1.0)
-    left = left.gather(1, alive.sum(1, keepdim=True).sub(1).clamp_min(0))
+    # the transmittance after the last splat drawn; the first splat alone never finishes a pixel
+    left = after.gather(1, alive.sum(1, keepdim=True).sub(1).clamp_min(0))
     return weight.transpose(1, 2) @ channels[ids], left.transpose(1, 2)

@@ -18,6 +18,7 @@ from recon.raster.cpu.threads import for_each, ranges
 from recon.raster.rendering import Settings, Splats
 
 GAUSSIANS_PER_PART = 1024  # of the projection: fixed, so that sums over parts do not depend on the threads
+DEPTH_MODES = {None: kernels.NO_DEPTH, "accumulated": kernels.ACCUMULATED, "expected": kernels.EXPECTED}
 PARTS = 64  # of the tiles: many, because tiles differ by orders of magnitude in their work
 
 
@@ -37,11 +38,11 @@ def project(
 
 
 def rasterize(
-    splats: Splats, features: Tensor, width: int, height: int, with_depth: bool
+    splats: Splats, features: Tensor, width: int, height: int, depth: str | None
 ) -> tuple[Tensor, Tensor | None, Tensor]:
     """As :func:`recon.raster.torch_backend.rasterize`."""
-    image, depth, transmittance = _Rasterize.apply(*splats, features, width, height, with_depth)
-    return image, depth if with_depth else None, transmittance
+    image, depths, alphas = _Rasterize.apply(*splats, features, width, height, DEPTH_MODES[depth])
+    return image, depths if depth else None, alphas
 
 
 def _array(t: Tensor, dtype: torch.dtype = torch.float32) -> np.ndarray:
@@ -104,55 +105,55 @@ class _Project(torch.autograd.Function):
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, means2d, rows, depths, opacities, radii, features, width, height, with_depth):
+    def forward(ctx, means2d, rows, depths, opacities, radii, features, width, height, depth_mode):
         n_cameras, n = depths.shape
         arrays = [_array(t) for t in (means2d, rows, depths, opacities)]
         tiles = lists.build(*arrays, radii.numpy(), width, height)
+        with_depth = depth_mode != kernels.NO_DEPTH
         channels = _in_rank_order(_array(features), arrays[2].reshape(-1), tiles.splat_of_rank, n, with_depth)
         d = features.shape[-1]
         image = np.empty((n_cameras, height, width, d), np.float32)
-        depth = np.empty((n_cameras, height, width, 1), np.float32) if with_depth else np.empty(0, np.float32)
-        transmittance = np.empty((n_cameras, height, width, 1), np.float32)
+        depth = np.empty((n_cameras, height, width, 1) if with_depth else 0, np.float32)
+        alphas, transmittance = (np.empty((n_cameras, height, width, 1), np.float32) for _ in range(2))
         last_drawn = np.empty(n_cameras * height * width, np.int32)
         tiling = (width, height, tiles.tiles_across, tiles.tiles_per_camera)
         for_each(
             kernels.forward,
             _tile_parts(n_cameras * tiles.tiles_per_camera),
-            *(tiles.tile_starts, tiles.ranks, tiles.records, channels, d + with_depth, with_depth, tiling),
-            *(image.reshape(-1), depth.reshape(-1), transmittance.reshape(-1), last_drawn),
+            *(tiles.tile_starts, tiles.ranks, tiles.records, channels, d + with_depth, depth_mode, tiling),
+            *(a.reshape(-1) for a in (image, depth, alphas, transmittance, last_drawn)),
         )
-        dtype = means2d.dtype
-        outputs = [torch.from_numpy(a).to(dtype) for a in (image, depth, transmittance)]
-        ctx.tiles, ctx.channels, ctx.tiling, ctx.with_depth = tiles, channels, tiling, with_depth
-        ctx.last_drawn, ctx.features_shape, ctx.splats_shape = last_drawn, features.shape, (n_cameras, n)
-        ctx.transmittance = transmittance.reshape(-1)
+        outputs = [torch.from_numpy(a).to(means2d.dtype) for a in (image, depth, alphas)]
         if not with_depth:
             ctx.mark_non_differentiable(outputs[1])
+        ctx.tiles, ctx.channels, ctx.tiling, ctx.depth_mode = tiles, channels, tiling, depth_mode
+        ctx.pixels = depth.reshape(-1).copy() if depth_mode == kernels.EXPECTED else depth[:0].reshape(-1)
+        ctx.transmittance, ctx.last_drawn = transmittance.reshape(-1), last_drawn
+        ctx.features_shape, ctx.splats_shape = features.shape, (n_cameras, n)
         return tuple(outputs)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, v_image, v_depth, v_transmittance):
-        tiles, (n_cameras, n) = ctx.tiles, ctx.splats_shape
-        d = ctx.features_shape[-1]
-        row = kernels.SHAPE_GRADIENTS + d + ctx.with_depth
-        incoming = [_array(t).reshape(-1) for t in (v_image, v_depth, v_transmittance)]
+    def backward(ctx, v_image, v_depth, v_alphas):
+        tiles, (n_cameras, n), with_depth = ctx.tiles, ctx.splats_shape, ctx.depth_mode != kernels.NO_DEPTH
+        n_channels = ctx.features_shape[-1] + with_depth
+        row = kernels.SHAPE_GRADIENTS + n_channels
+        incoming = [_array(t).reshape(-1) for t in (v_image, v_depth, v_alphas)]
         gradients = np.empty(len(tiles.ranks) * row + LANES, np.float32)
         for_each(
             kernels.backward,
             _tile_parts(n_cameras * tiles.tiles_per_camera),
-            *(tiles.tile_starts, tiles.ranks, tiles.slots, tiles.records, ctx.channels, d + ctx.with_depth),
-            *(ctx.with_depth, ctx.tiling, ctx.transmittance, ctx.last_drawn, *incoming, gradients),
+            *(tiles.tile_starts, tiles.ranks, tiles.slots, tiles.records, ctx.channels, n_channels),
+            *(ctx.depth_mode, ctx.tiling, ctx.pixels, ctx.transmittance, ctx.last_drawn, *incoming, gradients),
         )
         v_means2d, v_rows = np.empty((n_cameras, n, 2), np.float32), np.empty((n_cameras, n, 3), np.float32)
-        v_opacities = np.empty((n_cameras, n), np.float32)
-        v_depths = np.empty((n_cameras, n), np.float32) if ctx.with_depth else np.zeros((n_cameras, n), np.float32)
-        v_features = np.empty(ctx.features_shape, np.float32)
+        v_opacities, v_features = np.empty((n_cameras, n), np.float32), np.empty(ctx.features_shape, np.float32)
+        v_depths = np.empty((n_cameras, n), np.float32) if with_depth else np.zeros((n_cameras, n), np.float32)
         shared = len(ctx.features_shape) == 2
         for_each(
             kernels.reduce,
             ranges(n, GAUSSIANS_PER_PART),
-            *(n_cameras, n, shared, ctx.with_depth, tiles.rank_of_splat, tiles.slot_starts, tiles.records),
+            *(n_cameras, n, shared, with_depth, tiles.rank_of_splat, tiles.slot_starts, tiles.records),
             *(gradients, row),
             *(a.reshape(-1) for a in (v_means2d, v_rows, v_opacities, v_depths, v_features)),
         )

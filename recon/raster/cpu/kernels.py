@@ -39,10 +39,21 @@ ZERO, ONE, HALF = F32(0), F32(1), F32(0.5)
 LEAST, MOST, FINISHED = F32(ALPHA_MIN), F32(ALPHA_MAX), F32(TRANSMITTANCE_MIN)
 HALF_LOG2E = F32(-0.5 * math.log2(math.e))  # sigma to a power of two: exp(-d^2 / (2 var)) = 2^(HALF_LOG2E d^2 / var)
 LAST_X = F32(TILE_WIDTH - 1)
+NO_DEPTH, ACCUMULATED, EXPECTED = 0, 1, 2
+LEAST_WEIGHT = F32(1e-10)  # of an expected depth: the floor of the alpha that it is divided by
+LINE = 16  # floats of a cache line
 SHAPE_GRADIENTS = 6  # moments kept per intersection, before the channels
 
 _raster_kernel = kernel(fastmath={"contract", "reassoc", "arcp", "nsz"})
 _inline = kernel(fastmath={"contract", "reassoc", "arcp", "nsz"}, inline="never")
+
+
+@_inline
+def _aligned(size):
+    """Uninitialised float32 array that begins on a cache line."""
+    spare = np.empty(size + LINE, np.float32)
+    offset = (LINE - (spare.ctypes.data // 4) % LINE) % LINE
+    return spare[offset : offset + size]
 
 
 @_inline
@@ -74,18 +85,18 @@ def _rows_reached(records, at, my, last_y):
 
 @_raster_kernel
 def forward(
-    first, last, tile_starts, ranks, records, features, n_channels, with_depth, tiling, image, depth, transmittance,
-    last_drawn,
+    first, last, tile_starts, ranks, records, features, n_channels, depth_mode, tiling, image, depth, alphas,
+    transmittance, last_drawn,
 ):  # fmt: skip
     """Composite tiles first..last front to back.
 
-    features [R * D] in rank order, the depth as the last channel when `with_depth`. tiling = (width, height, tiles
-    across, tiles per camera). Writes image, depth, transmittance, and last_drawn: per pixel the position in
-    `ranks` of the last splat that was drawn, or -1. All arrays flat.
+    features [R * D] in rank order, the depth as the last channel unless depth_mode is NO_DEPTH. tiling = (width, height,
+    tiles across, tiles per camera). Writes image, depth, alphas, transmittance, and last_drawn: per pixel the position
+    in `ranks` of the last splat that was drawn, or -1. All arrays flat.
     """
     width, height, across, per_camera = tiling
-    n_colors = n_channels - 1 if with_depth else n_channels
-    planes = np.empty((1 + n_channels) * PLANE, np.float32)
+    n_colors = n_channels if depth_mode == NO_DEPTH else n_channels - 1
+    planes = _aligned((1 + n_channels) * PLANE)
     drawn_last = np.empty(PLANE, np.int32)
     centres = np.empty(TILE_HEIGHT, np.float32)
     lefts, rights = np.empty(TILE_HEIGHT, np.int32), np.empty(TILE_HEIGHT, np.int32)
@@ -138,12 +149,16 @@ def forward(
             pixel = (camera * height + tile_y * TILE_HEIGHT + y) * width + tile_x * TILE_WIDTH
             for x in range(wide):
                 i = y * TILE_WIDTH + x
-                transmittance[pixel + x] = abs(planes[i])
+                left = abs(planes[i])
+                transmittance[pixel + x] = left
+                alphas[pixel + x] = ONE - left
                 last_drawn[pixel + x] = drawn_last[i]
                 for c in range(n_colors):
                     image[(pixel + x) * n_colors + c] = planes[i + (c + 1) * PLANE]
-                if with_depth:
+                if depth_mode == ACCUMULATED:
                     depth[pixel + x] = planes[i + n_channels * PLANE]
+                elif depth_mode == EXPECTED:
+                    depth[pixel + x] = planes[i + n_channels * PLANE] / max(ONE - left, LEAST_WEIGHT)
 
 
 @_inline
@@ -159,8 +174,8 @@ def _any_alive(planes):
 
 @_raster_kernel
 def backward(
-    first, last, tile_starts, ranks, slots, records, features, n_channels, with_depth, tiling, transmittance,
-    last_drawn, v_image, v_depth, v_transmittance, gradients,
+    first, last, tile_starts, ranks, slots, records, features, n_channels, depth_mode, tiling, depth, transmittance,
+    last_drawn, v_image, v_depth, v_alphas, gradients,
 ):  # fmt: skip
     """Walk tiles first..last back to front; writes one row of `gradients` [I * (6 + D)] per intersection.
 
@@ -171,11 +186,11 @@ def backward(
     then dL/dfeature. :func:`reduce` turns sums of rows into gradients.
     """
     width, height, across, per_camera = tiling
-    n_colors = n_channels - 1 if with_depth else n_channels
+    n_colors = n_channels if depth_mode == NO_DEPTH else n_channels - 1
     row = SHAPE_GRADIENTS + n_channels
-    planes = np.empty((2 + n_channels) * PLANE, np.float32)  # transmittance, behind, dL/dchannel
+    planes = _aligned((2 + n_channels) * PLANE)  # transmittance, behind, dL/dchannel
     drawn_last = np.empty(PLANE, np.int32)
-    v_features = np.empty(n_channels * LANES, np.float32)
+    v_features = _aligned(n_channels * LANES)
     centres = np.empty(TILE_HEIGHT, np.float32)
     lefts, rights = np.empty(TILE_HEIGHT, np.int32), np.empty(TILE_HEIGHT, np.int32)
     none = simd.spread(ZERO)
@@ -193,13 +208,20 @@ def backward(
             for x in range(wide):
                 i = y * TILE_WIDTH + x
                 planes[i] = transmittance[pixel + x]
-                planes[i + PLANE] = v_transmittance[pixel + x] * transmittance[pixel + x]
+                v_left = -v_alphas[pixel + x]
+                if depth_mode == ACCUMULATED:
+                    planes[i + (n_channels + 1) * PLANE] = v_depth[pixel + x]
+                elif depth_mode == EXPECTED:
+                    covered = ONE - transmittance[pixel + x]
+                    v_sum = v_depth[pixel + x] / max(covered, LEAST_WEIGHT)
+                    planes[i + (n_channels + 1) * PLANE] = v_sum
+                    if covered > LEAST_WEIGHT:
+                        v_left += v_sum * depth[pixel + x]
+                planes[i + PLANE] = v_left * transmittance[pixel + x]
                 drawn_last[i] = last_drawn[pixel + x]
                 furthest = max(furthest, last_drawn[pixel + x])
                 for c in range(n_colors):
                     planes[i + (c + 2) * PLANE] = v_image[(pixel + x) * n_colors + c]
-                if with_depth:
-                    planes[i + (n_channels + 1) * PLANE] = v_depth[pixel + x]
         origin_x, origin_y = F32(tile_x * TILE_WIDTH) + HALF, F32(tile_y * TILE_HEIGHT) + HALF
         for k in range(max(furthest + 1, tile_starts[tile]), tile_starts[tile + 1]):
             gradients[slots[k] * row : (slots[k] + 1) * row] = ZERO
