@@ -1,1 +1,54 @@
-"""Synchronise videos of one moving scene by optimal transport between 4D tracks."""
+"""Synchronise videos of one moving scene by optimal transport between 4D tracks.
+
+Tracks in, offsets out::
+
+    from otsync import simulate, synchronize
+
+    tracks, truth = simulate("tennis", videos=4, seed=3)
+    offsets = synchronize(tracks)
+    offsets.save("offsets.json")
+
+Nouns are frozen dataclasses of arrays, verbs validate and report a status, algorithms are objects in slots.
+"""
+
+from .align import DTW, ConstantShift, align
+from .costs import Cosine, track_distance
+from .match import (
+    EntropicFGW,
+    FusedGromovWasserstein,
+    GromovWasserstein,
+    NearestNeighbor,
+    OptimalTransport,
+    PartialFGW,
+    match,
+)
+from .refine import refine
+from .sync import synchronize
+from .types import Alignment, Camera, Matches, Offsets, Refused, Status, TrackSet, Video
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "DTW",
+    "Alignment",
+    "Camera",
+    "ConstantShift",
+    "Cosine",
+    "EntropicFGW",
+    "FusedGromovWasserstein",
+    "GromovWasserstein",
+    "Matches",
+    "NearestNeighbor",
+    "Offsets",
+    "OptimalTransport",
+    "PartialFGW",
+    "Refused",
+    "Status",
+    "TrackSet",
+    "Video",
+    "align",
+    "match",
+    "refine",
+    "synchronize",
+    "track_distance",
+]

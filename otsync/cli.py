@@ -1,0 +1,263 @@
+"""The command line: ``otsync demo | simulate | match | sync | bench``, over the same dataclasses as the library.
+
+Exit codes: 0 done; 1 an answer was refused (its status is printed); 2 bad arguments or files; 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import tyro
+
+from . import __version__
+from .align import DTW, ConstantShift
+from .match import (
+    EntropicFGW,
+    FusedGromovWasserstein,
+    GromovWasserstein,
+    NearestNeighbor,
+    OptimalTransport,
+    PartialFGW,
+    match,
+)
+from .sync import synchronize, unique_names
+from .types import Offsets, Refused, Status, TrackSet
+
+if TYPE_CHECKING:
+    import numpy as np
+
+Motion = Literal["boxes", "juggle", "softball", "tennis", "basketball", "football", "static"]
+Preset = Literal["clean", "mid", "hard", "brutal"]
+Matcher = FusedGromovWasserstein | PartialFGW | EntropicFGW | GromovWasserstein | OptimalTransport | NearestNeighbor
+Aligner = DTW | ConstantShift
+
+
+@dataclass
+class Demo:
+    """Simulate a small unsynchronised world, match, synchronise, and show what came out.
+
+    Example: otsync demo --motion tennis --videos 4 --out demo
+    """
+
+    out: Path = Path("demo")
+    """Folder for offsets.json and report.html."""
+    motion: Motion = "softball"
+    preset: Preset = "mid"
+    videos: int = 4
+    seed: int = 1
+
+    def run(self) -> int:
+        from .simulate import simulate
+
+        tracks, truth = simulate(self.motion, preset=self.preset, videos=self.videos, seed=self.seed)
+        print(
+            f"{self.videos} videos of a simulated scene ({self.motion}, {self.preset}), filmed without a common clock."
+        )
+        offsets = with_progress(tracks, "matching and synchronising")
+        return report(offsets, tracks, truth.offsets, self.out, f"{self.motion}, {self.preset}: {self.videos} videos")
+
+
+@dataclass
+class Simulate:
+    """Write the tracks of several unsynchronised videos of one simulated scene, and the truth.
+
+    Example: otsync simulate world --motion juggle --preset mid --videos 6 --seed 3
+    """
+
+    out: tyro.conf.Positional[Path]
+    """Folder for one .npz per video and truth.json (in the format of offsets.json)."""
+    motion: str = "softball"
+    """boxes, juggle, softball, tennis, basketball, football, static, or mocap:FILE (BVH, or AMC beside its ASF)."""
+    preset: Preset = "mid"
+    videos: int = 4
+    frames: int = 150
+    fps: float = 30.0
+    max_offset: float = 30.0
+    """Largest offset, in frames."""
+    seed: int = 0
+
+    def run(self) -> int:
+        import numpy as np
+
+        from .simulate import simulate
+
+        tracks, truth = simulate(
+            self.motion, preset=self.preset, videos=self.videos, frames=self.frames, fps=self.fps,
+            max_offset=self.max_offset, seed=self.seed,
+        )  # fmt: skip
+        for t in tracks:
+            t.save(self.out / f"{t.name}.npz")
+        known = np.zeros(len(tracks))
+        Offsets(
+            names=unique_names(tracks), fps=np.array([t.fps for t in tracks], float), seconds=truth.offsets,
+            rates=truth.rates, sigma=known, reference=0, component=known.astype(int),
+            status=(Status.OK,) * len(tracks), flags=((),) * len(tracks),
+        ).save(self.out / "truth.json")  # fmt: skip
+        print(f"{self.out}: {', '.join(t.name + '.npz' for t in tracks)}, truth.json")
+        return 0
+
+
+@dataclass
+class Match:
+    """Match the tracks of two videos.
+
+    Example: otsync match a.npz b.npz --out matches.csv matcher:partial-fgw --matcher.mass 0.65
+    """
+
+    a: tyro.conf.Positional[Path]
+    b: tyro.conf.Positional[Path]
+    out: Path | None = None
+    """CSV file for the pairs (index in a, index in b, score)."""
+    matcher: Matcher = field(default_factory=FusedGromovWasserstein)
+
+    def run(self) -> int:
+        a, b = TrackSet.load(self.a), TrackSet.load(self.b)
+        found = match(a, b, self.matcher, throw=False)
+        print(f"{len(found)} matches between {len(a)} and {len(b)} tracks")
+        print("  ".join(f"{name} {value:.6g}" for name, value in found.stats.items()))
+        if self.out is not None:
+            from .files import atomic_write
+
+            assert found.score is not None
+            with atomic_write(self.out, "w") as stream:
+                stream.write("a,b,score\n")
+                stream.writelines(f"{i},{j},{s:.9g}\n" for (i, j), s in zip(found.pairs, found.score, strict=True))
+            print(f"wrote {self.out}")
+        return refusal("match", found.status, found.flags)
+
+
+@dataclass
+class Sync:
+    """Synchronise videos from their track sets.
+
+    Example: otsync sync world/*.npz --out result matcher:optimal-transport --matcher.reg 0.05 aligner:dtw
+    """
+
+    tracks: tyro.conf.Positional[tuple[Path, ...]]
+    """Track sets (.npz written by otsync), one per video, in one world frame."""
+    out: Path = Path("sync")
+    """Folder for offsets.json and report.html."""
+    reference: str | None = None
+    """Name of the reference video; default: the first."""
+    truth: Path | None = None
+    """truth.json of a simulated world: adds errors to the table."""
+    matcher: Matcher = field(default_factory=FusedGromovWasserstein)
+    aligner: Aligner = field(default_factory=DTW)
+
+    def run(self) -> int:
+        if len(self.tracks) < 2:
+            raise ValueError(f"tracks: expected at least two .npz files; found {len(self.tracks)}.")
+        tracks = [TrackSet.load(path) for path in self.tracks]
+        names = unique_names(tracks)
+        reference = 0
+        if self.reference is not None:
+            if self.reference not in names:
+                raise ValueError(f"--reference: expected one of {', '.join(names)}; found {self.reference!r}.")
+            reference = names.index(self.reference)
+        truth = None if self.truth is None else true_offsets(self.truth, names, reference)
+        offsets = with_progress(
+            tracks, "synchronising", reference=reference, matcher=self.matcher, aligner=self.aligner
+        )
+        return report(offsets, tracks, truth, self.out, "Synchronisation report")
+
+
+COMMANDS: dict[str, Callable[..., Any]] = {"demo": Demo, "simulate": Simulate, "match": Match, "sync": Sync}
+
+
+def true_offsets(path: Path, names: tuple[str, ...], reference: int) -> np.ndarray:
+    """True offsets of the named videos relative to the reference; ValueError names what the file lacks."""
+    import numpy as np
+
+    known = Offsets.load(path)
+    missing = [name for name in names if name not in known.names]
+    if missing:
+        raise ValueError(f"{path}: expected offsets of {', '.join(names)}; {', '.join(missing)} are not in it.")
+    seconds = np.array([known.seconds[known.names.index(name)] for name in names])
+    return seconds - seconds[reference]
+
+
+def with_progress(tracks: list[TrackSet], what: str, **options: Any) -> Offsets:
+    """:func:`otsynchronize` with a progress bar on a terminal."""
+
+    def progress(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterable[Any]:
+        from tqdm import tqdm
+
+        items = list(items)
+        return tqdm(map(function, items), total=len(items), desc=what, unit="pair", disable=None, leave=False)
+
+    return synchronize(tracks, map=progress, **options)
+
+
+def report(offsets: Offsets, tracks: list[TrackSet], truth: Any, out: Path, title: str) -> int:
+    """Print the table, write offsets.json and report.html; exit code 1 when an answer was refused."""
+    from .report import write_report
+
+    print(table(offsets, truth))
+    offsets.save(out / "offsets.json")
+    write_report(out / "report.html", offsets, tracks, truth=truth, title=title)
+    print(f"wrote {out / 'offsets.json'} and {out / 'report.html'}")
+    doubtful = [n for n, s in zip(offsets.names, offsets.status, strict=True) if not s.ok]
+    for name, flags in zip(offsets.names, offsets.flags, strict=True):
+        for flag in flags:
+            print(f"{name}: {flag.code}: {flag}", file=sys.stderr)
+    return 1 if doubtful else 0
+
+
+def table(offsets: Offsets, truth: Any = None) -> str:
+    """The answer as text, in frames of the reference."""
+    import numpy as np
+
+    fps = offsets.fps[offsets.component]
+    true = np.full(len(offsets), np.nan) if truth is None else np.asarray(truth) * fps
+    width = max(5, *map(len, offsets.names))
+    lines = [
+        f"{'video':{width}}  {'offset':>9} {'sigma':>8} {'true':>9} {'error':>8}  status   (frames of the reference)"
+    ]
+    for v, name in enumerate(offsets.names):
+        values = (offsets.frames[v], offsets.sigma[v] * fps[v], true[v], offsets.frames[v] - true[v])
+        cells = [f"{x:{w}.3f}" if np.isfinite(x) else "–".rjust(w) for x, w in zip(values, (9, 8, 9, 8), strict=True)]
+        status = offsets.status[v].code if v != offsets.component[v] else "reference"
+        lines.append(f"{name:{width}}  {' '.join(cells)}  {status}")
+    return "\n".join(lines)
+
+
+def refusal(verb: str, status: Status, flags: tuple[Status, ...]) -> int:
+    if status.ok:
+        return 0
+    for flag in flags or (status,):
+        print(f"{verb} refused: {flag.code}: {flag}", file=sys.stderr)
+    return 1
+
+
+def main(args: list[str] | None = None) -> int:
+    """Entry point of the ``otsync`` command."""
+    args = sys.argv[1:] if args is None else args
+    if args == ["--version"]:
+        print(f"otsync {__version__}")
+        return 0
+    command = tyro.extras.subcommand_cli_from_dict(
+        COMMANDS,
+        prog="otsync",
+        description=__doc__,
+        args=args,
+        config=(tyro.conf.AvoidSubcommands,) if not args else (),
+    )
+    try:
+        return command.run()
+    except Refused as error:
+        print(f"otsync: {error}", file=sys.stderr)
+        return 1
+    except (ValueError, OSError) as error:
+        print(f"otsync: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("otsync: interrupted; nothing half-written is left.", file=sys.stderr)
+        return 130
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,132 @@
+"""Reading and writing files so that nothing is half written and no stranger's file takes the memory."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+import zipfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+MAX_BYTES = 8 * 2**30
+"""Largest total size of the arrays of one file that is read without being asked (8 GiB)."""
+
+
+@contextmanager
+def atomic_write(path: str | os.PathLike[str], mode: str = "wb") -> Iterator[IO[Any]]:
+    """Open a temporary file beside ``path`` and rename it into place when the block ends well.
+
+    An exception or Ctrl-C inside the block leaves the old file as it was and no temporary one behind.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
+    try:
+        with os.fdopen(handle, mode, encoding=None if "b" in mode else "utf-8") as stream:
+            yield stream
+            stream.flush()
+            os.fsync(stream.fileno())
+        umask = os.umask(0)
+        os.umask(umask)
+        os.chmod(temporary, 0o666 & ~umask)
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def write_json(path: str | os.PathLike[str], value: Any) -> None:
+    """Write ``value`` as indented JSON, atomically; nan and infinity are refused (use None)."""
+    text = json.dumps(value, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+    with atomic_write(path, "w") as stream:
+        stream.write(text)
+
+
+def read_json(path: str | os.PathLike[str], *, max_bytes: int = 64 * 2**20) -> Any:
+    """Read a JSON file of at most ``max_bytes``. Raises ValueError naming the file for anything else."""
+    path = existing(path)
+    if path.stat().st_size > max_bytes:
+        raise ValueError(f"{path}: expected a JSON file of at most {max_bytes} bytes; found {path.stat().st_size}.")
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+        raise ValueError(f"{path}: expected JSON; {error}. Write it again with otsync.") from None
+
+
+def existing(path: str | os.PathLike[str]) -> Path:
+    """``path`` as a Path to a regular file. FileNotFoundError names what is missing and what lies beside it."""
+    path = Path(path)
+    if path.is_file():
+        return path
+    if path.is_dir():
+        raise ValueError(f"{path}: expected a file; found a folder.")
+    beside = sorted(p.name for p in path.parent.glob(f"*{path.suffix}"))[:8] if path.parent.is_dir() else []
+    hint = f"beside it lie {', '.join(beside)}" if beside else f"its folder holds no {path.suffix or 'such'} files"
+    raise FileNotFoundError(f"{path}: no such file; {hint}. Check the path.")
+
+
+def write_npz(path: str | os.PathLike[str], arrays: dict[str, np.ndarray]) -> None:
+    """Write plain arrays as ``.npz``, atomically. Object arrays are refused: they would need pickle."""
+    for name, array in arrays.items():
+        if array.dtype.hasobject:
+            raise ValueError(f"{name}: expected a plain array; found dtype {array.dtype}. Convert it first.")
+    with atomic_write(path) as stream:
+        np.savez(stream, allow_pickle=False, **arrays)
+
+
+def read_npz(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> dict[str, np.ndarray]:
+    """Read every array of an ``.npz`` without pickle, after checking the declared sizes against the file.
+
+    Raises ValueError naming the file for a foreign, truncated, tampered or oversized one.
+    """
+    path = existing(path)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            total = sum(_declared_bytes(archive, info) for info in archive.infolist())
+        if total > max_bytes:
+            raise ValueError(f"arrays of {total} bytes, more than the {max_bytes} allowed; pass a larger max_bytes")
+        with np.load(path, allow_pickle=False) as data:
+            return {name: data[name] for name in data.files}
+    except (
+        zipfile.BadZipFile,
+        ValueError,
+        KeyError,
+        EOFError,
+        OSError,
+        NotImplementedError,
+        zipfile.LargeZipFile,
+    ) as e:
+        raise ValueError(f"{path}: expected a readable .npz of plain arrays; {e}.") from None
+    except Exception as error:  # zlib.error and the like: whatever a corrupted stream raises
+        raise ValueError(
+            f"{path}: expected a readable .npz of plain arrays; {type(error).__name__}: {error}."
+        ) from None
+
+
+_HEADERS: dict[tuple[int, int], Callable[..., tuple[tuple[int, ...], bool, np.dtype]]] = {
+    (1, 0): np.lib.format.read_array_header_1_0,
+    (2, 0): np.lib.format.read_array_header_2_0,
+}
+
+
+def _declared_bytes(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> int:
+    """Bytes of one member's array by its own header, which must agree with the archive's directory."""
+    with archive.open(info) as member:
+        version = np.lib.format.read_magic(member)
+        if version not in _HEADERS:
+            raise ValueError(f"member {info.filename!r} has the unknown .npy version {version}")
+        shape, _, dtype = _HEADERS[version](member)
+        header = member.tell()
+    if dtype.hasobject:
+        raise ValueError(f"member {info.filename!r} holds pickled objects, which are never read")
+    size = dtype.itemsize
+    for length in shape:
+        size *= int(length)
+    if any(length < 0 for length in shape) or size + header != info.file_size:
+        raise ValueError(f"member {info.filename!r} declares {size} bytes but holds {info.file_size - header}")
+    return size

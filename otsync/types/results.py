@@ -1,0 +1,288 @@
+"""What the verbs return: matches of a pair, alignment of a pair, offsets of all videos."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..files import read_json, write_json
+from .status import Status, in_order
+
+Stats = dict[str, float]
+
+FORMAT, VERSION = "otsync.offsets", 1
+SIGN = (
+    "t_world = rate * t_video + offset_seconds, t_video in seconds on the video's own clock; a positive offset means "
+    "that the video started later than its reference; offset_frames = offset_seconds * fps of the reference"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """Corresponding tracks of two videos. ``Matches(pairs, score)`` alone is valid: bring your own.
+
+    Args:
+        pairs: (M,2) indices into a's and b's tracks; a track may appear in several pairs.
+        score: (M,), larger is better; None: all equal.
+        plan: the transport plan, dense (Na,Nb) or scipy.sparse, when the matcher has one.
+        status, flags: what the answer is worth.
+        stats: objective, iterations, seconds, marginal_error, mass, ...
+    """
+
+    pairs: Int[np.ndarray, "M 2"]
+    score: Float[np.ndarray, " M"] | None = None
+    plan: Any = None
+    status: Status = Status.OK
+    flags: tuple[Status, ...] = ()
+    stats: Stats = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        pairs = np.asarray(self.pairs)
+        if pairs.size == 0:
+            pairs = pairs.reshape(0, 2).astype(np.int64)
+        if pairs.ndim != 2 or pairs.shape[1] != 2 or pairs.dtype.kind not in "iu":
+            raise ValueError(
+                f"Matches.pairs: expected integers of shape (M,2); found {pairs.dtype} of shape {pairs.shape}."
+            )
+        if (pairs < 0).any():
+            raise ValueError("Matches.pairs: expected indices >= 0; found negative ones.")
+        score = np.ones(len(pairs)) if self.score is None else np.asarray(self.score, float)
+        if score.shape != (len(pairs),) or np.isnan(score).any():
+            raise ValueError(
+                f"Matches.score: expected {len(pairs)} numbers without nan; found shape {score.shape}"
+                f"{' with nan' if np.isnan(score).any() else ''}."
+            )
+        object.__setattr__(self, "pairs", pairs.astype(np.int64))
+        object.__setattr__(self, "score", score)
+
+    def __len__(self) -> int:
+        return len(self.pairs)
+
+    def check(self, name: str, n_a: int, n_b: int) -> None:
+        """ValueError, naming the argument, when a pair points beyond the tracks."""
+        for column, n, side in ((0, n_a, "a"), (1, n_b, "b")):
+            top = int(self.pairs[:, column].max(initial=-1))
+            if top >= n:
+                raise ValueError(
+                    f"{name}.pairs: expected indices of {side} below {n}; found {top}. Are a and b swapped?"
+                )
+
+    def best(self, n: int) -> Matches:
+        """The ``n`` best by score, ties in the given order."""
+        assert self.score is not None
+        order = np.argsort(-self.score, kind="stable")[:n]
+        return Matches(self.pairs[order], self.score[order], self.plan, self.status, self.flags, self.stats)
+
+    def without_plan(self) -> Matches:
+        """The same matches without the plan, which is as large as both videos' tracks multiplied."""
+        return Matches(self.pairs, self.score, None, self.status, self.flags, self.stats)
+
+    def swapped(self) -> Matches:
+        """The same matches with a and b exchanged."""
+        plan = None if self.plan is None else self.plan.T
+        return Matches(self.pairs[:, ::-1], self.score, plan, self.status, self.flags, self.stats)
+
+
+_NO_PEAKS = np.zeros((0, 2))
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """When b happened on a's clock: ``t_a = rate * t_b + offset``; ``offset(a,b) = offset_b - offset_a``.
+
+    Args:
+        offset: seconds; positive when b started later than a; nan when there is no answer.
+        rate: seconds of a's clock per second of b's.
+        sigma: one standard deviation of ``offset`` in seconds, nan when not estimated.
+        hypotheses: (H,2) peaks of the score, best first: offset in seconds, score.
+        curve: (K,2) the whole score: offset in seconds, score (larger is better; -inf where not defined).
+        path: (P,2) frame pairs of a warping path on the common clock.
+        cost: frame-to-frame cost on the common clock, nan where no match is seen.
+        fps: frames per second of the common clock: ``offset * fps`` is in frames.
+        stats: seconds, matches, evidence, ...
+    """
+
+    offset: float
+    rate: float = 1.0
+    sigma: float = math.nan
+    hypotheses: Float[np.ndarray, "H 2"] = field(default_factory=lambda: _NO_PEAKS)
+    curve: Float[np.ndarray, "K 2"] | None = None
+    path: Int[np.ndarray, "P 2"] | None = None
+    cost: Float[np.ndarray, "Ta Tb"] | None = None
+    fps: float = math.nan
+    status: Status = Status.OK
+    flags: tuple[Status, ...] = ()
+    stats: Stats = field(default_factory=dict)
+
+    @property
+    def frames(self) -> float:
+        """The offset in frames of the common clock."""
+        return self.offset * self.fps
+
+
+@dataclass(frozen=True, eq=False)
+class Offsets:
+    """The clocks of V videos: ``t_world = rates[v] * t_v + seconds[v]``.
+
+    Args:
+        names, fps: of every video.
+        seconds: (V,) offsets; nan where there is no answer. The reference has 0.
+        rates: (V,) 1 unless declared or fitted.
+        sigma: (V,) one standard deviation in seconds, nan when not estimated; 0 for a reference.
+        reference: index of the video whose clock is the world's.
+        component: (V,) index of the video whose clock ``seconds[v]`` refers to. All ``reference`` when the videos
+            hang together; a disconnected group has a reference of its own.
+        alignments: per pair (i, j) the pair's own answer. matches: what it was made from, without plans.
+        status, flags: per video. stats: of the whole.
+    """
+
+    names: tuple[str, ...]
+    fps: Float[np.ndarray, " V"]
+    seconds: Float[np.ndarray, " V"]
+    rates: Float[np.ndarray, " V"]
+    sigma: Float[np.ndarray, " V"]
+    reference: int
+    component: Int[np.ndarray, " V"]
+    status: tuple[Status, ...]
+    flags: tuple[tuple[Status, ...], ...]
+    alignments: Mapping[tuple[int, int], Alignment] = field(default_factory=dict)
+    matches: Mapping[tuple[int, int], Matches] = field(default_factory=dict)
+    stats: Stats = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def frames(self) -> Float[np.ndarray, " V"]:
+        """Offsets in frames of each video's reference."""
+        return self.seconds * self.fps[self.component]
+
+    @property
+    def ok(self) -> bool:
+        """Whether every video's offset is to be trusted."""
+        return all(s.ok for s in self.status)
+
+    def between(self, a: int, b: int) -> float:
+        """offset(a, b) = offset_b - offset_a in seconds; nan when no chain of pairs links them."""
+        return float(self.seconds[b] - self.seconds[a]) if self.component[a] == self.component[b] else math.nan
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write ``offsets.json``: unit, sign and reference in words; atomically."""
+        write_json(path, self.to_dict())
+
+    def to_dict(self) -> dict[str, Any]:
+        """The content of ``offsets.json``."""
+        videos = [
+            {
+                "name": self.names[v],
+                "fps": _number(self.fps[v]),
+                "rate": _number(self.rates[v]),
+                "offset_seconds": _number(self.seconds[v]),
+                "offset_frames": _number(self.frames[v]),
+                "sigma_seconds": _number(self.sigma[v]),
+                "reference": self.names[self.component[v]],
+                "status": self.status[v].code,
+                "flags": [f.code for f in self.flags[v]],
+            }
+            for v in range(len(self))
+        ]
+        pairs = [
+            {
+                "a": self.names[i],
+                "b": self.names[j],
+                "fps": _number(p.fps),
+                "rate": _number(p.rate),
+                "offset_seconds": _number(p.offset),
+                "offset_frames": _number(p.frames),
+                "sigma_seconds": _number(p.sigma),
+                "status": p.status.code,
+                "flags": [f.code for f in p.flags],
+                "hypotheses": [[_number(x) for x in row] for row in p.hypotheses],
+                "stats": {k: _number(x) for k, x in p.stats.items()},
+            }
+            for (i, j), p in sorted(self.alignments.items())
+        ]
+        return {
+            "format": FORMAT,
+            "version": VERSION,
+            "unit": "seconds",
+            "sign": SIGN,
+            "reference": self.names[self.reference],
+            "videos": videos,
+            "pairs": pairs,
+            "stats": {k: _number(x) for k, x in self.stats.items()},
+        }
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Offsets:
+        """Read ``offsets.json``; matches, curves, paths and cost maps are not in the file. ValueError names file and field."""
+        data = read_json(path)
+        if not isinstance(data, dict) or data.get("format") != FORMAT:
+            raise ValueError(f"{path}: expected an offsets file written by otsync (format {FORMAT!r}); found another.")
+        if data.get("version") != VERSION:
+            raise ValueError(
+                f"{path}: expected version {VERSION}; found {data.get('version')!r}. Read it with the otsync release "
+                "that wrote it, or write it anew with this one."
+            )
+        try:
+            return cls._from_dict(data)
+        except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+            raise ValueError(
+                f"{path}: not a sound offsets file; {type(error).__name__}: {error}. Write it anew."
+            ) from None
+
+    @classmethod
+    def _from_dict(cls, data: dict[str, Any]) -> Offsets:
+        videos = data["videos"]
+        index = {video["name"]: v for v, video in enumerate(videos)}
+        if len(index) != len(videos) or not videos:
+            raise ValueError("videos: expected at least one, with unique names")
+
+        def column(key: str, rows: Sequence[dict[str, Any]] = videos) -> np.ndarray:
+            return np.array([_float(row[key]) for row in rows])
+
+        alignments = {}
+        for p in data["pairs"]:
+            alignments[index[p["a"]], index[p["b"]]] = Alignment(
+                offset=_float(p["offset_seconds"]),
+                rate=_float(p["rate"]),
+                sigma=_float(p["sigma_seconds"]),
+                hypotheses=np.array([[_float(x) for x in row] for row in p["hypotheses"]]).reshape(-1, 2),
+                fps=_float(p["fps"]),
+                status=Status.from_code(p["status"]),
+                flags=tuple(Status.from_code(f) for f in p["flags"]),
+                stats={str(k): _float(x) for k, x in p["stats"].items()},
+            )
+        return cls(
+            names=tuple(index),
+            fps=column("fps"),
+            seconds=column("offset_seconds"),
+            rates=column("rate"),
+            sigma=column("sigma_seconds"),
+            reference=index[data["reference"]],
+            component=np.array([index[video["reference"]] for video in videos]),
+            status=tuple(Status.from_code(video["status"]) for video in videos),
+            flags=tuple(in_order(Status.from_code(f) for f in video["flags"]) for video in videos),
+            alignments=alignments,
+            stats={str(k): _float(x) for k, x in data["stats"].items()},
+        )
+
+
+def _number(x: Any) -> float | None:
+    """A JSON number, or None for nan and infinities."""
+    x = float(x)
+    return x if math.isfinite(x) else None
+
+
+def _float(x: Any) -> float:
+    if x is None:
+        return math.nan
+    if isinstance(x, bool) or not isinstance(x, int | float):
+        raise ValueError(f"expected a number or null; found {x!r}")
+    return float(x)

@@ -1,0 +1,231 @@
+"""4D feature tracks of one video: the paper's ({τ_t}, f), and what a tracker knows besides."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ..files import MAX_BYTES, read_npz, write_npz
+from .camera import Camera, clock, frame_times
+
+FORMAT, VERSION = "otsync.tracks", 1
+
+
+@dataclass(frozen=True, eq=False)
+class TrackSet:
+    """N tracks over the T frames of one video.
+
+    Args:
+        xyz: positions in world units, or None when only ``uv`` is known. Read only where ``visible``.
+        visible: where a track was observed; (N,T). None: everywhere.
+        features: time-invariant descriptors, any scale but not zero (verbs normalise them).
+        fps: frames per second of the video's own clock; or
+        timestamps: seconds of every frame on that clock, strictly increasing (variable frame rate, dropped frames).
+        name: of the video, for tables and files.
+        uv: pixels, (N,T,2).
+        sigma: one standard deviation of position, world units, (N,T).
+        labels: (N,) integer instance or class, or (N,L) soft memberships.
+        camera: who filmed.
+        frame: name of the world frame of ``xyz``. Positions of two sets are compared only when both declare the same.
+
+    Shapes and the clock are checked here; contents (nan in visible samples, zero features) by the verbs, which
+    name their argument. Integer and half-precision positions become float64 and float32.
+    """
+
+    xyz: Float[np.ndarray, "N T 3"] | None
+    visible: Bool[np.ndarray, "N T"] | None = None
+    features: Float[np.ndarray, "N D"] | None = None
+    fps: float | None = None
+    timestamps: Float[np.ndarray, " T"] | None = None
+    name: str = ""
+    uv: Float[np.ndarray, "N T 2"] | None = None
+    sigma: Float[np.ndarray, "N T"] | None = None
+    labels: np.ndarray | None = None
+    camera: Camera | None = None
+    frame: str | None = None
+
+    def __post_init__(self) -> None:
+        def put(field: str, value: Any) -> None:
+            object.__setattr__(self, field, value)
+
+        lead = self.xyz if self.xyz is not None else self.uv
+        if lead is None:
+            raise ValueError("TrackSet.xyz: expected positions (N,T,3), or uv (N,T,2); found neither.")
+        shape = np.shape(lead)[:2]
+        for field, tail in (("xyz", (3,)), ("uv", (2,)), ("sigma", ())):
+            value = getattr(self, field)
+            if value is not None:
+                put(field, _real(value, (*shape, *tail), f"TrackSet.{field}"))
+        put("visible", _visible(self.visible, shape))
+        if self.features is not None:
+            put("features", _real(self.features, (shape[0], None), "TrackSet.features"))
+        if self.labels is not None:
+            labels = np.asarray(self.labels)
+            if labels.ndim not in (1, 2) or len(labels) != shape[0] or labels.dtype.kind not in "iuf":
+                raise ValueError(
+                    f"TrackSet.labels: expected numbers of shape ({shape[0]},) or ({shape[0]},L); "
+                    f"found {labels.dtype} of shape {labels.shape}."
+                )
+            put("labels", labels)
+        fps, timestamps = clock(self.fps, self.timestamps, shape[1], "TrackSet")
+        put("fps", fps)
+        put("timestamps", timestamps)
+
+    def __len__(self) -> int:
+        return len(self.seen)
+
+    def __repr__(self) -> str:
+        what = [f for f in ("xyz", "uv", "features", "sigma", "labels", "camera") if getattr(self, f) is not None]
+        return f"TrackSet({self.name!r}, {len(self)} tracks x {self.n_frames} frames, fps={self.fps}, {'+'.join(what)})"
+
+    @property
+    def n_frames(self) -> int:
+        return self.seen.shape[1]
+
+    @property
+    def times(self) -> Float[np.ndarray, " T"]:
+        """Seconds of every frame on the video's own clock."""
+        return frame_times(self.fps, self.timestamps, self.n_frames)
+
+    @property
+    def seen(self) -> Bool[np.ndarray, "N T"]:
+        """``visible``, which is never None once constructed."""
+        assert self.visible is not None
+        return self.visible
+
+    def positions(self) -> Float[np.ndarray, "N T 3"]:
+        """``xyz`` as float64 with nan where not visible; a copy."""
+        if self.xyz is None:
+            raise ValueError("xyz: expected 3D positions; this track set holds pixels only. Lift it with depth first.")
+        return np.where(self.seen[..., None], self.xyz, np.nan).astype(float, copy=False)
+
+    def take(self, index: Any) -> TrackSet:
+        """The tracks at ``index`` (integers, a slice or a mask), in that order."""
+        fields = ("xyz", "visible", "features", "uv", "sigma", "labels")
+        return replace(self, **{f: v[index] for f in fields if (v := getattr(self, f)) is not None})
+
+    def check(self, name: str, *, xyz: bool = True, features: bool = False) -> None:
+        """Raise ValueError, naming the argument ``name``, unless the contents are fit for use.
+
+        Asked of every set: at least one track, finite visible samples. ``xyz``/``features``: that they are there;
+        features must be finite and not zero.
+        """
+        if len(self) == 0 or self.n_frames == 0:
+            raise ValueError(f"{name}: expected at least one track and one frame; found {len(self)} x {self.n_frames}.")
+        if xyz and self.xyz is None:
+            raise ValueError(f"{name}.xyz: expected 3D positions; found pixels only. Lift the tracks with depth first.")
+        for field in ("xyz", "uv", "sigma"):
+            value = getattr(self, field)
+            if value is None:
+                continue
+            finite = np.isfinite(value)
+            bad = self.seen & ~(finite.all(-1) if value.ndim == 3 else finite)
+            if bad.any():
+                n, t = np.argwhere(bad)[0]
+                raise ValueError(
+                    f"{name}.{field}: expected finite values in visible samples; {int(bad.sum())} are not, the first in "
+                    f"track {n}, frame {t}. Mark unobserved samples in visible."
+                )
+        if features:
+            if self.features is None:
+                raise ValueError(
+                    f"{name}.features: expected (N,D) descriptors; found none. Add them, or match by hand."
+                )
+            _check_features(self.features, name)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write a versioned ``.npz`` without pickle, atomically."""
+        arrays: dict[str, np.ndarray] = {"format": np.array(FORMAT), "version": np.array(VERSION)}
+        for field in ("xyz", "visible", "features", "fps", "timestamps", "uv", "sigma", "labels"):
+            value = getattr(self, field)
+            if value is not None:
+                arrays[field] = np.asarray(value)
+        arrays["name"] = np.array(self.name)
+        if self.frame is not None:
+            arrays["frame"] = np.array(self.frame)
+        if self.camera is not None:
+            for field in ("K", "w2c", "width", "height", "distortion", "readout"):
+                value = getattr(self.camera, field)
+                if value is not None:
+                    arrays[f"camera_{field}"] = np.asarray(value)
+        write_npz(path, arrays)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> TrackSet:
+        """Read what :meth:`save` wrote. ValueError names the file for anything foreign, damaged or oversized."""
+        data = read_npz(path, max_bytes=max_bytes)
+        if str(data.get("format")) != FORMAT:
+            raise ValueError(f"{path}: expected a track set written by otsync (format {FORMAT!r}); found another .npz.")
+        version = data.get("version")
+        if version is None or version.shape != () or version.dtype.kind not in "iu" or int(version) != VERSION:
+            raise ValueError(
+                f"{path}: expected version {VERSION}; found {version}. Read it with the otsync release that wrote it."
+            )
+        try:
+            camera = None
+            if "camera_K" in data:
+                parts = {k.removeprefix("camera_"): v for k, v in data.items() if k.startswith("camera_")}
+                scalars = {k: v.item() for k, v in parts.items() if k in ("width", "height", "readout")}
+                camera = Camera(**{**parts, **scalars})
+            arrays = {k: data[k] for k in ("visible", "features", "timestamps", "uv", "sigma", "labels") if k in data}
+            return cls(
+                data.get("xyz"),
+                **arrays,
+                fps=float(data["fps"]) if "fps" in data else None,
+                name=str(data.get("name", "")),
+                camera=camera,
+                frame=str(data["frame"]) if "frame" in data else None,
+            )
+        except (ValueError, TypeError, KeyError) as error:
+            raise ValueError(f"{path}: not a sound track set; {error}") from None
+
+
+def _real(value: Any, shape: tuple[int | None, ...], name: str) -> np.ndarray:
+    """``value`` as a float32 or float64 array of ``shape`` (None: any length)."""
+    array = np.asarray(value)
+    fits = array.ndim == len(shape) and all(s is None or s == n for s, n in zip(shape, array.shape, strict=True))
+    if not fits or array.dtype.kind not in "iufb":
+        want = ",".join("D" if s is None else str(s) for s in shape)
+        raise ValueError(
+            f"{name}: expected real numbers of shape ({want}); found {array.dtype} of shape {array.shape}."
+        )
+    if array.dtype in (np.float32, np.float64):
+        return array
+    return array.astype(np.float32 if array.dtype == np.float16 else np.float64)
+
+
+def _visible(value: Any, shape: tuple[int, ...]) -> np.ndarray:
+    if value is None:
+        return np.ones(shape, bool)
+    visible = np.asarray(value)
+    if (
+        visible.shape != shape
+        or visible.dtype.kind not in "bu"
+        or (visible.dtype.kind == "u" and visible.max(initial=0) > 1)
+    ):
+        raise ValueError(
+            f"TrackSet.visible: expected booleans of shape {shape}; found {visible.dtype} of {visible.shape}."
+        )
+    return visible.astype(bool, copy=False)
+
+
+def _check_features(features: np.ndarray, name: str) -> None:
+    bad = ~np.isfinite(features).all(1)
+    if bad.any():
+        raise ValueError(f"{name}.features: expected finite values; tracks {_some(bad)} have nan or infinity.")
+    # the largest entry, not the norm: it neither under- nor overflows
+    bad = np.abs(features).max(1, initial=0.0) == 0
+    if bad.any():
+        raise ValueError(
+            f"{name}.features: expected non-zero descriptors; tracks {_some(bad)} are all zero. Leave those tracks out."
+        )
+
+
+def _some(mask: np.ndarray) -> str:
+    """The first few indices where ``mask`` holds, for an error message."""
+    index = np.flatnonzero(mask)
+    return ", ".join(map(str, index[:8])) + (f" and {len(index) - 8} more" if len(index) > 8 else "")
