@@ -9,7 +9,7 @@
     gsplat_backend.py  the same on CUDA, through gsplat
 """
 
-from recon.raster.render import render
+from recon.raster.render import render, set_threads, warmup
 from recon.raster.rendering import Rendering, Settings, Splats
 
-__all__ = ["Rendering", "Settings", "Splats", "render"]
+__all__ = ["Rendering", "Settings", "Splats", "render", "set_threads", "warmup"]

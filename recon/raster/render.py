@@ -74,6 +74,19 @@ def render(
     return Rendering(image, alphas, depths, splats.means2d, splats.radii, name)
 
 
+def warmup() -> None:
+    """Compile the CPU back end now, or load its compiled code; without numba there is nothing to do."""
+    if _has_numba():
+        _engine("cpu").warmup()
+
+
+def set_threads(n: int) -> None:
+    """Let the CPU back end use `n` threads, the caller's included; results do not depend on it, to the last bit."""
+    from recon.raster.cpu import threads
+
+    threads.set_threads(n)
+
+
 def _engine(name: str) -> ModuleType:
     if name == "torch":
         from recon.raster import torch_backend

@@ -6,6 +6,9 @@ Everything is computed in float32 (the projection inside in float64); float64 te
 
 from __future__ import annotations
 
+import logging
+import threading
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -18,6 +21,8 @@ from recon.raster.cpu.threads import for_each, ranges
 from recon.raster.rendering import Settings, Splats
 
 GAUSSIANS_PER_PART = 1024  # of the projection: fixed, so that sums over parts do not depend on the threads
+logger = logging.getLogger("recon.raster")
+
 DEPTH_MODES = {None: kernels.NO_DEPTH, "accumulated": kernels.ACCUMULATED, "expected": kernels.EXPECTED}
 PARTS = 64  # of the tiles: many, because tiles differ by orders of magnitude in their work
 
@@ -34,6 +39,8 @@ def project(
     settings: Settings,
 ) -> Splats:
     """As :func:`recon.raster.projection.project`."""
+    if not _warm:
+        warmup()
     return Splats(*_Project.apply(means, quats, scales, opacities, viewmats, Ks, width, height, settings))
 
 
@@ -43,6 +50,46 @@ def rasterize(
     """As :func:`recon.raster.torch_backend.rasterize`."""
     image, depths, alphas = _Rasterize.apply(*splats, features, width, height, DEPTH_MODES[depth])
     return image, depths if depth else None, alphas
+
+
+_warm = False
+_warming = threading.Lock()
+
+
+def warmup() -> None:
+    """Load every kernel from numba's cache, or compile it: a fraction of a second, or some seconds once per machine.
+
+    Happens by itself with the first rendering; call it to choose when. Says so when it takes long.
+    """
+    global _warm
+    with _warming:
+        if _warm:
+            return
+        timer = threading.Timer(1.0, _announce_compilation)
+        timer.daemon = True
+        timer.start()
+        try:
+            _exercise()
+        finally:
+            timer.cancel()
+        _warm = True
+
+
+def _announce_compilation() -> None:
+    every = (projection.forward, projection.backward, kernels.forward, kernels.backward)
+    if any(k.stats.cache_misses or not k.stats.cache_hits and k.signatures for k in every):
+        logger.warning("recon.raster compiles its CPU kernels: about 15 seconds, once per machine and version")
+
+
+def _exercise() -> None:
+    """One Gaussian, one camera, forward and backward: every kernel with the types it always has."""
+    gaussian = [torch.tensor([[0.0, 0, 2]]), torch.tensor([[1.0, 0, 0, 0]]), torch.ones(1, 3), torch.ones(1)]
+    K = torch.tensor([[[8.0, 0, 4], [0, 8, 4], [0, 0, 1]]])
+    with torch.enable_grad():
+        leaves = [t.requires_grad_() for t in gaussian]
+        splats = Splats(*_Project.apply(*leaves, torch.eye(4)[None], K, 8, 8, Settings()))
+        image, _, _ = _Rasterize.apply(*splats, torch.ones(1, 3), 8, 8, kernels.ACCUMULATED)
+        torch.autograd.grad(image.sum(), leaves, allow_unused=True)
 
 
 def _array(t: Tensor, dtype: torch.dtype = torch.float32) -> np.ndarray:
