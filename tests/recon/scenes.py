@@ -90,7 +90,8 @@ def oracle(scene: Scene, **leaves: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     s = replace(scene.to(torch.float64), **leaves)
     eps, antialiased = s.settings.get("eps2d", 0.3), s.settings.get("rasterize_mode") == "antialiased"
     near, far = s.settings.get("near_plane", 0.01), s.settings.get("far_plane", 1e10)
-    ys, xs = torch.meshgrid(torch.arange(s.height), torch.arange(s.width), indexing="ij")
+    pixels = (torch.arange(size, dtype=torch.float64) + 0.5 for size in (s.height, s.width))
+    ys, xs = torch.meshgrid(*pixels, indexing="ij")
     images, alphas, depths = [], [], []
     for c in range(len(s.viewmats)):
         R, t = s.viewmats[c, :3, :3], s.viewmats[c, :3, 3]
@@ -118,7 +119,7 @@ def oracle(scene: Scene, **leaves: Tensor) -> tuple[Tensor, Tensor, Tensor]:
             zero = torch.zeros((), dtype=torch.float64)
             J = torch.stack([fx / z, zero, -fx * tx / z**2, zero, fy / z, -fy * ty / z**2]).reshape(2, 3)
             sharp = J @ axes @ (J @ axes).T
-            cov = sharp + eps * torch.eye(2)
+            cov = sharp + eps * torch.eye(2, dtype=torch.float64)
             det_sharp, det = torch.linalg.det(sharp), torch.linalg.det(cov)
             if not det > 0:
                 continue
@@ -127,7 +128,7 @@ def oracle(scene: Scene, **leaves: Tensor) -> tuple[Tensor, Tensor, Tensor]:
                 opacity = opacity * (det_sharp.clamp_min(1e-300) / det).sqrt()
             if not opacity >= 1 / 255:
                 continue
-            dx, dy = xs + 0.5 - (fx * x / z + cx), ys + 0.5 - (fy * y / z + cy)
+            dx, dy = xs - (fx * x / z + cx), ys - (fy * y / z + cy)
             sigma = 0.5 * (cov[1, 1] * dx * dx + cov[0, 0] * dy * dy - 2 * cov[0, 1] * dx * dy) / det
             alpha = (opacity * torch.exp(-sigma)).clamp_max(0.999)
             touched = (alpha >= 1 / 255) & ~done
@@ -170,7 +171,6 @@ def run(scene: Scene, backend: str, dtype: torch.dtype = torch.float32):
 
 
 def relative(a: Tensor, b: Tensor) -> float:
-    """|a - b| / |b| in the Frobenius norm; |a| where b is zero."""
+    """|a - b| / |b| in the Frobenius norm. Below 1e-14 |b| is the rounding of a zero, as for the turns of a sphere."""
     a, b = a.double(), b.double()
-    scale = b.norm()
-    return float((a - b).norm() / (scale if scale > 0 else 1))
+    return float((a - b).norm() / b.norm().clamp_min(1e-9 if float(b.norm()) < 1e-14 else 0))
