@@ -90,8 +90,11 @@ def project(
         inside = (means2d + radii > 0) & (means2d - radii < torch.tensor([width, height]))
         drawn = drawn & inside.all(-1) & (radii > settings.radius_clip).any(-1)
         radii = torch.where(drawn[..., None], radii, 0.0).to(torch.int32)
+        exact = torch.cat([means2d, rows[..., 1:2]], -1)
+        residuals = torch.where(drawn[..., None], exact - exact.to(dtype).to(torch.float64), 0.0).to(dtype)
     harmless = torch.tensor([1.0, 0.0, 1.0], dtype=torch.float64)
     return Splats(
+        residuals=residuals,
         means2d=torch.where(drawn[..., None], means2d, 0.0).to(dtype),
         rows=torch.where(drawn[..., None], rows, harmless).to(dtype),
         depths=torch.where(drawn, z, 0.0).to(dtype),

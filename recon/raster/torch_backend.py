@@ -55,7 +55,7 @@ def rasterize(
         listed = rank < counts[tiles, None]
         ids = splat_of[(starts[tiles, None] + rank).clamp_max(len(splat_of) - 1)]
         corners = torch.stack([tiles % across, tiles % (across * down) // across], -1) * TILE
-        block = (corners, ids, listed, flat.means2d, flat.rows, flat.opacities, channels)
+        block = (corners, ids, listed, flat.means2d, flat.rows, flat.opacities, flat.residuals, channels)
         image, left = checkpoint(_composite, *block, use_reentrant=False) if recompute else _composite(*block)
         images.append(image)
         lefts.append(left)
@@ -103,20 +103,31 @@ def _tile_lists(flat: Splats, n: int, across: int, down: int) -> tuple[Tensor, T
 
 
 def _composite(
-    corners: Tensor, ids: Tensor, listed: Tensor, means2d: Tensor, rows: Tensor, opacities: Tensor, channels: Tensor
+    corners: Tensor,
+    ids: Tensor,
+    listed: Tensor,
+    means2d: Tensor,
+    rows: Tensor,
+    opacities: Tensor,
+    residuals: Tensor,
+    channels: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Composite B tiles whose upper left pixels are `corners` [B,2] and whose lists `ids` [B,K] are padded.
 
     Returns the tiles [B,P,D] and the transmittance left [B,P,1].
     """
-    pixel = torch.arange(TILE * TILE)
-    local = torch.stack([pixel % TILE, pixel // TILE], -1).to(means2d) + 0.5
-    centre = means2d[ids] - corners[:, None]
-    dx = local[:, 0] - centre[..., :1]
-    dy = local[:, 1] - centre[..., 1:]
+    dtype, steps = means2d.dtype, torch.arange(TILE)
+    rest = residuals[ids].double()
+    centre = means2d[ids].double() + rest[..., :2] - corners[:, None]
     var_x, slope, var_y = rows[ids].split(1, -1)
-    across = dx - slope * dy
-    power = across * across * (-0.5 / var_x) + dy * dy * (-0.5 / var_y)
+    dy = steps + 0.5 - centre[..., 1:]  # [B,K,rows]
+    # where the splat is centred on each row: a whole number of pixels and an exact rest, see Splats.residuals
+    on_row = centre[..., :1] + (slope.double() + rest[..., 2:]) * dy
+    whole = on_row.detach().round()
+    dx = ((steps + 0.5).to(dtype) - whole.to(dtype)[..., None]) - (on_row - whole).to(dtype)[..., None]
+    dy = dy.to(dtype)
+    power = dx * dx * (-0.5 / var_x)[..., None] + (dy * dy * (-0.5 / var_y))[..., None]
+    power = power.flatten(2)  # [B,K,P]
     alpha = ((opacities[ids] * listed)[..., None] * power.exp()).clamp_max(ALPHA_MAX)
     alpha = alpha * (alpha.detach() >= ALPHA_MIN)
     after = (1 - alpha).cumprod(1)

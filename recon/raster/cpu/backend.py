@@ -108,7 +108,7 @@ class _Project(torch.autograd.Function):
         cameras = [_array(viewmats, torch.float64), _array(Ks)]
         means2d, rows = np.empty((c, n, 2), np.float32), np.empty((c, n, 3), np.float32)
         depths, seen = np.empty((c, n), np.float32), np.empty((c, n), np.float32)
-        radii = np.empty((c, n, 2), np.int32)
+        radii, residuals = np.empty((c, n, 2), np.int32), np.zeros((c, n, 3), np.float32)
         limits = (
             np.float32(settings.near_plane),
             np.float32(min(settings.far_plane, np.finfo(np.float32).max)),
@@ -119,18 +119,18 @@ class _Project(torch.autograd.Function):
         for_each(
             projection.forward,
             ranges(n, GAUSSIANS_PER_PART),
-            *(*gaussians, *cameras, *size, limits, settings.antialiased, means2d, rows, depths, seen, radii),
+            *(*gaussians, *cameras, *size, limits, settings.antialiased, means2d, rows, depths, seen, radii, residuals),
         )
-        out_radii = torch.from_numpy(radii)
-        ctx.mark_non_differentiable(out_radii)
+        out_radii, out_residuals = torch.from_numpy(radii), torch.from_numpy(residuals)
+        ctx.mark_non_differentiable(out_radii, out_residuals)
         ctx.save_for_backward(means, quats, scales, opacities, viewmats, Ks, out_radii)
         ctx.size, ctx.settings = size, settings
         floats = (torch.from_numpy(a).to(means.dtype) for a in (means2d, rows, depths, seen))
-        return *floats, out_radii
+        return *floats, out_radii, out_residuals
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, v_means2d, v_rows, v_depths, v_seen, _):
+    def backward(ctx, v_means2d, v_rows, v_depths, v_seen, *_):
         means, quats, scales, opacities, viewmats, Ks, radii = ctx.saved_tensors
         n, c = len(means), len(viewmats)
         gaussians = [_array(t) for t in (means, quats, scales, opacities)]
@@ -152,10 +152,10 @@ class _Project(torch.autograd.Function):
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, means2d, rows, depths, opacities, radii, features, width, height, depth_mode):
+    def forward(ctx, means2d, rows, depths, opacities, radii, residuals, features, width, height, depth_mode):
         n_cameras, n = depths.shape
         arrays = [_array(t) for t in (means2d, rows, depths, opacities)]
-        tiles = lists.build(*arrays, radii.numpy(), width, height)
+        tiles = lists.build(*arrays, radii.numpy(), residuals.numpy(), width, height)
         with_depth = depth_mode != kernels.NO_DEPTH
         channels = _in_rank_order(_array(features), arrays[2].reshape(-1), tiles.splat_of_rank, n, with_depth)
         d = features.shape[-1]
@@ -207,7 +207,7 @@ class _Rasterize(torch.autograd.Function):
         means2d, rows, depths, opacities, features = (
             torch.from_numpy(a).to(v_image.dtype) for a in (v_means2d, v_rows, v_depths, v_opacities, v_features)
         )
-        return means2d, rows, depths, opacities, None, features, None, None, None
+        return means2d, rows, depths, opacities, None, None, features, None, None, None
 
 
 def _in_rank_order(features: np.ndarray, depths: np.ndarray, order: np.ndarray, n: int, with_depth: bool) -> np.ndarray:

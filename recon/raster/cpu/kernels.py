@@ -22,6 +22,9 @@ from recon.raster.cpu.lists import (
     PER_VAR_Y,
     REACH2,
     RECORD,
+    REST_SLOPE,
+    REST_X,
+    REST_Y,
     SLOPE,
     TILE_HEIGHT,
     TILE_WIDTH,
@@ -31,7 +34,7 @@ from recon.raster.cpu.simd import LANES
 from recon.raster.cpu.threads import kernel
 from recon.raster.rendering import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 
-F32, I32 = np.float32, np.int32
+F32, F64, I32 = np.float32, np.float64, np.int32
 PIXELS = TILE_WIDTH * TILE_HEIGHT
 # planes do not start a power of two apart: their lines would all fall into the same two sets of the L1 cache
 PLANE = PIXELS + LANES
@@ -57,21 +60,31 @@ def _aligned(size):
 
 
 @_inline
-def _row_spans(records, at, mx, my, last_x, centres, lefts, rights):
-    """For every row of the tile: the splat's centre on it, and the first and last pixel of its span.
+def _row_spans(records, at, mx, my, last_x, lefts, rights):
+    """For every row of the tile the first and last pixel of the splat's span.
 
     mx, my: the mean, with the centre of the tile's first pixel as origin.
     """
     reach2, per_y = records[at + REACH2], records[at + PER_VAR_Y]
     var_x, slope = records[at + VAR_X], records[at + SLOPE]
     for y in range(0, TILE_HEIGHT, LANES):
-        dy = simd.counting_from(F32(y) - my)
+        dy = simd.counting_from(F32(y)) - my
         centre = dy * slope + mx
         half = simd.square_root(simd.maximum((reach2 - dy * dy * per_y) * var_x, ZERO)) + MARGIN
-        simd.store(centres, y, centre)
         # limited before the conversion: a huge splat leaves the range of int32
         simd.store(lefts, y, simd.to_int(simd.round_up(simd.minimum(simd.maximum(centre - half, ZERO), LAST_X + ONE))))
         simd.store(rights, y, simd.to_int(simd.round_down(simd.maximum(simd.minimum(centre + half, last_x), -ONE))))
+
+
+@_inline
+def _row_centres(records, at, mx, my, top, bottom, wholes, rests):
+    """Where the splat is centred on rows top..bottom: the nearest pixel, and the rest to full precision."""
+    slope = F64(records[at + SLOPE]) + F64(records[at + REST_SLOPE])
+    for y in range(top, bottom + 1):
+        centre = mx + slope * (y - my)
+        whole = np.rint(centre)
+        wholes[y] = F32(whole)
+        rests[y] = F32(centre - whole)
 
 
 @_inline
@@ -98,7 +111,7 @@ def forward(
     n_colors = n_channels if depth_mode == NO_DEPTH else n_channels - 1
     planes = _aligned((1 + n_channels) * PLANE)
     drawn_last = np.empty(PLANE, np.int32)
-    centres = np.empty(TILE_HEIGHT, np.float32)
+    wholes, rests = np.empty(TILE_HEIGHT, np.float32), np.empty(TILE_HEIGHT, np.float32)
     lefts, rights = np.empty(TILE_HEIGHT, np.int32), np.empty(TILE_HEIGHT, np.int32)
     for tile in range(first, last):
         camera = tile // per_camera
@@ -109,28 +122,30 @@ def forward(
         drawn_last[:] = -1
         for y in range(tall):
             planes[y * TILE_WIDTH : y * TILE_WIDTH + wide] = ONE  # outside the image stays 0: finished
-        origin_x, origin_y = F32(tile_x * TILE_WIDTH) + HALF, F32(tile_y * TILE_HEIGHT) + HALF
+        origin_x, origin_y = tile_x * TILE_WIDTH + 0.5, tile_y * TILE_HEIGHT + 0.5
         for k in range(tile_starts[tile], tile_starts[tile + 1]):
             if (k - tile_starts[tile]) & 31 == 31 and not _any_alive(planes):
                 break
             rank = ranks[k]
             at = rank * RECORD
-            mx, my = records[at + MEAN_X] - origin_x, records[at + MEAN_Y] - origin_y
+            mx = F64(records[at + MEAN_X]) + F64(records[at + REST_X]) - origin_x
+            my = F64(records[at + MEAN_Y]) + F64(records[at + REST_Y]) - origin_y
             opacity = records[at + OPACITY]
             fall_x, fall_y = HALF_LOG2E / records[at + VAR_X], HALF_LOG2E * records[at + PER_VAR_Y]
-            top, bottom = _rows_reached(records, at, my, F32(tall - 1))
-            _row_spans(records, at, mx, my, F32(wide - 1), centres, lefts, rights)
+            top, bottom = _rows_reached(records, at, F32(my), F32(tall - 1))
+            _row_spans(records, at, F32(mx), F32(my), F32(wide - 1), lefts, rights)
+            _row_centres(records, at, mx, my, top, bottom, wholes, rests)
             for y in range(top, bottom + 1):
                 chunks = (rights[y] - lefts[y] + LANES) // LANES
                 if rights[y] < lefts[y]:
                     continue
-                dy = F32(y) - my
+                dy = F32(y - my)
                 power_y = fall_y * dy * dy
                 x = min(lefts[y], I32(TILE_WIDTH - chunks * LANES))
                 for _ in range(chunks):
                     i = y * TILE_WIDTH + x
                     before = simd.load(planes, i)
-                    dx = simd.counting_from(F32(x) - centres[y])
+                    dx = simd.counting_from(F32(x) - wholes[y]) - rests[y]
                     alpha = simd.minimum(simd.exp2_nonpositive(dx * dx * fall_x + power_y) * opacity, MOST)
                     touched = (alpha >= LEAST) & (before > ZERO)
                     weight = alpha * before
@@ -191,7 +206,7 @@ def backward(
     planes = _aligned((2 + n_channels) * PLANE)  # transmittance, behind, dL/dchannel
     drawn_last = np.empty(PLANE, np.int32)
     v_features = _aligned(n_channels * LANES)
-    centres = np.empty(TILE_HEIGHT, np.float32)
+    wholes, rests = np.empty(TILE_HEIGHT, np.float32), np.empty(TILE_HEIGHT, np.float32)
     lefts, rights = np.empty(TILE_HEIGHT, np.int32), np.empty(TILE_HEIGHT, np.int32)
     none = simd.spread(ZERO)
     for tile in range(first, last):
@@ -222,17 +237,19 @@ def backward(
                 furthest = max(furthest, last_drawn[pixel + x])
                 for c in range(n_colors):
                     planes[i + (c + 2) * PLANE] = v_image[(pixel + x) * n_colors + c]
-        origin_x, origin_y = F32(tile_x * TILE_WIDTH) + HALF, F32(tile_y * TILE_HEIGHT) + HALF
+        origin_x, origin_y = tile_x * TILE_WIDTH + 0.5, tile_y * TILE_HEIGHT + 0.5
         for k in range(max(furthest + 1, tile_starts[tile]), tile_starts[tile + 1]):
             gradients[slots[k] * row : (slots[k] + 1) * row] = ZERO
         for k in range(furthest, tile_starts[tile] - 1, -1):
             rank = ranks[k]
             at = rank * RECORD
-            mx, my = records[at + MEAN_X] - origin_x, records[at + MEAN_Y] - origin_y
+            mx = F64(records[at + MEAN_X]) + F64(records[at + REST_X]) - origin_x
+            my = F64(records[at + MEAN_Y]) + F64(records[at + REST_Y]) - origin_y
             opacity = records[at + OPACITY]
             fall_x, fall_y = HALF_LOG2E / records[at + VAR_X], HALF_LOG2E * records[at + PER_VAR_Y]
-            top, bottom = _rows_reached(records, at, my, F32(tall - 1))
-            _row_spans(records, at, mx, my, F32(wide - 1), centres, lefts, rights)
+            top, bottom = _rows_reached(records, at, F32(my), F32(tall - 1))
+            _row_spans(records, at, F32(mx), F32(my), F32(wide - 1), lefts, rights)
+            _row_centres(records, at, mx, my, top, bottom, wholes, rests)
             m, m_x, m_y, m_xx, m_xy, m_yy = none, none, none, none, none, none
             for c in range(0, n_channels * LANES, LANES):
                 simd.store(v_features, c, none)
@@ -240,13 +257,13 @@ def backward(
                 chunks = (rights[y] - lefts[y] + LANES) // LANES
                 if rights[y] < lefts[y]:
                     continue
-                dy = F32(y) - my
+                dy = F32(y - my)
                 power_y = fall_y * dy * dy
                 x = min(lefts[y], I32(TILE_WIDTH - chunks * LANES))
                 for _ in range(chunks):
                     i = y * TILE_WIDTH + x
                     x += LANES
-                    dx = simd.counting_from(F32(x - LANES) - centres[y])
+                    dx = simd.counting_from(F32(x - LANES) - wholes[y]) - rests[y]
                     uncapped = simd.exp2_nonpositive(dx * dx * fall_x + power_y) * opacity
                     alpha = simd.minimum(uncapped, MOST)
                     drawn = (alpha >= LEAST) & (simd.load(drawn_last, i) >= I32(k))

@@ -16,8 +16,8 @@ from recon.raster.cpu.threads import for_each, kernel, ranges
 from recon.raster.rendering import ALPHA_MIN
 
 TILE_WIDTH, TILE_HEIGHT = 64, 16  # pixels: wide, because most of the work is per row of a splat in a tile
-RECORD = 8  # floats of a packed splat
-MEAN_X, MEAN_Y, VAR_X, SLOPE, PER_VAR_Y, OPACITY, REACH2, HALF_Y = range(RECORD)
+RECORD = 11  # floats of a packed splat; the last three are the residuals of float32
+MEAN_X, MEAN_Y, VAR_X, SLOPE, PER_VAR_Y, OPACITY, REACH2, HALF_Y, REST_X, REST_Y, REST_SLOPE = range(RECORD)
 PART = 2048  # splats of one part
 
 F32 = np.float32
@@ -38,7 +38,7 @@ class TileLists(NamedTuple):
     tiles_per_camera: int
 
 
-def build(means2d, rows, depths, opacities, radii, width: int, height: int) -> TileLists:
+def build(means2d, rows, depths, opacities, radii, residuals, width: int, height: int) -> TileLists:
     """Sort the splats of all cameras and list them by tile; shapes as in :class:`recon.raster.rendering.Splats`."""
     n_cameras, n = depths.shape
     order = depth_order(depths.reshape(-1), radii.reshape(-1, 2))
@@ -54,7 +54,7 @@ def build(means2d, rows, depths, opacities, radii, width: int, height: int) -> T
     tiles_of_part: list[np.ndarray] = [np.empty(0, np.int32)] * len(parts)
     numbered = [(*part, p) for p, part in enumerate(parts)]
     grid = (n, across, down)
-    flat = (means2d.reshape(-1, 2), rows.reshape(-1, 3), opacities.reshape(-1))
+    flat = (means2d.reshape(-1, 2), rows.reshape(-1, 3), opacities.reshape(-1), residuals.reshape(-1, 3))
 
     def count(first: int, last: int, part: int) -> None:
         tiles_of_part[part] = _pack_and_count(
@@ -128,7 +128,9 @@ def _tile_range(low, high, size, count):
 
 
 @_list_kernel
-def _pack_and_count(first, last, order, means2d, rows, opacities, grid, records, rank_of_splat, counts, slot_starts):
+def _pack_and_count(
+    first, last, order, means2d, rows, opacities, residuals, grid, records, rank_of_splat, counts, slot_starts
+):
     """Pack ranks first..last, and list the tiles that each one's ellipse meets, one tile row after the other.
 
     On one row of tiles the ellipse spans an interval of x: its rightmost point lies at dy = B sqrt(reach2 / A), its
@@ -154,6 +156,9 @@ def _pack_and_count(first, last, order, means2d, rows, opacities, grid, records,
         records[at + OPACITY] = opacities[m]
         records[at + REACH2] = reach2
         records[at + HALF_Y] = half_y
+        records[at + REST_X] = residuals[m, 0]
+        records[at + REST_Y] = residuals[m, 1]
+        records[at + REST_SLOPE] = residuals[m, 2]
         extreme = slope * var_y * math.sqrt(reach2 / (var_x + slope * slope * var_y))
         row_low, row_high = _tile_range(y - half_y, y + half_y, F32(TILE_HEIGHT), down)
         before = listed

@@ -66,7 +66,7 @@ def _jacobian_rows(V, c, jx, jy, tx, ty):
 @_project_kernel
 def forward(
     first, last, means, quats, scales, opacities, V, K, width, height, limits, antialiased,
-    means2d, rows, depths, seen, radii,
+    means2d, rows, depths, seen, radii, residuals,
 ):  # fmt: skip
     """Project Gaussians first..last into every camera; limits = (near, far, radius_clip, eps2d).
 
@@ -130,6 +130,9 @@ def forward(
             rows[c, i, 0] = det / var_y
             rows[c, i, 1] = uv / var_y
             rows[c, i, 2] = var_y
+            residuals[c, i, 0] = mx - means2d[c, i, 0]
+            residuals[c, i, 1] = my - means2d[c, i, 1]
+            residuals[c, i, 2] = uv / var_y - rows[c, i, 1]
             depths[c, i] = depth
             seen[c, i] = opacity
 
