@@ -44,6 +44,7 @@ HALF_LOG2E = F32(-0.5 * math.log2(math.e))  # sigma to a power of two: exp(-d^2 
 LAST_X = F32(TILE_WIDTH - 1)
 NO_DEPTH, ACCUMULATED, EXPECTED = 0, 1, 2
 LEAST_WEIGHT = F32(1e-10)  # of an expected depth: the floor of the alpha that it is divided by
+FAR = 1e6  # pixels: whole numbers of pixels are kept within int32
 LINE = 16  # floats of a cache line
 SHAPE_GRADIENTS = 6  # moments kept per intersection, before the channels
 
@@ -82,8 +83,8 @@ def _row_centres(records, at, mx, my, top, bottom, wholes, rests):
     slope = F64(records[at + SLOPE]) + F64(records[at + REST_SLOPE])
     for y in range(top, bottom + 1):
         centre = mx + slope * (y - my)
-        whole = np.rint(centre)
-        wholes[y] = F32(whole)
+        whole = np.rint(min(max(centre, -FAR), FAR))
+        wholes[y] = I32(whole)
         rests[y] = F32(centre - whole)
 
 
@@ -111,7 +112,7 @@ def forward(
     n_colors = n_channels if depth_mode == NO_DEPTH else n_channels - 1
     planes = _aligned((1 + n_channels) * PLANE)
     drawn_last = np.empty(PLANE, np.int32)
-    wholes, rests = np.empty(TILE_HEIGHT, np.float32), np.empty(TILE_HEIGHT, np.float32)
+    wholes, rests = np.empty(TILE_HEIGHT, np.int32), np.empty(TILE_HEIGHT, np.float32)
     lefts, rights = np.empty(TILE_HEIGHT, np.int32), np.empty(TILE_HEIGHT, np.int32)
     for tile in range(first, last):
         camera = tile // per_camera
@@ -145,7 +146,7 @@ def forward(
                 for _ in range(chunks):
                     i = y * TILE_WIDTH + x
                     before = simd.load(planes, i)
-                    dx = simd.counting_from(F32(x) - wholes[y]) - rests[y]
+                    dx = simd.counting_from(I32(x - wholes[y])) - rests[y]
                     alpha = simd.minimum(simd.exp2_nonpositive(dx * dx * fall_x + power_y) * opacity, MOST)
                     touched = (alpha >= LEAST) & (before > ZERO)
                     weight = alpha * before
@@ -206,7 +207,7 @@ def backward(
     planes = _aligned((2 + n_channels) * PLANE)  # transmittance, behind, dL/dchannel
     drawn_last = np.empty(PLANE, np.int32)
     v_features = _aligned(n_channels * LANES)
-    wholes, rests = np.empty(TILE_HEIGHT, np.float32), np.empty(TILE_HEIGHT, np.float32)
+    wholes, rests = np.empty(TILE_HEIGHT, np.int32), np.empty(TILE_HEIGHT, np.float32)
     lefts, rights = np.empty(TILE_HEIGHT, np.int32), np.empty(TILE_HEIGHT, np.int32)
     none = simd.spread(ZERO)
     for tile in range(first, last):
@@ -263,7 +264,7 @@ def backward(
                 for _ in range(chunks):
                     i = y * TILE_WIDTH + x
                     x += LANES
-                    dx = simd.counting_from(F32(x - LANES) - wholes[y]) - rests[y]
+                    dx = simd.counting_from(I32(x - LANES - wholes[y])) - rests[y]
                     uncapped = simd.exp2_nonpositive(dx * dx * fall_x + power_y) * opacity
                     alpha = simd.minimum(uncapped, MOST)
                     drawn = (alpha >= LEAST) & (simd.load(drawn_last, i) >= I32(k))

@@ -139,11 +139,16 @@ def spread(typingctx, scalar):
 
 @intrinsic
 def counting_from(typingctx, start):
-    """start, start + 1, ..., start + LANES - 1 in float32; never reassociated, so exact for a whole start."""
+    """start, start + 1, ..., start + LANES - 1 in float32, from a float32 or an int32 start.
+
+    From an int32 it is exact, and no optimisation may mix it with what is subtracted from it.
+    """
 
     def lower(context, builder, sig, args):
-        steps = ir.Constant(floats.ir, [float(k) for k in range(LANES)])
-        return builder.fadd(_spread(builder, args[0], sig.args[0]), steps)
+        first = _spread(builder, args[0], sig.args[0])
+        if sig.args[0] == types.int32:
+            return builder.sitofp(builder.add(first, ir.Constant(ints.ir, list(range(LANES)))), floats.ir)
+        return builder.fadd(first, ir.Constant(floats.ir, [float(k) for k in range(LANES)]), flags=FLAGS)
 
     return floats(start), lower
 
