@@ -200,8 +200,8 @@ def test_every_pixel_a_splat_touches_is_in_a_tile_that_lists_it(seed):
     s = project(
         *(scene.means, scene.quats, scene.scales, scene.opacities, scene.viewmats, scene.Ks, 150, 50), Settings()
     )
-    arrays = [t.numpy() for t in (s.means2d, s.rows, s.depths, s.opacities, s.radii, s.residuals)]
-    tiles = lists.build(*arrays, 150, 50)
+    arrays = tuple(t.numpy() for t in (s.means2d, s.rows, s.depths, s.opacities, s.radii, s.residuals))
+    tiles = lists.build(arrays, 150, 50)
     listed = set()
     for tile in range(len(tiles.tile_starts) - 1):
         ranks = tiles.ranks[tiles.tile_starts[tile] : tiles.tile_starts[tile + 1]]

@@ -104,49 +104,43 @@ class _Project(torch.autograd.Function):
     @staticmethod
     def forward(ctx, means, quats, scales, opacities, viewmats, Ks, width, height, settings):
         n, c = len(means), len(viewmats)
-        gaussians = [_array(t) for t in (means, quats, scales, opacities)]
-        cameras = [_array(viewmats, torch.float64), _array(Ks)]
         means2d, rows = np.empty((c, n, 2), np.float32), np.empty((c, n, 3), np.float32)
         depths, seen = np.empty((c, n), np.float32), np.empty((c, n), np.float32)
-        radii, residuals = np.empty((c, n, 2), np.int32), np.zeros((c, n, 3), np.float32)
+        radii, residuals = np.empty((c, n, 2), np.int32), np.empty((c, n, 3), np.float32)
         limits = (
             np.float32(settings.near_plane),
             np.float32(min(settings.far_plane, np.finfo(np.float32).max)),
             float(settings.radius_clip),
             float(settings.eps2d),
         )
-        size = (float(width), float(height))
-        for_each(
-            projection.forward,
-            ranges(n, GAUSSIANS_PER_PART),
-            *(*gaussians, *cameras, *size, limits, settings.antialiased, means2d, rows, depths, seen, radii, residuals),
-        )
-        out_radii, out_residuals = torch.from_numpy(radii), torch.from_numpy(residuals)
-        ctx.mark_non_differentiable(out_radii, out_residuals)
-        ctx.save_for_backward(means, quats, scales, opacities, viewmats, Ks, out_radii)
-        ctx.size, ctx.settings = size, settings
-        floats = (torch.from_numpy(a).to(means.dtype) for a in (means2d, rows, depths, seen))
-        return *floats, out_radii, out_residuals
+        gaussians = tuple(_array(t) for t in (means, quats, scales, opacities))
+        cameras = (_array(viewmats, torch.float64), _array(Ks), float(width), float(height))
+        outputs = (means2d, rows, depths, seen, radii, residuals)
+        parts = ranges(n, GAUSSIANS_PER_PART)
+        for_each(projection.forward, parts, gaussians, cameras, limits, settings.antialiased, outputs)
+        ctx.save_for_backward(means, quats, scales, opacities, viewmats, Ks)
+        ctx.radii, ctx.size, ctx.settings = radii, (float(width), float(height)), settings
+        floats = [torch.from_numpy(a).to(means.dtype) for a in (means2d, rows, depths, seen)]
+        fixed = torch.from_numpy(radii.copy()), torch.from_numpy(residuals)
+        ctx.mark_non_differentiable(*fixed)
+        return *floats, *fixed
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, v_means2d, v_rows, v_depths, v_seen, *_):
-        means, quats, scales, opacities, viewmats, Ks, radii = ctx.saved_tensors
+    def backward(ctx, g_means2d, g_rows, g_depths, g_seen, *_):
+        means, quats, scales, opacities, viewmats, Ks = ctx.saved_tensors
         n, c = len(means), len(viewmats)
-        gaussians = [_array(t) for t in (means, quats, scales, opacities)]
-        incoming = [_array(t) for t in (v_means2d, v_rows, v_depths, v_seen)]
-        outgoing = [np.empty((n, *t.shape[1:]), np.float32) for t in (means, quats, scales, opacities)]
+        gaussians = tuple(_array(t) for t in (means, quats, scales, opacities))
+        cameras = (_array(viewmats, torch.float64), _array(Ks), *ctx.size)
+        incoming = tuple(_array(t) for t in (g_means2d, g_rows, g_depths, g_seen))
+        outgoing = tuple(np.empty(a.shape, np.float32) for a in gaussians)
         parts = [(*part, p) for p, part in enumerate(ranges(n, GAUSSIANS_PER_PART))]
-        v_views = np.zeros((len(parts), c, 3, 4))
-        for_each(
-            projection.backward,
-            parts,
-            *(*gaussians, _array(viewmats, torch.float64), _array(Ks), *ctx.size, float(ctx.settings.eps2d)),
-            *(ctx.settings.antialiased, radii.numpy(), *incoming, *outgoing, v_views),
-        )
-        v_viewmats = np.zeros((c, 4, 4))
-        v_viewmats[:, :3] = v_views.sum(0)
-        gradients = (torch.from_numpy(a).to(means.dtype) for a in (*outgoing, v_viewmats))
+        g_views = np.zeros((len(parts), c, 3, 4))
+        options = (float(ctx.settings.eps2d), ctx.settings.antialiased, ctx.radii)
+        for_each(projection.backward, parts, gaussians, cameras, *options, incoming, outgoing, g_views)
+        g_viewmats = np.zeros((c, 4, 4))
+        g_viewmats[:, :3] = g_views.sum(0)
+        gradients = (torch.from_numpy(a).to(means.dtype) for a in (*outgoing, g_viewmats))
         return *gradients, None, None, None, None
 
 
@@ -154,10 +148,10 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx, means2d, rows, depths, opacities, radii, residuals, features, width, height, depth_mode):
         n_cameras, n = depths.shape
-        arrays = [_array(t) for t in (means2d, rows, depths, opacities)]
-        tiles = lists.build(*arrays, radii.numpy(), residuals.numpy(), width, height)
+        splats = (*(_array(t) for t in (means2d, rows, depths, opacities)), radii.numpy(), residuals.numpy())
+        tiles = lists.build(splats, width, height)
         with_depth = depth_mode != kernels.NO_DEPTH
-        channels = _in_rank_order(_array(features), arrays[2].reshape(-1), tiles.splat_of_rank, n, with_depth)
+        channels = _in_rank_order(_array(features), splats[2].reshape(-1), tiles.splat_of_rank, n, with_depth)
         d = features.shape[-1]
         image = np.empty((n_cameras, height, width, d), np.float32)
         depth = np.empty((n_cameras, height, width, 1) if with_depth else 0, np.float32)
@@ -167,46 +161,45 @@ class _Rasterize(torch.autograd.Function):
         for_each(
             kernels.forward,
             _tile_parts(n_cameras * tiles.tiles_per_camera),
-            *(tiles.tile_starts, tiles.ranks, tiles.records, channels, d + with_depth, depth_mode, tiling),
-            *(a.reshape(-1) for a in (image, depth, alphas, transmittance, last_drawn)),
+            *((tiles.tile_starts, tiles.ranks, tiles.records), channels, d + with_depth, depth_mode, tiling),
+            tuple(a.reshape(-1) for a in (image, depth, alphas, transmittance, last_drawn)),
         )
         outputs = [torch.from_numpy(a).to(means2d.dtype) for a in (image, depth, alphas)]
         if not with_depth:
             ctx.mark_non_differentiable(outputs[1])
+        # a copy, because the caller owns the depth and may change it
+        kept_depth = depth.reshape(-1).copy() if depth_mode == kernels.EXPECTED else np.empty(0, np.float32)
+        ctx.saved = (kept_depth, transmittance.reshape(-1), last_drawn)
         ctx.tiles, ctx.channels, ctx.tiling, ctx.depth_mode = tiles, channels, tiling, depth_mode
-        ctx.pixels = depth.reshape(-1).copy() if depth_mode == kernels.EXPECTED else depth[:0].reshape(-1)
-        ctx.transmittance, ctx.last_drawn = transmittance.reshape(-1), last_drawn
         ctx.features_shape, ctx.splats_shape = features.shape, (n_cameras, n)
         return tuple(outputs)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, v_image, v_depth, v_alphas):
+    def backward(ctx, g_image, g_depth, g_alphas):
         tiles, (n_cameras, n), with_depth = ctx.tiles, ctx.splats_shape, ctx.depth_mode != kernels.NO_DEPTH
         n_channels = ctx.features_shape[-1] + with_depth
         row = kernels.SHAPE_GRADIENTS + n_channels
-        incoming = [_array(t).reshape(-1) for t in (v_image, v_depth, v_alphas)]
+        incoming = tuple(_array(t).reshape(-1) for t in (g_image, g_depth, g_alphas))
         gradients = np.empty(len(tiles.ranks) * row + LANES, np.float32)
         for_each(
             kernels.backward,
             _tile_parts(n_cameras * tiles.tiles_per_camera),
-            *(tiles.tile_starts, tiles.ranks, tiles.slots, tiles.records, ctx.channels, n_channels),
-            *(ctx.depth_mode, ctx.tiling, ctx.pixels, ctx.transmittance, ctx.last_drawn, *incoming, gradients),
+            *((tiles.tile_starts, tiles.ranks, tiles.records), tiles.slots, ctx.channels, n_channels),
+            *(ctx.depth_mode, ctx.tiling, ctx.saved, incoming, gradients),
         )
-        v_means2d, v_rows = np.empty((n_cameras, n, 2), np.float32), np.empty((n_cameras, n, 3), np.float32)
-        v_opacities, v_features = np.empty((n_cameras, n), np.float32), np.empty(ctx.features_shape, np.float32)
-        v_depths = np.empty((n_cameras, n), np.float32) if with_depth else np.zeros((n_cameras, n), np.float32)
-        shared = len(ctx.features_shape) == 2
+        shapes = [(n_cameras, n, 2), (n_cameras, n, 3), (n_cameras, n), (n_cameras, n), ctx.features_shape]
+        outgoing = [np.empty(shape, np.float32) for shape in shapes]
+        if not with_depth:
+            outgoing[2][:] = 0
         for_each(
             kernels.reduce,
             ranges(n, GAUSSIANS_PER_PART),
-            *(n_cameras, n, shared, with_depth, tiles.rank_of_splat, tiles.slot_starts, tiles.records),
-            *(gradients, row),
-            *(a.reshape(-1) for a in (v_means2d, v_rows, v_opacities, v_depths, v_features)),
+            *(n_cameras, len(ctx.features_shape) == 2, with_depth),
+            *((tiles.rank_of_splat, tiles.slot_starts, tiles.records), gradients, row),
+            tuple(a.reshape(-1) for a in outgoing),
         )
-        means2d, rows, depths, opacities, features = (
-            torch.from_numpy(a).to(v_image.dtype) for a in (v_means2d, v_rows, v_depths, v_opacities, v_features)
-        )
+        means2d, rows, depths, opacities, features = (torch.from_numpy(a).to(g_image.dtype) for a in outgoing)
         return means2d, rows, depths, opacities, None, None, features, None, None, None
 
 

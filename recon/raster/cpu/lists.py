@@ -38,8 +38,9 @@ class TileLists(NamedTuple):
     tiles_per_camera: int
 
 
-def build(means2d, rows, depths, opacities, radii, residuals, width: int, height: int) -> TileLists:
-    """Sort the splats of all cameras and list them by tile; shapes as in :class:`recon.raster.rendering.Splats`."""
+def build(splats: tuple[np.ndarray, ...], width: int, height: int) -> TileLists:
+    """Sort the splats of all cameras and list them by tile; the fields of :class:`recon.raster.rendering.Splats`."""
+    means2d, rows, depths, opacities, radii, residuals = splats
     n_cameras, n = depths.shape
     order = depth_order(depths.reshape(-1), radii.reshape(-1, 2))
     r = len(order)
@@ -58,7 +59,7 @@ def build(means2d, rows, depths, opacities, radii, residuals, width: int, height
 
     def count(first: int, last: int, part: int) -> None:
         tiles_of_part[part] = _pack_and_count(
-            first, last, order, *flat, grid, records, rank_of_splat, counts[part], slot_starts
+            first, last, order, flat, grid, records, rank_of_splat, counts[part], slot_starts
         )
 
     for_each(count, numbered)
@@ -128,14 +129,13 @@ def _tile_range(low, high, size, count):
 
 
 @_list_kernel
-def _pack_and_count(
-    first, last, order, means2d, rows, opacities, residuals, grid, records, rank_of_splat, counts, slot_starts
-):
+def _pack_and_count(first, last, order, splats, grid, records, rank_of_splat, counts, slot_starts):
     """Pack ranks first..last, and list the tiles that each one's ellipse meets, one tile row after the other.
 
     On one row of tiles the ellipse spans an interval of x: its rightmost point lies at dy = B sqrt(reach2 / A), its
     leftmost opposite; outside the tile row the extreme is on the row's edge, as the ellipse is convex.
     """
+    means2d, rows, opacities, residuals = splats
     n, across, down = grid
     tiles = np.empty(4 * (last - first) + 64, np.int32)
     listed = 0
