@@ -117,13 +117,14 @@ class Case:
     def __init__(self, tensors: list[Tensor], width: int, height: int, backend: str) -> None:
         device = "cuda" if backend == "gsplat" else "cpu"
         self.leaves = [t.detach().to(device).requires_grad_(i < 6) for i, t in enumerate(tensors)]
-        self.size, self.backend = (width, height), backend
+        self.arguments: Any = (*self.leaves, width, height)
+        self.backend: Any = backend
         g = torch.Generator().manual_seed(1)
         channels = tensors[4].shape[-1]
         self.weights = [torch.randn(1, height, width, d, generator=g).to(device) for d in (channels, 1)]
 
     def forward(self) -> Rendering:
-        out = render(*self.leaves, *self.size, backend=self.backend, depth="accumulated")  # type: ignore[misc]
+        out = render(*self.arguments, backend=self.backend, depth="accumulated")
         if self.backend == "gsplat":
             torch.cuda.synchronize()
         return out
@@ -335,7 +336,9 @@ def _write(out: Path, report: dict[str, Any]) -> None:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", default="bench/out/raster")
-    parser.add_argument("--sizes", type=int, nargs="*", default=range(len(SIZES)), help="which of the four sizes, from 0")
+    parser.add_argument(
+        "--sizes", type=int, nargs="*", default=range(len(SIZES)), help="which of the four sizes, from 0"
+    )
     parser.add_argument("--channels", type=int, nargs="*", default=[3, 32])
     parser.add_argument("--repeats", type=int, default=15)
     parser.add_argument("--gate", action="store_true")

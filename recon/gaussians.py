@@ -45,7 +45,12 @@ class Gaussians:
             found = tuple(getattr(self, name).shape)
             if found != shape:
                 raise ValueError(f"{name}: expected shape {shape} for {n} means, got {found}")
-        if self.sh.ndim != 3 or self.sh.shape[0] != n or self.sh.shape[2] != 3 or self.sh.shape[1] not in (1, 4, 9, 16, 25):
+        if (
+            self.sh.ndim != 3
+            or self.sh.shape[0] != n
+            or self.sh.shape[2] != 3
+            or self.sh.shape[1] not in (1, 4, 9, 16, 25)
+        ):
             raise ValueError(f"sh: expected shape ({n}, 1 | 4 | 9 | 16 | 25, 3), got {tuple(self.sh.shape)}")
 
     @classmethod
@@ -80,8 +85,10 @@ class Gaussians:
         cameras = [camera] if isinstance(camera, Camera) else list(camera)
         sizes = {(c.width, c.height) for c in cameras}
         if len(sizes) != 1:
-            raise ValueError(f"camera: expected one or more cameras of one image size, got sizes {sorted(sizes)}: "
-                             "render each size on its own")
+            raise ValueError(
+                f"camera: expected one or more cameras of one image size, got sizes {sorted(sizes)}: "
+                "render each size on its own"
+            )
         if any(c.distortion is not None and np.any(c.distortion) for c in cameras):
             raise ValueError("camera: expected no distortion, got coefficients: undistort the images and drop them")
         w2c = [np.atleast_3d(c.w2c).reshape(-1, 4, 4) for c in cameras]
@@ -143,8 +150,11 @@ def load_ply(path: str | os.PathLike[str]) -> Gaussians:
     k = rest // 3 + 1
     missing = [name for name in ply_fields(k) if name not in names and not name.startswith("n")]
     if rest % 3 or k not in (1, 4, 9, 16, 25) or missing:
-        raise ValueError(f"{path}: expected the properties of 3DGS with 0, 9, 24, 45 or 72 f_rest, got {rest} f_rest"
-                         + (f" and no {', '.join(missing[:4])}" if missing else "") + ": export it as standard 3DGS")
+        raise ValueError(
+            f"{path}: expected the properties of 3DGS with 0, 9, 24, 45 or 72 f_rest, got {rest} f_rest"
+            + (f" and no {', '.join(missing[:4])}" if missing else "")
+            + ": export it as standard 3DGS"
+        )
     try:
         vertex = PlyData.read(str(path), mmap=False)["vertex"].data
     except (PlyParseError, ValueError, KeyError) as error:
@@ -154,7 +164,9 @@ def load_ply(path: str | os.PathLike[str]) -> Gaussians:
         return np.stack([np.asarray(vertex[name], np.float32) for name in wanted], -1).reshape(n, len(wanted))
 
     dc = columns(*(f"f_dc_{i}" for i in range(3)))[:, None]
-    higher = columns(*(f"f_rest_{i}" for i in range(rest))).reshape(n, 3, k - 1) if rest else np.empty((n, 3, 0), np.float32)
+    higher = (
+        columns(*(f"f_rest_{i}" for i in range(rest))).reshape(n, 3, k - 1) if rest else np.empty((n, 3, 0), np.float32)
+    )
     arrays = {
         "means": columns("x", "y", "z"),
         "quats": columns(*(f"rot_{i}" for i in range(4))),
@@ -165,8 +177,10 @@ def load_ply(path: str | os.PathLike[str]) -> Gaussians:
     for name, array in arrays.items():
         if not np.isfinite(array).all():
             bad = int((~np.isfinite(array)).reshape(n, -1).any(-1).sum())
-            raise ValueError(f"{path}: expected finite {name}, got NaN or infinity in {bad} of {n} Gaussians: "
-                             "the fit that wrote it has diverged")
+            raise ValueError(
+                f"{path}: expected finite {name}, got NaN or infinity in {bad} of {n} Gaussians: "
+                "the fit that wrote it has diverged"
+            )
     return Gaussians(**{name: torch.from_numpy(np.ascontiguousarray(a)) for name, a in arrays.items()})
 
 
@@ -204,8 +218,10 @@ def _check_ply_header(path: Path) -> tuple[int, list[str]]:
         raise refuse("no element")
     body = total - end - len(b"end_header\n")
     if n * bytes_each > body + ascii_format:
-        raise ValueError(f"{path}: expected {n} Gaussians of {bytes_each} bytes as its header says, got {body} bytes: "
-                         "the file is cut off or its header is wrong")
+        raise ValueError(
+            f"{path}: expected {n} Gaussians of {bytes_each} bytes as its header says, got {body} bytes: "
+            "the file is cut off or its header is wrong"
+        )
     return n, names
 
 

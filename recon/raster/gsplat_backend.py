@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -26,14 +29,13 @@ def render(
         import gsplat
     except ImportError as error:
         raise ValueError("backend='gsplat' needs gsplat: pip install 'otsync[cuda]', or use backend='cpu'") from error
-    means, quats, scales, opacities, colors = gaussians
-    if not means.is_cuda:
+    if not gaussians[0].is_cuda:
         raise ValueError("backend='gsplat' needs CUDA tensors, got CPU tensors: move them with .cuda(), or use 'cpu'")
     return rasterize(gsplat.rasterization, gaussians, viewmats, Ks, size, backgrounds, options)
 
 
 def rasterize(
-    rasterization,
+    rasterization: Callable[..., tuple[Tensor, Tensor, dict[str, Any]]],
     gaussians: tuple[Tensor, Tensor, Tensor, Tensor, Tensor],
     viewmats: Tensor,
     Ks: Tensor,
@@ -46,7 +48,9 @@ def rasterize(
     dtype, n, c = means.dtype, len(means), len(viewmats)
     width, height = size
     if n == 0:  # gsplat launches no kernel and leaves its outputs unset
-        return _empty(means, viewmats, size, 3 if options.sh_degree is not None else colors.shape[-1], backgrounds, options)
+        return _empty(
+            means, viewmats, size, 3 if options.sh_degree is not None else colors.shape[-1], backgrounds, options
+        )
     # gsplat normalises by 1/|q|; a quaternion that is no rotation must not reach it
     rotates = (quats * quats).sum(-1) >= QUAT_NORM2_MIN
     quats = torch.where(rotates[:, None], quats, torch.ones_like(quats))

@@ -133,7 +133,7 @@ def _drop_nonfinite(gaussians: tuple[Tensor, ...], sh_degree: int | None) -> tup
         if all(_finite_sum(t) for t in gaussians):
             return gaussians
         means, colors = gaussians[0], gaussians[4]
-        per_camera = colors.ndim == 4 or colors.ndim == 3 and (sh_degree is None)
+        per_camera = colors.ndim == 4 or (colors.ndim == 3 and (sh_degree is None))
         good = torch.ones(len(means), dtype=torch.bool, device=means.device)
         for t in (*gaussians[:4], colors.movedim(0, 1) if per_camera else colors):
             good &= t.isfinite().reshape(len(means), -1).all(-1)
@@ -148,7 +148,9 @@ def _finite_sum(t: Tensor) -> bool:
     if t.is_cuda:
         return bool(t.sum().isfinite())
     with np.errstate(all="ignore"):
-        return bool(np.isfinite(t.detach().numpy().sum()))  # torch would wake its own pool, which then competes with ours
+        return bool(
+            np.isfinite(t.detach().numpy().sum())
+        )  # torch would wake its own pool, which then competes with ours
 
 
 def _check_shapes(
@@ -175,11 +177,14 @@ def _check_shapes(
                 break
         else:
             wanted = " or ".join("[" + ",".join(map(str, s)) + "]" for s in shapes)
-            raise ValueError(f"{name}: expected {wanted} (N = {n} from means, C = {c} from viewmats), "
-                             f"got {list(tensor.shape)}")
+            raise ValueError(
+                f"{name}: expected {wanted} (N = {n} from means, C = {c} from viewmats), got {list(tensor.shape)}"
+            )
         if tensor.dtype != means.dtype or not tensor.is_floating_point() or tensor.device != means.device:
-            raise ValueError(f"{name}: expected {means.dtype} on {means.device} like means (a float type), "
-                             f"got {tensor.dtype} on {tensor.device}: convert with .to(means)")
+            raise ValueError(
+                f"{name}: expected {means.dtype} on {means.device} like means (a float type), "
+                f"got {tensor.dtype} on {tensor.device}: convert with .to(means)"
+            )
 
     expect("means", means, ("N", 3))
     expect("quats", quats, (n, 4))
@@ -191,12 +196,16 @@ def _check_shapes(
     if options.sh_degree is None:
         expect("colors", colors, (n, "D"), (c, n, "D"))
         if d == 0:
-            raise ValueError("colors: expected at least one channel, got none: pass ones [N,1] to render the alpha only")
+            raise ValueError(
+                "colors: expected at least one channel, got none: pass ones [N,1] to render the alpha only"
+            )
     else:
         expect("colors", colors, (n, "K", 3), (c, n, "K", 3))
         if colors.shape[-2] < (options.sh_degree + 1) ** 2:
-            raise ValueError(f"colors: sh_degree {options.sh_degree} needs {(options.sh_degree + 1) ** 2} coefficients, "
-                             f"got {colors.shape[-2]}")
+            raise ValueError(
+                f"colors: sh_degree {options.sh_degree} needs {(options.sh_degree + 1) ** 2} coefficients, "
+                f"got {colors.shape[-2]}"
+            )
     if width < 1 or height < 1:
         raise ValueError(f"width, height: expected at least one pixel, got {width} x {height}")
     if c < 1:
@@ -207,5 +216,6 @@ def _check_shapes(
         cameras["backgrounds"] = backgrounds
     for name, tensor in cameras.items():
         if not _finite_sum(tensor):
-            raise ValueError(f"{name}: expected finite entries, got NaN or infinity: a camera or colour of the caller "
-                             f"has diverged")
+            raise ValueError(
+                f"{name}: expected finite entries, got NaN or infinity: a camera or colour of the caller has diverged"
+            )

@@ -1,4 +1,4 @@
-"""What a rendering is asked for and what it gives back: the thresholds, :class:`Settings`, :class:`Splats` and :class:`Rendering`."""
+"""What a rendering is asked for and what it gives back: thresholds, Settings, Splats, Rendering."""
 
 from __future__ import annotations
 
@@ -41,7 +41,9 @@ class Settings:
         if self.depth not in ("expected", "accumulated", None):
             raise ValueError(f"depth: expected 'expected', 'accumulated' or None, got {self.depth!r}")
         if not 0 <= self.near_plane < self.far_plane:
-            raise ValueError(f"near_plane, far_plane: expected 0 <= near < far, got {self.near_plane}, {self.far_plane}")
+            raise ValueError(
+                f"near_plane, far_plane: expected 0 <= near < far, got {self.near_plane}, {self.far_plane}"
+            )
         if not 0 <= self.eps2d < float("inf"):
             raise ValueError(f"eps2d: expected a variance >= 0 in square pixels, got {self.eps2d}")
         if self.sh_degree is not None and self.sh_degree not in range(5):

@@ -26,7 +26,8 @@ def basis(degree: int, directions: Tensor) -> list[Tensor]:
         sines.append(x * s + y * c)
     legendre = _legendre(degree, z)
     for l in range(1, degree + 1):
-        below, above = [], []
+        below: list[Tensor] = []
+        above: list[Tensor] = []
         for m in range(1, l + 1):
             # the alternating sign is the Condon-Shortley phase, which 3DGS keeps
             norm = (-1) ** m * math.sqrt((2 * l + 1) / (2 * math.pi) * math.factorial(l - m) / math.factorial(l + m))

@@ -152,7 +152,11 @@ def header(n="1", names=None, kind="float", form="binary_little_endian", before=
         (header(kind="list uchar int"), b"\0" * 900, "the line 'property list"),
         (header(kind="quad"), b"\0" * 900, "the line 'property quad"),
         (header(form="binary_middle_endian"), b"\0" * 900, "the line 'format"),
-        (header(before="element face 1000000000\nproperty list uchar int vertex_index\n"), b"\0" * 900, "the line 'element face"),
+        (
+            header(before="element face 1000000000\nproperty list uchar int vertex_index\n"),
+            b"\0" * 900,
+            "the line 'element face",
+        ),
         (header().replace("end_header", "element face 5\nproperty float a\nend_header"), b"\0" * 900, "element face"),
         ("ply\nformat ascii 1.0\nend_header\n", b"", "no element"),
         (header(), struct.pack("<17f", *([0.0] * 16), float("nan")), "NaN or infinity in 1 of 1"),

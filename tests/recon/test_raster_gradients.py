@@ -88,7 +88,7 @@ def test_projection_node_alone(mode):
     assert (results["cpu", "radii"] == results["torch", "radii"]).all()
     for field in ("means2d", "rows", "depths", "opacities"):
         for a, b in zip(results["cpu", field], results["torch", field], strict=True):
-            assert (a is None or relative(a, torch.zeros_like(a) if b is None else b) < 2e-6), field
+            assert a is None or relative(a, torch.zeros_like(a) if b is None else b) < 2e-6, field
 
 
 @hypothesis_settings(max_examples=25, deadline=None)

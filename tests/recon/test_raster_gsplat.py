@@ -39,7 +39,16 @@ def test_projection(engine, mode, dtype):
     """Means, depths, conics and compensations of the splats that both draw."""
     scene = SCENE.to(dtype)
     settings = Settings(rasterize_mode=mode)
-    args = (scene.means, scene.quats, scene.scales, scene.opacities, scene.viewmats, scene.Ks, scene.width, scene.height)
+    args = (
+        scene.means,
+        scene.quats,
+        scene.scales,
+        scene.opacities,
+        scene.viewmats,
+        scene.Ks,
+        scene.width,
+        scene.height,
+    )
     mine = engine(*args, settings)
     radii, means2d, depths, conics, compensations = gsplat_projection(scene, mode == "antialiased")
     both = (mine.radii > 0).all(-1) & (radii > 0).all(-1)

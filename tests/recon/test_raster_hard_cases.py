@@ -101,40 +101,65 @@ ROWS: dict[str, Row] = {
     ),
     "opacity 0": Row(splats([[0, 0, 5]], 0.3, opacities=0.0), drawn=False),
     "opacity 1": Row(splats([[0, 0, 5], [0.2, 0.1, 6], [-0.1, 0, 7]], 0.4, opacities=1.0), drawn=True),
-    "opacity at 1/255": Row(splats([[0.0333333, 0.0333333, 5]], 0.8, opacities=1.00001 / 255), drawn=None, gradients=1.0),
+    "opacity at 1/255": Row(
+        splats([[0.0333333, 0.0333333, 5]], 0.8, opacities=1.00001 / 255), drawn=None, gradients=1.0
+    ),
     "equal depths": Row(
-        replace(BASE, means=(BASE.means @ look()[:3, :3].T * torch.tensor([1.0, 1, 0]) + torch.tensor([0, 0, 4.0])),
-                viewmats=torch.eye(4)[None]), drawn=True,
+        replace(
+            BASE,
+            means=(BASE.means @ look()[:3, :3].T * torch.tensor([1.0, 1, 0]) + torch.tensor([0, 0, 4.0])),
+            viewmats=torch.eye(4)[None],
+        ),
+        drawn=True,
     ),
     "identical Gaussians": Row(splats([[0.1, 0, 5]] * 12, 0.3, opacities=0.3), drawn=True),
     "one pixel image": Row(
-        replace(splats([[0, 0, 5], [0.01, 0, 6]], 0.3), width=1, height=1, Ks=torch.tensor([[[2.0, 0, 0.5], [0, 2, 0.5], [0, 0, 1]]])),
+        replace(
+            splats([[0, 0, 5], [0.01, 0, 6]], 0.3),
+            width=1,
+            height=1,
+            Ks=torch.tensor([[[2.0, 0, 0.5], [0, 2, 0.5], [0, 0, 1]]]),
+        ),
         drawn=True,
     ),
     "N = 1": Row(splats([[0.1, 0.1, 4]], [0.3, 0.1, 0.2]), drawn=True),
     "N = 0": Row(splats([], 0.3), drawn=False),
     "5000 splats on one pixel": Row(
-        splats([[(3 + 0.001 * i) / 60, (3 + 0.001 * i) / 60, 3 + 0.001 * i] for i in range(5000)], 0.004, opacities=0.0045),
-        oracle="torch", drawn=True, gradients=1e-4,
+        splats(
+            [[(3 + 0.001 * i) / 60, (3 + 0.001 * i) / 60, 3 + 0.001 * i] for i in range(5000)], 0.004, opacities=0.0045
+        ),
+        oracle="torch",
+        drawn=True,
+        gradients=1e-4,
     ),
     "5000 opaque splats": Row(
-        splats([[0, 0, 3 + 0.001 * i] for i in range(5000)], 0.3, opacities=0.9), oracle="torch", drawn=True,
+        splats([[0, 0, 3 + 0.001 * i] for i in range(5000)], 0.3, opacities=0.9),
+        oracle="torch",
+        drawn=True,
     ),
     "origin 1e4 away": Row(
-        replace(BASE, means=(BASE.means + 1e4), viewmats=BASE.viewmats @ torch.tensor(
-            [[1.0, 0, 0, -1e4], [0, 1, 0, -1e4], [0, 0, 1, -1e4], [0, 0, 0, 1]])), drawn=True,
+        replace(
+            BASE,
+            means=(BASE.means + 1e4),
+            viewmats=BASE.viewmats @ torch.tensor([[1.0, 0, 0, -1e4], [0, 1, 0, -1e4], [0, 0, 1, -1e4], [0, 0, 0, 1]]),
+        ),
+        drawn=True,
     ),
     "needle 1:1e-4": Row(needle(1e-4, 1.0, 0.7), drawn=True, gradients=1e-4),
     "needle 1:1e-4, antialiased": Row(needle(1e-4, 1.0, 0.7, rasterize_mode="antialiased"), gradients=1e-4),
     "needle 1:1e-4, no blur": Row(needle(1e-4, 1.0, 0.7, eps2d=0.0), gradients=1e-4),
     "needle 100:1e-3": Row(needle(1e-3, 100.0, 0.7), drawn=True, gradients=1e-4),
-    "needle 100:1e-3, antialiased": Row(needle(1e-3, 100.0, 0.7, rasterize_mode="antialiased"), drawn=True, gradients=1e-4),
+    "needle 100:1e-3, antialiased": Row(
+        needle(1e-3, 100.0, 0.7, rasterize_mode="antialiased"), drawn=True, gradients=1e-4
+    ),
     "needle 100:1e-3, no blur": Row(needle(1e-3, 100.0, 0.7, eps2d=0.0), gradients=1e-4),
     "needle 100:1e-3, no blur, antialiased": Row(
         needle(1e-3, 100.0, 0.7, eps2d=0.0, rasterize_mode="antialiased"), gradients=1e-4
     ),
     "flat needle": Row(needle(1e-3, 100.0, 0.003), drawn=True, gradients=1e-4),
-    "upright needle, antialiased": Row(needle(1e-3, 100.0, 1.57, rasterize_mode="antialiased"), drawn=True, gradients=1e-4),
+    "upright needle, antialiased": Row(
+        needle(1e-3, 100.0, 1.57, rasterize_mode="antialiased"), drawn=True, gradients=1e-4
+    ),
     **{
         f"{value} in {name}": nonfinite(name, index, value)
         for value in (float("nan"), float("inf"), -float("inf"))
@@ -335,4 +360,9 @@ def test_unknown_back_ends_and_settings_are_refused():
     with pytest.raises(ValueError, match="backend: expected"):
         BASE.render("opengl")
     with pytest.raises(TypeError, match="tile_size"):
-        render(*(getattr(BASE, k) for k in ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks")), 8, 8, tile_size=4)
+        render(
+            *(getattr(BASE, k) for k in ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks")),
+            8,
+            8,
+            tile_size=4,
+        )

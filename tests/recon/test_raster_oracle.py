@@ -129,7 +129,9 @@ def test_turning_the_world_and_the_camera_together_changes_nothing(backend):
     rigid = torch.eye(4, dtype=torch.float64)
     rigid[:3, :3], rigid[:3, 3] = turn, torch.tensor([1.0, 2, 3])
     w = 0.5 * (1 + turn.trace()).sqrt()
-    q = torch.stack([w, *(torch.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / (4 * w))])
+    q = torch.stack(
+        [w, *(torch.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / (4 * w))]
+    )
     a, b = q, scene.quats.double()
     product = torch.stack([
         a[0] * b[:, 0] - a[1] * b[:, 1] - a[2] * b[:, 2] - a[3] * b[:, 3],

@@ -19,8 +19,8 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from recon import bench_raster
-from recon.raster import set_threads, warmup
 from recon.raster import render as render_module  # the function; its module is reached through sys.modules
+from recon.raster import set_threads, warmup
 from recon.raster.cpu import kernels, lists, simd, threads
 from recon.raster.projection import project
 from recon.raster.rendering import ALPHA_MIN, Settings
@@ -43,12 +43,19 @@ print(sum(sum(k.stats.cache_hits.values()) for k in every), sum(sum(k.stats.cach
 
 
 def python(code: str, **options) -> subprocess.CompletedProcess:
-    environment = {"PYTHONPATH": str(ROOT), "PATH": os.environ["PATH"], "OMP_NUM_THREADS": "1", **options.pop("env", {})}
+    environment = {
+        "PYTHONPATH": str(ROOT),
+        "PATH": os.environ["PATH"],
+        "OMP_NUM_THREADS": "1",
+        **options.pop("env", {}),
+    }
     return subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, **options)
 
 
 def test_importing_the_renderer_is_light_and_knows_nothing_of_otsync():
-    code = "import sys, recon.raster; print([m for m in sys.modules if m.split('.')[0] in ('otsync', 'numba', 'gsplat')])"
+    code = (
+        "import sys, recon.raster; print([m for m in sys.modules if m.split('.')[0] in ('otsync', 'numba', 'gsplat')])"
+    )
     assert python(code).stdout.strip() == "[]"
 
 
@@ -81,7 +88,12 @@ def test_a_read_only_installation_works(tmp_path, home):
         path.chmod(0o555 if path.is_dir() else 0o444)
     folder.mkdir()
     read_only = str(site) if home == "writable" else f"{site}:{folder}"
-    env = {"PYTHONPATH": str(site), "HOME": str(folder), "XDG_CACHE_HOME": str(folder / "cache"), "READ_ONLY": read_only}
+    env = {
+        "PYTHONPATH": str(site),
+        "HOME": str(folder),
+        "XDG_CACHE_HOME": str(folder / "cache"),
+        "READ_ONLY": read_only,
+    }
     first = python(READ_ONLY + RENDER, env=env, cwd=str(tmp_path))
     assert first.returncode == 0, first.stderr
     assert not list(site.rglob("*.nbc"))
@@ -185,7 +197,11 @@ def test_vectors_do_what_their_names_say():
 
 
 @hypothesis_settings(max_examples=40, deadline=None)
-@given(st.lists(st.sampled_from([0.01, 0.5, 1.0, 1.0000001, 2.0, 1e3, 3e9]) | st.floats(2**-7, 2**33, width=32), max_size=60))
+@given(
+    st.lists(
+        st.sampled_from([0.01, 0.5, 1.0, 1.0000001, 2.0, 1e3, 3e9]) | st.floats(2**-7, 2**33, width=32), max_size=60
+    )
+)
 def test_depth_order_is_a_stable_sort(values):
     depths = np.array(values, np.float32)
     radii = np.ones((len(depths), 2), np.int32)
@@ -231,7 +247,7 @@ def test_the_benchmark_writes_its_files_and_its_gate_closes(tmp_path, monkeypatc
     assert {p.name for p in (tmp_path / "out").iterdir()} == {"raster.csv", "raster.json", "raster.png"}
     report = json.loads((tmp_path / "out" / "raster.json").read_text())
     assert {row["backend"] for row in report["rows"]} >= {"cpu", "torch"}
-    assert report["machine"]["versions"]["torch"] and "gsplat" in report["skipped"] or torch.cuda.is_available()
+    assert (report["machine"]["versions"]["torch"] and "gsplat" in report["skipped"]) or torch.cuda.is_available()
     assert all(row["difference_p999"] < 1e-5 for row in report["rows"])
     known = json.loads(baseline.read_text())
     known["ratios"] = {key: 1e6 for key in known["ratios"]}

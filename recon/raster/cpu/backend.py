@@ -77,7 +77,7 @@ def warmup() -> None:
 
 def _announce_compilation() -> None:
     every = (projection.forward, projection.backward, kernels.forward, kernels.backward)
-    if any(k.stats.cache_misses or not k.stats.cache_hits and k.signatures for k in every):
+    if any(k.stats.cache_misses or (not k.stats.cache_hits and k.signatures) for k in every):
         logger.warning("recon.raster compiles its CPU kernels: about 15 seconds, once per machine and version")
 
 
@@ -209,7 +209,7 @@ def _in_rank_order(features: np.ndarray, depths: np.ndarray, order: np.ndarray, 
     channels = np.empty((len(order), d + with_depth), np.float32)
     for_each(
         kernels.gather_channels,
-        ranges(len(order), lists.PART),
+        ranges(len(order), GAUSSIANS_PER_PART),
         *(order, features.reshape(-1, d), n if features.ndim == 2 else 0, depths, channels),
     )
     return channels.reshape(-1)

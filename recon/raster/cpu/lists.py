@@ -18,7 +18,7 @@ from recon.raster.rendering import ALPHA_MIN
 TILE_WIDTH, TILE_HEIGHT = 64, 16  # pixels: wide, because most of the work is per row of a splat in a tile
 RECORD = 11  # floats of a packed splat; the last three are the residuals of float32
 MEAN_X, MEAN_Y, VAR_X, SLOPE, PER_VAR_Y, OPACITY, REACH2, HALF_Y, REST_X, REST_Y, REST_SLOPE = range(RECORD)
-PART = 2048  # splats of one part
+LEAST_PART, MOST_PARTS = 2048, 16  # splats of one part at the least; parts, each with a counter per tile
 
 F32 = np.float32
 MARGIN = F32(0.01)  # pixels added to every extent: a splat at the rounding edge of a row is tested, not lost
@@ -49,7 +49,7 @@ def build(splats: tuple[np.ndarray, ...], width: int, height: int) -> TileLists:
 
     records = np.empty(r * RECORD, F32)
     rank_of_splat = np.full(n_cameras * n, -1, np.int32)
-    parts = ranges(r, PART)
+    parts = ranges(r, max(LEAST_PART, -(-r // MOST_PARTS)))
     counts = np.zeros((len(parts), n_tiles), np.int64)
     slot_starts = np.zeros(r + 1, np.int64)
     tiles_of_part: list[np.ndarray] = [np.empty(0, np.int32)] * len(parts)
@@ -103,7 +103,10 @@ def _radix_sort(depth_bits, radii, entries):
     source, target = entries[0], entries[1]
     for digit in range(3):
         place = counts[digit]
-        if n > 0 and place[(depth_bits[source[0] & np.uint64(0xFFFFFFFF)] >> np.uint64(11 * digit)) & np.uint64(2047)] == n:
+        if (
+            n > 0
+            and place[(depth_bits[source[0] & np.uint64(0xFFFFFFFF)] >> np.uint64(11 * digit)) & np.uint64(2047)] == n
+        ):
             continue  # all alike in these bits: the highest ones, mostly
         start = 0
         for value in range(2048):

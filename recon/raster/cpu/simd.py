@@ -13,6 +13,7 @@ float32 or int32; indices are not checked.
 from __future__ import annotations
 
 import operator
+from typing import Any
 
 import llvmlite.binding
 from llvmlite import ir
@@ -26,6 +27,8 @@ LANES = 16 if llvmlite.binding.get_host_cpu_features().get("avx512f", False) els
 
 # Reassociation and contraction only: NaN and infinity keep their meaning, the guards rely on it.
 FLAGS = ("contract", "reassoc", "arcp", "nsz")
+
+_intrinsic: Any = intrinsic  # to a type checker the decorated functions have one argument too many
 
 _F32, _I32, _I1 = ir.FloatType(), ir.IntType(32), ir.IntType(1)
 
@@ -105,20 +108,20 @@ def _pointer(context, builder, array_type, array, index, vector):
     return builder.bitcast(builder.gep(data, [index]), vector.as_pointer())
 
 
-@intrinsic
+@_intrinsic
 def load(typingctx, array, index):
     """The LANES elements that start at array[index]."""
     kind = _SCALARS[array.dtype]
 
     def lower(context, builder, sig, args):
-        value = builder.load(_pointer(context, builder, sig.args[0], *args, kind.ir))
+        value = builder.load(_pointer(context, builder, sig.args[0], args[0], args[1], kind.ir))
         value.align = 4
         return value
 
     return kind(array, index), lower
 
 
-@intrinsic
+@_intrinsic
 def store(typingctx, array, index, vector):
     """array[index : index + LANES] = vector."""
 
@@ -131,13 +134,13 @@ def store(typingctx, array, index, vector):
     return types.void(array, index, vector), lower
 
 
-@intrinsic
+@_intrinsic
 def spread(typingctx, scalar):
     """The scalar (float32 or int32) in every lane."""
     return _SCALARS[scalar](scalar), lambda context, builder, sig, args: _spread(builder, args[0], sig.args[0])
 
 
-@intrinsic
+@_intrinsic
 def counting_from(typingctx, start):
     """start, start + 1, ..., start + LANES - 1 in float32, from a float32 or an int32 start.
 
@@ -153,7 +156,7 @@ def counting_from(typingctx, start):
     return floats(start), lower
 
 
-@intrinsic
+@_intrinsic
 def select(typingctx, condition, yes, no):
     """Per lane: yes where the condition holds, else no. Either may be a scalar."""
     kind = ints if ints in (yes, no) or (yes, no) == (types.int32, types.int32) else floats
@@ -164,7 +167,7 @@ def select(typingctx, condition, yes, no):
     return kind(condition, yes, no), lower
 
 
-@intrinsic
+@_intrinsic
 def minimum(typingctx, x, y):
     """Per lane the smaller of two; y where x is NaN."""
 
@@ -175,7 +178,7 @@ def minimum(typingctx, x, y):
     return floats(x, y), lower
 
 
-@intrinsic
+@_intrinsic
 def maximum(typingctx, x, y):
     """Per lane the larger of two; y where x is NaN."""
 
@@ -191,7 +194,7 @@ def _unary(name, doc):
         return floats(x), lambda context, builder, sig, args: _call(builder, name, floats.ir, list(args))
 
     typer.__doc__ = doc
-    return intrinsic(typer)
+    return _intrinsic(typer)
 
 
 square_root = _unary("sqrt", "Per lane square root.")
@@ -200,17 +203,23 @@ round_down = _unary("floor", "Per lane the next integer below, as a float.")
 magnitude = _unary("fabs", "Per lane absolute value.")
 
 
-@intrinsic
+@_intrinsic
 def to_int(typingctx, x):
     """Per lane conversion of an integral float within the range of int32."""
     return ints(x), lambda context, builder, sig, args: builder.fptosi(args[0], ints.ir)
 
 
 #: 2^f = 1 + f (c1 + f (c2 + ...)) on [-1/2, 1/2]: minimax in the relative error, 9e-8, about one unit in the last place.
-EXP2_COEFFICIENTS = (0.6931470036506653, 0.24022242426872253, 0.05550733581185341, 0.009671512991189957, 0.001326472731307149)
+EXP2_COEFFICIENTS = (
+    0.6931470036506653,
+    0.24022242426872253,
+    0.05550733581185341,
+    0.009671512991189957,
+    0.001326472731307149,
+)
 
 
-@intrinsic
+@_intrinsic
 def exp2_nonpositive(typingctx, x):
     """Per lane 2^x for x <= 0; below 2^-126, the smallest normal number, it stays there."""
 
@@ -228,7 +237,7 @@ def exp2_nonpositive(typingctx, x):
     return floats(x), lower
 
 
-@intrinsic
+@_intrinsic
 def total(typingctx, x):
     """Sum over the lanes, in an order that depends on the processor only."""
 
@@ -241,7 +250,7 @@ def total(typingctx, x):
     return types.float32(x), lower
 
 
-@intrinsic
+@_intrinsic
 def any_lane(typingctx, condition):
     """True when the condition holds in at least one lane."""
 

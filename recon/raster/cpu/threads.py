@@ -111,8 +111,10 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         except RuntimeError:  # "cannot cache function: no locator available"
             if not _uncached_announced:
                 _uncached_announced = True
-                logger.warning("recon.raster finds no writable folder for compiled code and compiles it in every process; "
-                               "set NUMBA_CACHE_DIR to a folder of your own")
+                logger.warning(
+                    "recon.raster finds no writable folder for compiled code and compiles it in every process; "
+                    "set NUMBA_CACHE_DIR to a folder of your own"
+                )
             return numba.njit(**settings)(function)
 
     return compile_lazily
