@@ -7,8 +7,9 @@ from dataclasses import replace
 import pytest
 import torch
 
+from recon import bench_raster
 from recon.raster import render
-from tests.recon.scenes import random_scene, relative, run
+from tests.recon.scenes import Scene, random_scene, relative, run
 
 BACKENDS = ("torch", "cpu")
 # name -> (scene, tolerance of outputs, tolerance of gradients); no pixel of these lies at a threshold
@@ -147,3 +148,28 @@ def test_turning_the_world_and_the_camera_together_changes_nothing(backend):
     )
     here, there = scene.render(backend).colors, moved.to(torch.float32).render(backend).colors
     assert float((here - there).abs().flatten().quantile(0.99)) < 1e-5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", bench_raster.SIZES, ids=str)
+@pytest.mark.parametrize("mode", ["classic", "antialiased"])
+def test_accuracy_at_the_sizes_of_the_benchmark(size, mode):
+    """Against the torch back end in float64: the percentile, the pixels that flip at a threshold, the gradients."""
+    width, height, n = size
+    means, quats, scales, opacities, colors, viewmats, Ks = bench_raster.scene(width, height, n, 3)
+    settings = {"rasterize_mode": mode, "depth": "accumulated"}
+    scene = Scene(means, quats, scales, opacities, colors, viewmats, Ks, width, height, settings=settings)
+    (image, _, _), gradients = run(scene, "cpu")
+    (true_image, _, _), true_gradients = run(scene, "torch", torch.float64)
+    difference = (image - true_image).abs().flatten()
+    flips = int((difference > 1e-4).sum())
+    percentile = float(difference.kthvalue(int(0.999 * len(difference))).values)
+    worst = {name: relative(gradients[name], true) for name, true in true_gradients.items()}
+    print(
+        f"\n{size} {mode}: p99.9 {percentile:.1e}, largest {float(difference.max()):.1e}, {flips} flipped values, "
+        f"gradients { ({k: f'{v:.1e}' for k, v in worst.items()}) }"
+    )
+    assert percentile <= 5e-6
+    assert flips <= 20 and float(difference.max()) <= 5e-3
+    if flips == 0:
+        assert max(worst.values()) <= 5e-6
