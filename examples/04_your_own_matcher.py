@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import tyro
-from otsync.simulate import simulate
 
 from otsync import Matches, OptimalTransport, TrackSet, match, synchronize
+from otsync.simulate import simulate
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ def main(videos: int = 3, seed: int = 0) -> None:
         print(f"{matcher}: errors {np.round(error, 2)} frames, {[s.code for s in offsets.status[1:]]}")
 
     # or skip matching altogether: bring pairs of your own
-    given = {(0, v): truth.matches(tracks[0], tracks[v]) for v in range(1, videos)}
+    given = {(0, v): truth.matches(0, v) for v in range(1, videos)}
     offsets = synchronize(tracks, matches=given)
     print(f"given matches: errors {np.round(np.abs(offsets.seconds - truth.offsets)[1:] * 30, 2)} frames")
 
