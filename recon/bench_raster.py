@@ -212,7 +212,7 @@ def measure(size: tuple[int, int, int], channels: int, repeats: int, names: Sequ
     return rows
 
 
-def gate(rows: list[dict[str, Any]], baseline: dict[str, float]) -> list[str]:
+def fallen_behind(rows: list[dict[str, Any]], baseline: dict[str, float]) -> list[str]:
     """What fell behind: ratios below the floor, or below the baseline by more than TOLERANCE."""
     problems = []
     for row in rows:
@@ -258,13 +258,13 @@ def run(
     sizes: Sequence[tuple[int, int, int]] = SIZES,
     channels: Sequence[int] = (3, 32),
     repeats: int = 15,
-    gate_closed: bool = False,
+    gate: bool = False,
     with_fit: bool = True,
     update_baseline: bool = False,
 ) -> int:
     """Measure, print, and write raster.csv, raster.json and raster.png to the folder `out`; returns an exit code.
 
-    gate_closed: return 1 when a ratio is below its floor or fell behind the committed baseline.
+    gate: return 1 when a ratio is below its floor or fell behind the committed baseline.
     with_fit: measure the toy fit of :mod:`recon.toy` too. update_baseline: make this run the baseline.
     """
     out = Path(out)
@@ -293,10 +293,10 @@ def run(
         ratios = {_key(row): row["times_torch"] for row in rows if row["backend"] == "cpu"}
         write_json(BASELINE, {"machine": info, "ratios": ratios})
     baseline = json.loads(BASELINE.read_text())["ratios"] if BASELINE.exists() else {}
-    problems = gate(rows, baseline)
+    problems = fallen_behind(rows, baseline)
     for problem in problems:
         print("behind:", problem)
-    return 1 if gate_closed and problems else 0
+    return 1 if gate and problems else 0
 
 
 def _toy_fit() -> dict[str, float]:
@@ -355,7 +355,7 @@ def main() -> int:
         sizes=[SIZES[i] for i in args.sizes],
         channels=args.channels,
         repeats=args.repeats,
-        gate_closed=args.gate,
+        gate=args.gate,
         with_fit=not args.no_fit,
         update_baseline=args.update_baseline,
     )

@@ -108,6 +108,18 @@ def test_a_read_only_installation_works(tmp_path, home):
         path.chmod(0o755)
 
 
+@pytest.mark.slow
+def test_a_processor_without_avx_gets_the_same_images(tmp_path):
+    """Compiled for the least x86-64 there is: eight lanes, no fused multiply-add."""
+    code = "from recon.raster.cpu.simd import LANES; assert LANES == 8, LANES"
+    env = {"NUMBA_CPU_NAME": "generic", "NUMBA_CACHE_DIR": str(tmp_path)}
+    assert python(code, env=env).returncode == 0
+    tests = ["tests/recon/test_raster_oracle.py", "tests/recon/test_raster_hard_cases.py"]
+    code = f"import pytest; raise SystemExit(pytest.main(['-q', '-x', '-m', 'not slow', '-k', 'cpu', *{tests}]))"
+    result = python(code, env=env, cwd=ROOT)
+    assert result.returncode == 0, result.stdout[-3000:]
+
+
 def test_compiled_code_is_stale_when_any_source_of_the_kernels_changed():
     stamp = kernels.forward._cache._cache_file._source_stamp
     names = {entry[0] for entry in stamp[1]}
@@ -243,7 +255,7 @@ def test_the_benchmark_writes_its_files_and_its_gate_closes(tmp_path, monkeypatc
     monkeypatch.setattr(bench_raster, "BASELINE", baseline)
     monkeypatch.setattr(bench_raster, "LEAST_RATIO", {})
     options = {"sizes": [(48, 32, 200)], "channels": [3], "repeats": 3, "with_fit": False}
-    assert bench_raster.run(tmp_path / "out", update_baseline=True, gate_closed=True, **options) == 0
+    assert bench_raster.run(tmp_path / "out", update_baseline=True, gate=True, **options) == 0
     assert {p.name for p in (tmp_path / "out").iterdir()} == {"raster.csv", "raster.json", "raster.png"}
     report = json.loads((tmp_path / "out" / "raster.json").read_text())
     assert {row["backend"] for row in report["rows"]} >= {"cpu", "torch"}
@@ -252,7 +264,7 @@ def test_the_benchmark_writes_its_files_and_its_gate_closes(tmp_path, monkeypatc
     known = json.loads(baseline.read_text())
     known["ratios"] = {key: 1e6 for key in known["ratios"]}
     baseline.write_text(json.dumps(known))
-    assert bench_raster.run(tmp_path / "out", gate_closed=True, **options) == 1
+    assert bench_raster.run(tmp_path / "out", gate=True, **options) == 1
     assert "behind" in capsys.readouterr().out
 
 

@@ -17,13 +17,21 @@ from typing import Any
 
 import llvmlite.binding
 from llvmlite import ir
-from numba.core import cgutils, types
+from numba.core import cgutils, config, types
 from numba.core.datamodel.models import PrimitiveModel
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, register_model
 
+
+def _compiles_avx512() -> bool:
+    """Whether numba compiles for AVX-512: for this processor, unless it was told to compile for another one."""
+    if config.CPU_FEATURES is not None:
+        return "+avx512f" in config.CPU_FEATURES
+    return config.CPU_NAME is None and llvmlite.binding.get_host_cpu_features().get("avx512f", False)
+
+
 #: Sixteen floats fill an AVX-512 register; elsewhere eight: one AVX register, or two of SSE or NEON.
-LANES = 16 if llvmlite.binding.get_host_cpu_features().get("avx512f", False) else 8
+LANES = 16 if _compiles_avx512() else 8
 
 # Reassociation and contraction only: NaN and infinity keep their meaning, the guards rely on it.
 FLAGS = ("contract", "reassoc", "arcp", "nsz")
@@ -230,7 +238,7 @@ def exp2_nonpositive(typingctx, x):
         part = builder.fsub(y, whole)
         value = _constant(EXP2_COEFFICIENTS[-1])
         for c in (*reversed(EXP2_COEFFICIENTS[:-1]), 1.0):
-            value = _call(builder, "fma", floats.ir, [value, part, _constant(c)])
+            value = _call(builder, "fmuladd", floats.ir, [value, part, _constant(c)])
         exponent = builder.shl(builder.fptosi(whole, ints.ir), ir.Constant(ints.ir, [23] * LANES))
         return builder.bitcast(builder.add(builder.bitcast(value, ints.ir), exponent), floats.ir)
 
