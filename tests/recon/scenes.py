@@ -39,13 +39,18 @@ class Scene:
 
     def render(self, backend: str, **leaves: Tensor):
         scene = replace(self, **leaves)
-        return render(
-            *(scene.means, scene.quats, scene.scales, scene.opacities, scene.colors, scene.viewmats, scene.Ks),
+        device = "cuda" if backend == "gsplat" and torch.cuda.is_available() else "cpu"
+        names = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks")
+        out = render(
+            *(getattr(scene, name).to(device) for name in names),
             *(scene.width, scene.height),
-            backgrounds=scene.backgrounds,
+            backgrounds=None if scene.backgrounds is None else scene.backgrounds.to(device),
             backend=backend,
             **scene.settings,
         )
+        if device == "cpu":
+            return out
+        return replace(out, **{k: v.cpu() for k, v in vars(out).items() if isinstance(v, Tensor)})
 
 
 def look(angle: float = 0.1, shift=(0.2, -0.1, 0.3)) -> Tensor:
