@@ -25,9 +25,10 @@ from numba.extending import intrinsic, lower_builtin, register_model
 
 def _compiles_avx512() -> bool:
     """Whether numba compiles for AVX-512: for this processor, unless it was told to compile for another one."""
-    if config.CPU_FEATURES is not None:
-        return "+avx512f" in config.CPU_FEATURES
-    return config.CPU_NAME is None and llvmlite.binding.get_host_cpu_features().get("avx512f", False)
+    target: Any = config  # its attributes are made when numba starts
+    if target.CPU_FEATURES is not None:
+        return "+avx512f" in target.CPU_FEATURES
+    return target.CPU_NAME is None and llvmlite.binding.get_host_cpu_features().get("avx512f", False)
 
 
 #: Sixteen floats fill an AVX-512 register; elsewhere eight: one AVX register, or two of SSE or NEON.
