@@ -1,7 +1,7 @@
 """Benchmark of the rasterizer: the back ends side by side in one run, against a committed baseline of ratios.
 
-    python -m recon.bench_raster --out bench/out/raster            # all sizes, 3 and 32 channels
-    python -m recon.bench_raster --out bench/out/raster --gate     # exit code 1 when a ratio fell behind
+    otsync bench raster            # all sizes, 3 and 32 channels
+    otsync bench raster --gate     # exit code 1 when a ratio fell behind
 
 Times depend on the machine and on who else uses it; the ratio of two back ends, measured alternately in one process,
 much less so. It is the ratio that the gate watches.
@@ -14,15 +14,10 @@ import os
 # Torch's OpenMP threads would spin for a while after each operation and take the cores from the kernels that follow.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
-import argparse
 import contextlib
-import csv
 import ctypes
 import gc
-import io
-import json
 import math
-import platform
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -32,11 +27,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from otsync.files import atomic_write, write_json
+from otsync.bench import record
+from otsync.files import atomic_write, read_json
 from recon.raster import Rendering, render, warmup
 
 SIZES = ((128, 96, 2_000), (160, 120, 5_000), (320, 180, 20_000), (640, 360, 100_000))  # width, height, Gaussians
-BASELINE = Path(__file__).parents[1] / "bench" / "baselines" / "raster.json"
 TOLERANCE = 0.35  # of the baseline's ratio: what a busy machine may cost before the gate closes
 LEAST_RATIO = {3: 15.0, 32: 8.0}  # times the torch back end, by channels: the floor whatever the baseline
 FLOPS_PER_PAIR = (30, 6)  # of a splat at a pixel, forward and backward: fixed part, and part per channel
@@ -231,24 +226,12 @@ def _key(row: dict[str, Any]) -> str:
     return f"{row['width']}x{row['height']}, {row['gaussians']} Gaussians, {row['channels']} channels"
 
 
-def machine() -> dict[str, Any]:
-    """What the numbers were measured on."""
-    import numba
-
-    model = platform.processor()
-    if os.path.exists("/proc/cpuinfo"):
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        model = next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), model)
-    versions = {"torch": torch.__version__, "numba": numba.__version__, "numpy": np.__version__}
+def about() -> dict[str, Any]:
+    """What the numbers depend on besides the machine that :mod:`otsync.bench.record` writes down."""
     return {
-        "processor": model,
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "torch_threads": torch.get_num_threads(),
         "omp_wait_policy": os.environ.get("OMP_WAIT_POLICY"),
-        "load_before": list(os.getloadavg()),
         "cuda": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
-        "python": platform.python_version(),
-        "versions": versions,
     }
 
 
@@ -260,18 +243,18 @@ def run(
     repeats: int = 15,
     gate: bool = False,
     with_fit: bool = True,
-    update_baseline: bool = False,
+    rebase: bool = False,
 ) -> int:
     """Measure, print, and write raster.csv, raster.json and raster.png to the folder `out`; returns an exit code.
 
     gate: return 1 when a ratio is below its floor or fell behind the committed baseline.
-    with_fit: measure the toy fit of :mod:`recon.toy` too. update_baseline: make this run the baseline.
+    with_fit: measure the toy fit of :mod:`recon.toy` too. rebase: make this run the baseline.
     """
     out = Path(out)
     names, skipped = backends()
     for name, reason in skipped.items():
         print(f"{name}: skipped, {reason}")
-    info = machine()
+    settings = about()
     warmup()
     rows: list[dict[str, Any]] = []
     print("   size              C  back end    forward     total       min  x torch  peak MB  x bound")
@@ -285,14 +268,12 @@ def run(
                     f"{row['times_torch']:9.1f}{row['peak_mb']:9.0f}{row['above_bound']:9.1f}",
                     flush=True,
                 )
-    report: dict[str, Any] = {"machine": info, "skipped": skipped, "rows": rows}
-    if with_fit:
-        report["toy_fit"] = _toy_fit()
-    _write(out, report)
-    if update_baseline:
-        ratios = {_key(row): row["times_torch"] for row in rows if row["backend"] == "cpu"}
-        write_json(BASELINE, {"machine": info, "ratios": ratios})
-    baseline = json.loads(BASELINE.read_text())["ratios"] if BASELINE.exists() else {}
+    fit = {"toy_fit": _toy_fit()} if with_fit else {}
+    record.write_rows(out, "raster", rows, {**settings, "skipped": skipped, **fit})
+    _plot(out, rows)
+    if rebase:
+        record.save_baseline("raster", {_key(row): row["times_torch"] for row in rows if row["backend"] == "cpu"})
+    baseline = read_json(record.baseline_path("raster"))["figures"] if gate else {}
     problems = fallen_behind(rows, baseline)
     for problem in problems:
         print("behind:", problem)
@@ -310,20 +291,12 @@ def _toy_fit() -> dict[str, float]:
     return {**seconds, "largest_error_frames": round(worst, 5), "steps": result.steps}
 
 
-def _write(out: Path, report: dict[str, Any]) -> None:
+def _plot(out: Path, rows: list[dict[str, Any]]) -> None:
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
-    rows = report["rows"]
-    text = io.StringIO()
-    writer = csv.DictWriter(text, fieldnames=list(rows[0]))
-    writer.writeheader()
-    writer.writerows(rows)
-    with atomic_write(out / "raster.csv", "w") as file:
-        file.write(text.getvalue())
-    write_json(out / "raster.json", report)
     figure, axes = plt.subplots(figsize=(7, 4))
     for name in dict.fromkeys(row["backend"] for row in rows):
         for c in dict.fromkeys(row["channels"] for row in rows):
@@ -336,30 +309,3 @@ def _write(out: Path, report: dict[str, Any]) -> None:
     with atomic_write(out / "raster.png") as file:
         figure.savefig(file, format="png", dpi=120)
     plt.close(figure)
-
-
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", default="bench/out/raster")
-    parser.add_argument(
-        "--sizes", type=int, nargs="*", default=range(len(SIZES)), help="which of the four sizes, from 0"
-    )
-    parser.add_argument("--channels", type=int, nargs="*", default=[3, 32])
-    parser.add_argument("--repeats", type=int, default=15)
-    parser.add_argument("--gate", action="store_true")
-    parser.add_argument("--no-fit", action="store_true")
-    parser.add_argument("--update-baseline", action="store_true")
-    args = parser.parse_args()
-    return run(
-        args.out,
-        sizes=[SIZES[i] for i in args.sizes],
-        channels=args.channels,
-        repeats=args.repeats,
-        gate=args.gate,
-        with_fit=not args.no_fit,
-        update_baseline=args.update_baseline,
-    )
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

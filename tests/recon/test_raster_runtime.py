@@ -18,6 +18,7 @@ from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
+from otsync.bench import record
 from recon import bench_raster
 from recon.raster import render as render_module  # the function; its module is reached through sys.modules
 from recon.raster import set_threads, warmup
@@ -252,24 +253,24 @@ def test_every_pixel_a_splat_touches_is_in_a_tile_that_lists_it(seed):
 
 def test_the_benchmark_writes_its_files_and_its_gate_closes(tmp_path, monkeypatch, capsys):
     baseline = tmp_path / "baseline.json"
-    monkeypatch.setattr(bench_raster, "BASELINE", baseline)
+    monkeypatch.setattr(record, "baseline_path", lambda name: baseline)
     monkeypatch.setattr(bench_raster, "LEAST_RATIO", {})
     options = {"sizes": [(48, 32, 200)], "channels": [3], "repeats": 3, "with_fit": False}
-    assert bench_raster.run(tmp_path / "out", update_baseline=True, gate=True, **options) == 0
+    assert bench_raster.run(tmp_path / "out", rebase=True, gate=True, **options) == 0
     assert {p.name for p in (tmp_path / "out").iterdir()} == {"raster.csv", "raster.json", "raster.png"}
     report = json.loads((tmp_path / "out" / "raster.json").read_text())
     assert {row["backend"] for row in report["rows"]} >= {"cpu", "torch"}
     assert (report["machine"]["versions"]["torch"] and "gsplat" in report["skipped"]) or torch.cuda.is_available()
     assert all(row["difference_p999"] < 1e-5 for row in report["rows"])
     known = json.loads(baseline.read_text())
-    known["ratios"] = {key: 1e6 for key in known["ratios"]}
+    known["figures"] = {key: 1e6 for key in known["figures"]}
     baseline.write_text(json.dumps(known))
     assert bench_raster.run(tmp_path / "out", gate=True, **options) == 1
     assert "behind" in capsys.readouterr().out
 
 
 def test_the_committed_baseline_covers_the_bars():
-    ratios = json.loads(bench_raster.BASELINE.read_text())["ratios"]
+    ratios = json.loads(record.baseline_path("raster").read_text())["figures"]
     assert len(ratios) == 8
     for key, ratio in ratios.items():
         assert ratio >= (15 if "3 channels" in key and "32" not in key else 8), key
