@@ -1,0 +1,2 @@
+from .solver import AnchoredFGW
+__all__=["AnchoredFGW"]
