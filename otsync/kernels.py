@@ -69,7 +69,9 @@ def open_end_path(cost, level):
     """Warping path with free ends: from the first row or column to the last row or column.
 
     Maximises the sum of ``level - cost`` over a monotone path (semi-global alignment), so that frames outside the
-    overlap cost nothing and a long overlap is worth having. Returns (P,2) frame pairs.
+    overlap cost nothing and a long overlap is worth having. A diagonal step counts twice (Sakoe and Chiba's
+    symmetric form): then a path's weight is the frames it spans, and a staircase gains nothing over a line.
+    Returns (P,2) frame pairs.
     """
     n, m = cost.shape
     total = np.empty((n, m))
@@ -78,12 +80,12 @@ def open_end_path(cost, level):
         for j in range(m):
             gain = level - cost[i, j]
             if i > 0 and j > 0:
-                best, move = total[i - 1, j - 1], 1
-                if total[i - 1, j] > best:
-                    best, move = total[i - 1, j], 2
-                if total[i, j - 1] > best:
-                    best, move = total[i, j - 1], 3
-                total[i, j] = best + gain
+                best, move = total[i - 1, j - 1] + 2 * gain, 1
+                if total[i - 1, j] + gain > best:
+                    best, move = total[i - 1, j] + gain, 2
+                if total[i, j - 1] + gain > best:
+                    best, move = total[i, j - 1] + gain, 3
+                total[i, j] = best
                 step[i, j] = move
             else:
                 total[i, j] = gain

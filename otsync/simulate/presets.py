@@ -81,9 +81,10 @@ PRESETS: dict[str, Preset] = {
                 e.RayCompression(0.5, 1.0),
                 e.LimbDrift(0.05, correlation=0.8),
                 e.IdentitySwitch(0.3),
+                # the tracker smooths its paths; the errors of depth, which is estimated frame by frame, come on top
+                e.Smoothing(2.5 / 30, 0.6, 1.4),
                 *_tracker(0.05, 0.025, 0.015, 0.008, 0.02),
                 e.CameraDepthDrift(0.012, correlation=1.2),
-                e.Smoothing(2.5 / 30, 0.6, 1.4),
                 e.Gaps(0.15),
                 e.Hallucination(0.3),
                 e.CameraFrame(0.03, 2.0, 0.09),

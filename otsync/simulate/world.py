@@ -14,12 +14,13 @@ from ..types import Camera, TrackSet
 from .body import sample_surface
 from .effects import Effect
 from .features import FeatureModel
+from .mocap import Mocap
 from .observation import IDENTITY, Observation, Surface, stream
 from .presets import PRESETS, Preset
 from .scenes import MOTIONS, Scene
 from .truth import Truth
 
-Motion = str | Scene | Callable[[np.random.Generator], Scene]
+Motion = str | Mocap | Scene | Callable[[np.random.Generator], Scene]
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,7 @@ def simulate(
 
     Args:
         motion: a class of :data:`MOTIONS` ("boxes", "juggle", "softball", "tennis", "basketball", "football",
-            "static"), or a :class:`Scene` (or what draws one) of your own.
+            "static"), ``"mocap:FILE"`` or a :class:`Mocap`, or a :class:`Scene` (or what draws one) of your own.
         preset: "clean", "mid", "hard", "brutal", or a :class:`Preset`.
         videos: how many; video 0 is the reference, with offset 0 and rate 1 unless given otherwise.
         frames: of every video, or one entry a video: a count, or the timestamps (T,) in seconds of a video whose frames
@@ -125,7 +126,7 @@ def simulate(
             features=level.features, seed=seed, video=v,
         )  # fmt: skip
         made.append(apply(obs, used, seed, v))
-    return [_tracks(obs, f"video{v}", "world") for v, obs in enumerate(made)], _truth(scene, made, level, seed)
+    return [as_tracks(obs, f"video{v}", "world") for v, obs in enumerate(made)], as_truth(scene, made, level, seed)
 
 
 def observe(
@@ -208,7 +209,7 @@ def _place(
     """Points of parts at the parts' poses: one small matrix product a part."""
     R, p = poses
     T = R.shape[1]
-    xyz = np.empty((len(part), T, 3), dtype)
+    xyz: np.ndarray = np.empty((len(part), T, 3), dtype)
     order = np.argsort(part, kind="stable")
     edges = np.searchsorted(part[order], np.arange(len(R) + 1))
     for i in np.flatnonzero(np.diff(edges)):
@@ -219,16 +220,16 @@ def _place(
     return xyz
 
 
-def _tracks(obs: Observation, name: str, frame: str | None, uv: bool = True) -> TrackSet:
-    hidden = ~obs.visible
-    xyz = obs.xyz.copy()
-    xyz[hidden] = np.nan
+def as_tracks(obs: Observation, name: str, frame: str | None, uv: bool = True) -> TrackSet:
+    # nothing is seen behind the camera, nor on its lens
+    visible = obs.visible & (obs.camera.to_camera(obs.xyz)[..., 2] > 0.05)
+    xyz = np.where(visible[..., None], obs.xyz, obs.xyz.dtype.type(np.nan))
     features = obs.features
     if features is not None:
         features = features / np.linalg.norm(features, axis=1, keepdims=True)
     return TrackSet(
         xyz,
-        obs.visible,
+        visible,
         features,
         fps=obs.fps,
         timestamps=None if obs.regular else obs.times,
@@ -239,7 +240,7 @@ def _tracks(obs: Observation, name: str, frame: str | None, uv: bool = True) -> 
     )
 
 
-def _truth(scene: Scene, made: list[Observation], level: Preset, seed: int) -> Truth:
+def as_truth(scene: Scene, made: list[Observation], level: Preset, seed: int) -> Truth:
     return Truth(
         offsets=np.array([obs.offset for obs in made]),
         rates=np.array([obs.rate for obs in made]),
@@ -264,9 +265,11 @@ def _preset(preset: str | Preset) -> Preset:
 def _scene(motion: Motion, seed: int) -> Scene:
     if isinstance(motion, Scene):
         return motion
+    if isinstance(motion, str) and motion.startswith("mocap:"):
+        motion = Mocap(motion.removeprefix("mocap:"))
     if isinstance(motion, str):
         if motion not in MOTIONS:
-            raise ValueError(f"motion: expected one of {', '.join(MOTIONS)}, or a Scene; found {motion!r}.")
+            raise ValueError(f"motion: expected one of {', '.join(MOTIONS)}, mocap:FILE, or a Scene; found {motion!r}.")
         motion = MOTIONS[motion]
     return motion(stream(seed, "motion"))
 
