@@ -17,8 +17,6 @@ def k_means(cloud: Cloud, n: int, rng: np.random.Generator, rounds: int = 4) -> 
     Begun from random tracks. (Farthest-point initialisation spends the groups on floating outliers: P50 .63 against
     .97.) Centres are found on a sample of 20 tracks a group.
     """
-    from . import kernels
-
     points = cloud.poses(POSES)
     n = min(n, len(points))
     sample = points[rng.permutation(len(points))[: max(20 * n, 4000)]]

@@ -9,24 +9,24 @@ from .clouds import Cloud
 
 QUADS = 2000
 FRAMES = 8
+ENOUGH = 20
 FLAT = 0.03
 """Quads whose triple product of unit edges is below this in any frame are too flat to have a side."""
 
 
-def chirality(a: Cloud, b: Cloud, rng: np.random.Generator) -> tuple[float, int]:
-    """Share of quads of matched landmarks with the same handedness in both videos, and how many could tell.
+def chirality(a: Cloud, b: Cloud) -> float:
+    """Share of random quads of matched landmarks with the same handedness in both videos.
 
     a and b hold the landmarks, the k-th of one matched to the k-th of the other. Only quads that keep their side in
-    every frame looked at, in both videos, count. Flipped solutions score .10-.32, right ones .94-.99; nan when no quad
-    counts (planar scenes).
+    every frame looked at, in both videos, count. Flipped solutions score .10-.32, right ones .94-.99; nan when too few
+    quads count (planar scenes).
     """
     if len(a) < 4:
-        return float("nan"), 0
-    quads = rng.integers(0, len(a), (QUADS, 4))
+        return float("nan")
+    quads = np.random.default_rng(len(a)).integers(0, len(a), (QUADS, 4))
     side_a, side_b = side(a, quads), side(b, quads)
     counts = (side_a != 0) & (side_b != 0)
-    n = int(counts.sum())
-    return (float((side_a == side_b)[counts].mean()) if n else float("nan")), n
+    return float((side_a == side_b)[counts].mean()) if counts.sum() >= ENOUGH else float("nan")
 
 
 def side(cloud: Cloud, quads: np.ndarray) -> Float[np.ndarray, " Q"]:
