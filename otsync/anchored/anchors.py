@@ -39,7 +39,7 @@ class AnchorProblem:
         lift = 2 * max(self.Ca.max(), self.Cb.max()) ** 2 / max(1 - weight, 1e-12)
         plan, _ = ot.gromov.partial_fused_gromov_wasserstein(
             self.M + lift, self.Ca, self.Cb, p, q, mass, "square_loss", G0=start, alpha=weight, log=True,
-            symmetric=True, tol=1e-7, warn=False, numItermax=LP_PIVOTS,
+            symmetric=True, tol=1e-5, warn=False, numItermax=LP_PIVOTS,
         )  # fmt: skip
         return plan
 

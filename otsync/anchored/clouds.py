@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -40,7 +41,7 @@ class Cloud:
     def __len__(self) -> int:
         return self.columns.shape[2]
 
-    @property
+    @cached_property
     def gaps(self) -> bool:
         return not self.weight.all()
 

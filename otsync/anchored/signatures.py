@@ -24,11 +24,13 @@ class Scale:
     Args:
         median: common median of D_track, the unit of signatures. tau: where the cost is truncated, in that unit.
         beta: weight of the linear cost relative to τ².
+        chance: mean M of random pairs; 0 when M is the same for all pairs, and tells nothing.
     """
 
     median: float
     tau: float
     beta: float
+    chance: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +66,11 @@ class Linear:
         if basis.shape[0] == basis.shape[1]:
             return self
         return Linear(self.ua @ basis, self.ub @ basis, self.offset, self.others, self.a, self.b)
-    def pairs(self, i: Int[np.ndarray, " P"], j: Int[np.ndarray, " P"]) -> Float[np.ndarray, " P"]:
+    def cost(self, i: Int[np.ndarray, " P"], j: Int[np.ndarray, " P"]) -> Float[np.ndarray, " P"]:
+        """M of the pairs."""
+        return self.offset - np.einsum("pd,pd->p", self.ua[i], self.ub[j]) + self.rest(i, j)
+
+    def rest(self, i: Int[np.ndarray, " P"], j: Int[np.ndarray, " P"]) -> Float[np.ndarray, " P"]:
         """What the compiled part leaves out."""
         a, b, i, j = self.a.source, self.b.source, self.a.index[i], self.b.index[j]
         return sum((cost.weight * cost.pairs(a, b, i, j) for cost in self.others), start=np.zeros(len(i)))
@@ -142,7 +148,7 @@ def shortlist(
     cost /= tau2
     if linear.others:
         i, k = np.nonzero(index >= 0)
-        cost[i, k] += scale.beta * linear.pairs(i, index[i, k])
+        cost[i, k] += scale.beta * linear.rest(i, index[i, k])
         order = np.argsort(cost, axis=1, kind="stable")
         index, cost = np.take_along_axis(index, order, 1), np.take_along_axis(cost, order, 1)
     return Candidates(index, cost)
