@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import tyro
 
 from . import __version__
-from .align import DTW, ConstantShift
+from .align import DTW, ConstantShift, LikelihoodScan
+from .graph import Graph
 from .match import (
     EntropicFGW,
     FusedGromovWasserstein,
@@ -24,6 +25,7 @@ from .match import (
     PartialFGW,
     match,
 )
+from .refine import SplineRefine, Unrefined
 from .sync import synchronize, unique_names
 from .types import Offsets, Refused, Status, TrackSet
 
@@ -33,7 +35,8 @@ if TYPE_CHECKING:
 Motion = Literal["boxes", "juggle", "softball", "tennis", "basketball", "football", "static"]
 Preset = Literal["clean", "mid", "hard", "brutal"]
 Matcher = FusedGromovWasserstein | PartialFGW | EntropicFGW | GromovWasserstein | OptimalTransport | NearestNeighbor
-Aligner = DTW | ConstantShift
+Aligner = LikelihoodScan | DTW | ConstantShift
+Refiner = SplineRefine | Unrefined
 
 
 @dataclass
@@ -136,7 +139,8 @@ class Match:
 class Sync:
     """Synchronise videos from their track sets.
 
-    Example: otsync sync world/*.npz --out result matcher:optimal-transport --matcher.reg 0.05 aligner:dtw
+    Example: otsync sync world/*.npz --out result
+    The paper's method: otsync sync world/*.npz --rematch 0 --graph.extra 0 aligner:dtw refiner:unrefined
     """
 
     tracks: tyro.conf.Positional[tuple[Path, ...]]
@@ -144,26 +148,36 @@ class Sync:
     out: Path = Path("sync")
     """Folder for offsets.json and report.html."""
     reference: str | None = None
-    """Name of the reference video; default: the first."""
+    """Name of the reference video, or "auto" for the one with the surest pairs; default: the first."""
     truth: Path | None = None
     """truth.json of a simulated world: adds errors to the table."""
+    rate: Literal["fixed", "fit"] = "fixed"
+    """Frame rates as declared, or fitted on long clips and kept where significant."""
+    rematch: int = 1
+    """How often trusted pairs are matched again at the synchronised times."""
+    workers: int = 1
+    """Processes that pairs are spread over; results do not depend on it."""
+    graph: Graph = field(default_factory=Graph)
     matcher: Matcher = field(default_factory=FusedGromovWasserstein)
-    aligner: Aligner = field(default_factory=DTW)
+    aligner: Aligner = field(default_factory=LikelihoodScan)
+    refiner: Refiner = field(default_factory=SplineRefine)
 
     def run(self) -> int:
         if len(self.tracks) < 2:
             raise ValueError(f"tracks: expected at least two .npz files; found {len(self.tracks)}.")
         tracks = [TrackSet.load(path) for path in self.tracks]
         names = unique_names(tracks)
-        reference = 0
+        reference: int | str = 0
         if self.reference is not None:
-            if self.reference not in names:
-                raise ValueError(f"--reference: expected one of {', '.join(names)}; found {self.reference!r}.")
-            reference = names.index(self.reference)
-        truth = None if self.truth is None else true_offsets(self.truth, names, reference)
+            if self.reference not in (*names, "auto"):
+                raise ValueError(f"--reference: expected auto or one of {', '.join(names)}; found {self.reference!r}.")
+            reference = "auto" if self.reference == "auto" else names.index(self.reference)
+        known = None if self.truth is None else true_offsets(self.truth, names)
         offsets = with_progress(
-            tracks, "synchronising", reference=reference, matcher=self.matcher, aligner=self.aligner
-        )
+            tracks, "synchronising", self.workers, reference=reference, matcher=self.matcher, aligner=self.aligner,
+            refiner=self.refiner, graph=self.graph, rematch=self.rematch, rate=self.rate,
+        )  # fmt: skip
+        truth = None if known is None else known - known[offsets.component]
         return report(offsets, tracks, truth, self.out, "Synchronisation report")
 
 
@@ -201,28 +215,38 @@ COMMANDS: dict[str, Callable[..., Any]] = {
 }
 
 
-def true_offsets(path: Path, names: tuple[str, ...], reference: int) -> np.ndarray:
-    """True offsets of the named videos relative to the reference; ValueError names what the file lacks."""
+def true_offsets(path: Path, names: tuple[str, ...]) -> np.ndarray:
+    """True offsets of the named videos; ValueError names what the file lacks."""
     import numpy as np
 
     known = Offsets.load(path)
     missing = [name for name in names if name not in known.names]
     if missing:
         raise ValueError(f"{path}: expected offsets of {', '.join(names)}; {', '.join(missing)} are not in it.")
-    seconds = np.array([known.seconds[known.names.index(name)] for name in names])
-    return seconds - seconds[reference]
+    return np.array([known.seconds[known.names.index(name)] for name in names])
 
 
-def with_progress(tracks: list[TrackSet], what: str, **options: Any) -> Offsets:
-    """:func:`otsynchronize` with a progress bar on a terminal."""
+def with_progress(tracks: list[TrackSet], what: str, workers: int = 1, **options: Any) -> Offsets:
+    """:func:`otsync.synchronize` on some processes, with a progress bar on a terminal."""
+    from concurrent.futures import ProcessPoolExecutor
+    from multiprocessing import get_context
 
-    def progress(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterable[Any]:
-        from tqdm import tqdm
+    from tqdm import tqdm
 
-        items = list(items)
-        return tqdm(map(function, items), total=len(items), desc=what, unit="pair", disable=None, leave=False)
+    if workers < 1:
+        raise ValueError(f"--workers: expected at least 1; found {workers}.")
 
-    return synchronize(tracks, map=progress, **options)
+    def progress(run: Callable[..., Iterable[Any]]) -> Callable[..., Iterable[Any]]:
+        def mapped(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterable[Any]:
+            items = list(items)
+            return tqdm(run(function, items), total=len(items), desc=what, unit="pair", disable=None, leave=False)
+
+        return mapped
+
+    if workers == 1:
+        return synchronize(tracks, map=progress(map), **options)
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        return synchronize(tracks, map=progress(pool.map), **options)
 
 
 def report(offsets: Offsets, tracks: list[TrackSet], truth: Any, out: Path, title: str) -> int:
