@@ -28,14 +28,16 @@ def unit_features(features: Float[np.ndarray, "N D"], *, center: bool = False) -
     Rows are brought to order one first: squares of 1e±200 neither overflow nor vanish. A row that centring makes
     zero (it equals the mean) stays zero: at cosine distance 1 from everything, it carries no information.
     """
-    f = np.asarray(features, float)
-    f = f / np.maximum(np.abs(f).max(1, keepdims=True, initial=0.0), np.finfo(float).tiny)
-    f = f / np.maximum(np.linalg.norm(f, axis=1, keepdims=True), np.finfo(float).tiny)
+    tiny = np.finfo(float).tiny
+    f = np.array(features, float)
+    top = np.maximum(f.max(1, initial=0.0), -f.min(1, initial=0.0))
+    f /= np.maximum(top, tiny)[:, None]
+    f /= np.maximum(np.sqrt(np.einsum("nd,nd->n", f, f)), tiny)[:, None]
     if center:
-        f = f - f.mean(0)
-        norm = np.linalg.norm(f, axis=1, keepdims=True)
+        f -= f.mean(0)
+        norm = np.sqrt(np.einsum("nd,nd->n", f, f))
         # what is left of a set of equal rows is rounding; blown up to unit norm it would look like information
-        f = np.where(norm > 1e-7, f / np.maximum(norm, 1e-7), 0.0)
+        f *= np.where(norm > 1e-7, 1 / np.maximum(norm, 1e-7), 0.0)[:, None]
     return f
 
 
@@ -226,7 +228,9 @@ def memberships(a: TrackSet, b: TrackSet) -> tuple[Float[np.ndarray, "Na L"], Fl
     """Labels of both sets as weights over their common classes, rows summing to one, or to zero when unlabelled."""
     for name, tracks in (("a", a), ("b", b)):
         if tracks.labels is None:
-            raise ValueError(f"{name}.labels: expected (N,) integers or (N,L) weights; found none. Add them to both sets.")
+            raise ValueError(
+                f"{name}.labels: expected (N,) integers or (N,L) weights; found none. Add them to both sets."
+            )
         if tracks.labels.ndim == 1 and tracks.labels.dtype.kind == "f":
             raise ValueError(f"{name}.labels: expected integers, or (N,L) weights; found {tracks.labels.dtype}.")
     assert a.labels is not None and b.labels is not None

@@ -173,7 +173,12 @@ class Start:
             marks = spread(marks, options.landmarks)
             allowed = shortlist(self.anchors.signatures(marks), self.anchors.linear, level.scale, GROUPS).index
             found = shortlist(
-                level.signatures(marks), level.linear, level.scale, options.partners, (self.label_a, self.label_b), allowed
+                level.signatures(marks),
+                level.linear,
+                level.scale,
+                options.partners,
+                (self.label_a, self.label_b),
+                allowed,
             )
             i, j, cost = found.one_to_one(len(level.b))
             best = max(min(options.landmarks, len(i)), int(KEPT * len(i)))

@@ -66,6 +66,7 @@ class Linear:
         if basis.shape[0] == basis.shape[1]:
             return self
         return Linear(self.ua @ basis, self.ub @ basis, self.offset, self.others, self.a, self.b)
+
     def cost(self, i: Int[np.ndarray, " P"], j: Int[np.ndarray, " P"]) -> Float[np.ndarray, " P"]:
         """M of the pairs."""
         return self.offset - np.einsum("pd,pd->p", self.ua[i], self.ub[j]) + self.rest(i, j)

@@ -124,7 +124,9 @@ class AnchoredFGW:
         if flat and not telling:
             return None
         medians = [float(np.median(p)) for p in positive if p.size]
-        return Scale(float(np.mean(medians)) if medians else 1.0, self.tau, self.beta, float(M.mean()) if telling else 0.0)
+        return Scale(
+            float(np.mean(medians)) if medians else 1.0, self.tau, self.beta, float(M.mean()) if telling else 0.0
+        )
 
     def _answer(
         self,
