@@ -239,7 +239,7 @@ def memberships(a: TrackSet, b: TrackSet) -> tuple[Float[np.ndarray, "Na L"], Fl
     if a.labels.ndim == 1:
         classes = np.unique(np.concatenate([a.labels, b.labels]))
         classes = classes[classes >= 0]
-        p, q = ((x.labels[:, None] == classes).astype(float) for x in (a, b))
+        p, q = ((x[:, None] == classes).astype(float) for x in (a.labels, b.labels))
         return p, q
     found = []
     for name, tracks in (("a", a), ("b", b)):

@@ -2,7 +2,7 @@
 
 The files in the order of the method: ``clouds`` (canonical order and unit), ``cells`` (k-means), ``anchors`` (partial
 FGW by POT), ``signatures`` (landmarks and the truncated cost), ``coarse`` (refinement, restarts, the challenger),
-``chirality`` (mirror images), ``solver`` (all of it, and the answer).
+``solver`` (all of it, and the answer).
 """
 
 from .solver import AnchoredFGW

@@ -70,7 +70,7 @@ class Cloud:
         weight = np.minimum(count, 1)
         xyz = columns.transpose(2, 1, 0).astype(float) * self.size + self.middle
         source = self.source
-        means: dict[str, np.ndarray] = {}
+        means: dict[str, Any] = {}
         for name in ("features", "labels"):
             values = getattr(source, name)
             if values is not None:

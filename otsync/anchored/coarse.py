@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..costs import fill_unseen, total_cost
+from ..vouch import FRAMES, chirality
 from .anchors import AnchorProblem
 from .cells import POSES, k_means
-from .chirality import chirality
 from .clouds import Cloud
 from .signatures import Candidates, Linear, Scale, distances, shortlist, signatures
 
@@ -69,7 +69,7 @@ class Solution:
         candidates: of every cell of a. marks: the landmarks that they were judged by.
         geometry, linear: mean of the two parts of the cheaper half's cost: in units of τ², and in units of chance
             (:class:`Scale`), 1/2 where M tells nothing.
-        chirality: see :func:`chirality`; nan where it cannot tell.
+        chirality: see :func:`otsync.vouch.chirality`; nan where it cannot tell.
     """
 
     i: Int[np.ndarray, " M"]
@@ -184,7 +184,9 @@ class Start:
             best = max(min(options.landmarks, len(i)), int(KEPT * len(i)))
             marks = level.a.take(i[:best]), level.b.take(j[:best])
         half = (len(i) + 1) // 2
-        side = chirality(level.a.take(i[:half]), level.b.take(j[:half]))
+        side = chirality(
+            *(c.take(k[:half]).poses(FRAMES).reshape(half, -1, 3) for c, k in ((level.a, i), (level.b, j)))
+        )
         linear = float(level.linear.cost(i[:half], j[:half]).mean())
         geometry = float(cost[:half].mean()) - level.scale.beta * linear
         relative = linear / level.scale.chance if level.scale.chance > 0 else 0.5

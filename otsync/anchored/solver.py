@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 
 from ..costs import Cosine, Cost, memberships, total_cost
 from ..types import Matches, Status, TrackSet, in_order
+from ..vouch import MIRRORED
 from .cells import k_means
 from .clouds import Cloud, clouds, comes_first
 from .coarse import UNRELATED, Level, Solution, solve
@@ -20,9 +21,6 @@ rises from .70 to .87, recall stays)."""
 
 AMBIGUOUS_SHARE = 0.2
 """Share of the better matches that a second answer of the same cost may place elsewhere before it is reported."""
-
-MIRRORED = 0.33
-"""Chirality below which the answer looks like a mirror image."""
 
 
 @dataclass(frozen=True)
@@ -94,15 +92,15 @@ class AnchoredFGW:
         grouped = max(len(a), len(b)) > 1.5 * self.cells
         if grouped:
             labels = k_means(a, self.cells, rng, rounds=2), k_means(b, self.cells, rng, rounds=2)
-            cells = tuple(c.groups(l, int(l.max()) + 1) for c, l in zip((a, b), labels, strict=True))
+            cell_a, cell_b = (c.groups(l, int(l.max()) + 1) for c, l in zip((a, b), labels, strict=True))
         else:
-            cells = (a, b)
-        scale = self._scale(*cells, rng)
+            cell_a, cell_b = a, b
+        scale = self._scale(cell_a, cell_b, rng)
         if scale is None:
             return nothing((n_a, n_b))
-        linear = Linear.of(self.costs, *cells)
+        linear = Linear.of(self.costs, cell_a, cell_b)
         basis = linear.basis()
-        coarse = Level(*cells, linear.reduced(basis), scale)
+        coarse = Level(cell_a, cell_b, linear.reduced(basis), scale)
         found, elsewhere, starts = solve(coarse, self)
         pairs = found.i, found.j, found.cost
         if grouped:

@@ -13,13 +13,14 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
     import matplotlib
 
     matplotlib.use("Agg")
+    from matplotlib import color_sequences
     from matplotlib import pyplot as plt
 
     done = [r for r in rows if r["status"] == "ok"]
     names = list(dict.fromkeys(r["matcher"] for r in done))
     with plt.rc_context({"svg.hashsalt": "otsync", "svg.fonttype": "none", "font.size": 9}):
         figure, axes = plt.subplots(figsize=(8, 4.6))
-        for name, color in zip(names, plt.get_cmap("tab10").colors, strict=False):
+        for name, color in zip(names, color_sequences["tab10"], strict=False):
             own = sorted((r for r in done if r["matcher"] == name), key=lambda r: r["n"])
             x, y = [r["cpu_seconds"] for r in own], [r["p50"] for r in own]
             axes.plot(x, y, "-", color=color, lw=1.2, alpha=0.7)

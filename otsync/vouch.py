@@ -1,0 +1,93 @@
+"""Whether matches deserve trust: handedness, and what the features of matched tracks say against chance."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from .costs import Cost, total_cost
+from .types import Matches, Status, TrackSet, in_order
+
+QUADS, FRAMES, ENOUGH = 2000, 8, 20
+
+FLAT = 0.03
+"""Quads whose triple product of unit edges is below this in any frame are too flat to have a side."""
+
+MIRRORED = 0.33
+"""Chirality below which an answer looks like a mirror image: flipped ones score .0-.32, right ones .94-1 (cameras up to
+90° apart; between opposite views of a thin body right ones may look mirrored, too)."""
+
+BY_CHANCE = 0.7
+"""Mean linear cost of the better half of the matches, in units of that of random pairs, above which the videos do not
+show the same scene. Measured over four presets: related ones .1 to .56, unrelated ones .77 to .97."""
+
+
+def vouch(found: Matches, a: TrackSet, b: TrackSet, costs: tuple[Cost, ...]) -> Matches:
+    """``found`` with NO_MATCH or AMBIGUOUS added where its better half looks unrelated or mirrored.
+
+    Solvers do not say so themselves: between unrelated videos they are as confident as ever.
+    """
+    if not found.status.ok or len(found) < 8:
+        return found
+    i, j = found.best((len(found) + 1) // 2).pairs.T
+    flags = set(found.flags)
+    if relative_cost(costs, a, b, i, j) > BY_CHANCE:
+        flags.add(Status.NO_MATCH)
+    elif chirality_of(a, b, i, j) < MIRRORED:
+        flags.add(Status.AMBIGUOUS)
+    ordered = in_order(flags)
+    return Matches(found.pairs, found.score, found.plan, ordered[0] if ordered else Status.OK, ordered, found.stats)
+
+
+def relative_cost(
+    costs: tuple[Cost, ...], a: TrackSet, b: TrackSet, i: Int[np.ndarray, " M"], j: Int[np.ndarray, " M"]
+) -> float:
+    """Mean cost of the pairs over the mean cost of random ones; 0 when the costs are the same for all pairs."""
+    if not costs:
+        return 0.0
+    rng = np.random.default_rng(0)
+    M = total_cost(costs, a.take(rng.permutation(len(a))[:256]), b.take(rng.permutation(len(b))[:256]))
+    if np.ptp(M) <= 1e-9 * max(1.0, float(np.abs(M).max())) or M.mean() <= 0:
+        return 0.0
+    matched = sum((c.weight * c.pairs(a, b, i, j) for c in costs), start=np.zeros(len(i)))
+    return float(matched.mean() / M.mean())
+
+
+def chirality_of(a: TrackSet, b: TrackSet, i: Int[np.ndarray, " M"], j: Int[np.ndarray, " M"]) -> float:
+    """:func:`chirality` of matched tracks; nan without 3D positions."""
+    if a.xyz is None or b.xyz is None:
+        return float("nan")
+    return chirality(poses(a.xyz[i], a.seen[i], FRAMES), poses(b.xyz[j], b.seen[j], FRAMES))
+
+
+def chirality(a: Float[np.ndarray, "M F 3"], b: Float[np.ndarray, "M G 3"]) -> float:
+    """Share of random quads of matched points with the same handedness in both videos.
+
+    The k-th point of a is matched to the k-th of b; frames of a and b need not correspond. Only quads that keep their
+    side in every frame, in both videos, count; nan when too few do (planar scenes, few matches).
+    """
+    if len(a) < 4:
+        return float("nan")
+    quads = np.random.default_rng(len(a)).integers(0, len(a), (QUADS, 4))
+    side_a, side_b = side(a, quads), side(b, quads)
+    counts = (side_a != 0) & (side_b != 0)
+    return float((side_a == side_b)[counts].mean()) if counts.sum() >= ENOUGH else float("nan")
+
+
+def side(points: Float[np.ndarray, "M F 3"], quads: Int[np.ndarray, "Q 4"]) -> Int[np.ndarray, " Q"]:
+    """+1 or -1 where the triple product of a quad's edges keeps its sign over the frames, 0 where it does not."""
+    x = points[quads].astype(float)
+    edges = x[:, 1:] - x[:, :1]
+    length = np.linalg.norm(edges, axis=-1, keepdims=True)
+    u, v, w = (edges / np.maximum(length, np.finfo(float).tiny)).swapaxes(0, 1)
+    volume = np.einsum("qtc,qtc->qt", np.cross(u, v), w)
+    return (volume > FLAT).all(1).astype(int) - (volume < -FLAT).all(1).astype(int)
+
+
+def poses(xyz: Float[np.ndarray, "M T 3"], seen: Bool[np.ndarray, "M T"], frames: int) -> Float[np.ndarray, "M F 3"]:
+    """Positions at some frames, of each track at the nearest one where it is seen."""
+    T = seen.shape[1]
+    at = np.unique(np.linspace(0, T - 1, frames).round().astype(int))
+    away = np.abs(np.arange(T)[None] - at[:, None])
+    nearest = np.where(seen[:, None], away[None], 2 * T).argmin(2)
+    return np.take_along_axis(xyz, nearest[..., None], 1)
