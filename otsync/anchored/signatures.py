@@ -51,8 +51,9 @@ class Linear:
         us, vs = [np.zeros((len(a), 1), np.float32)], [np.zeros((len(b), 1), np.float32)]
         for cost in factored:
             u, v = cost.factors(a.source, b.source)
-            us.append((cost.weight * u[a.index]).astype(np.float32))
-            vs.append(v[b.index].astype(np.float32))
+            root = np.sqrt(cost.weight)  # on both sides, so that the basis weighs both videos alike
+            us.append((root * u[a.index]).astype(np.float32))
+            vs.append((root * v[b.index]).astype(np.float32))
         return cls(np.hstack(us), np.hstack(vs), float(sum(c.weight for c in factored)), others, a, b)
 
     def basis(self) -> Float[np.ndarray, "D R"]:
