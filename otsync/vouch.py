@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .costs import Cost, total_cost
+from .costs import Cost, total_cost, track_distance
 from .types import Matches, Status, TrackSet, in_order
 
 QUADS, FRAMES, ENOUGH = 2000, 8, 20
@@ -17,9 +17,10 @@ MIRRORED = 0.33
 """Chirality below which an answer looks like a mirror image: flipped ones score .0-.32, right ones .94-1 (cameras up to
 90° apart; between opposite views of a thin body right ones may look mirrored, too)."""
 
-BY_CHANCE = 0.7
-"""Mean linear cost of the better half of the matches, in units of that of random pairs, above which the videos do not
-show the same scene. Measured over four presets: related ones .1 to .56, unrelated ones .77 to .97."""
+BY_CHANCE = 1.3
+"""Geometry plus relative cost of the better half of the matches above which the videos do not show the same scene.
+Measured for nearest neighbours, EMD, FGW and partial FGW: related videos .05 to 1.25, unrelated ones 1.36 to 1.8. (Few
+dimensions let features of unrelated videos agree by chance, optimised plans their distances; not both.)"""
 
 
 def vouch(found: Matches, a: TrackSet, b: TrackSet, costs: tuple[Cost, ...]) -> Matches:
@@ -31,7 +32,8 @@ def vouch(found: Matches, a: TrackSet, b: TrackSet, costs: tuple[Cost, ...]) -> 
         return found
     i, j = found.best((len(found) + 1) // 2).pairs.T
     flags = set(found.flags)
-    if relative_cost(costs, a, b, i, j) > BY_CHANCE:
+    structure, features = geometry(a, b, i, j), relative_cost(costs, a, b, i, j)
+    if (0.5 if np.isnan(structure) else structure) + features > BY_CHANCE:
         flags.add(Status.NO_MATCH)
     elif chirality_of(a, b, i, j) < MIRRORED:
         flags.add(Status.AMBIGUOUS)
@@ -39,16 +41,33 @@ def vouch(found: Matches, a: TrackSet, b: TrackSet, costs: tuple[Cost, ...]) -> 
     return Matches(found.pairs, found.score, found.plan, ordered[0] if ordered else Status.OK, ordered, found.stats)
 
 
+def geometry(a: TrackSet, b: TrackSet, i: Int[np.ndarray, " M"], j: Int[np.ndarray, " M"]) -> float:
+    """How badly distances among matched tracks agree: 0 the same, 1 nowhere within 5 % of their median.
+
+    ``mean min((d_a - d_b)² / τ², 1)`` over pairs of up to 128 matched tracks, d their D_track over the common median,
+    τ = .05; nan without 3D positions or where nothing is known.
+    """
+    if a.xyz is None or b.xyz is None:
+        return float("nan")
+    some = np.random.default_rng(len(i)).permutation(len(i))[:128]
+    d = [track_distance(x.xyz[k[some]], x.seen[k[some]]).astype(float) for x, k in ((a, i), (b, j))]
+    known = np.isfinite(d[0]) & np.isfinite(d[1]) & ~np.eye(len(some), dtype=bool)
+    unit = np.mean([np.median(x[known]) for x in d]) if known.any() else 0.0
+    if not unit > 0:
+        return float("nan")
+    return float(np.minimum(((d[0] - d[1])[known] / unit / 0.05) ** 2, 1).mean())
+
+
 def relative_cost(
     costs: tuple[Cost, ...], a: TrackSet, b: TrackSet, i: Int[np.ndarray, " M"], j: Int[np.ndarray, " M"]
 ) -> float:
-    """Mean cost of the pairs over the mean cost of random ones; 0 when the costs are the same for all pairs."""
+    """Mean cost of the pairs over the mean cost of random ones; 0.4, as between related videos, where it tells nothing."""
     if not costs:
-        return 0.0
+        return 0.4
     rng = np.random.default_rng(0)
     M = total_cost(costs, a.take(rng.permutation(len(a))[:256]), b.take(rng.permutation(len(b))[:256]))
     if np.ptp(M) <= 1e-9 * max(1.0, float(np.abs(M).max())) or M.mean() <= 0:
-        return 0.0
+        return 0.4
     matched = sum((c.weight * c.pairs(a, b, i, j) for c in costs), start=np.zeros(len(i)))
     return float(matched.mean() / M.mean())
 
