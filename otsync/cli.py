@@ -181,7 +181,7 @@ class Sync:
         return report(offsets, tracks, truth, self.out, "Synchronisation report")
 
 
-SUITES = {"core": "otsync.bench.core"}
+SUITES = {"core": "otsync.bench.core", "raster": "recon.bench_raster"}
 
 
 @dataclass
@@ -191,7 +191,7 @@ class Bench:
     Example: otsync bench core --out bench/out --gate
     """
 
-    suite: tyro.conf.Positional[Literal["core", "all"]]
+    suite: tyro.conf.Positional[Literal["core", "raster", "all"]]
     out: Path = Path("bench/out")
     """Folder for CSV, JSON and plots."""
     gate: bool = False
