@@ -45,7 +45,7 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
         axes.grid(alpha=0.25)
         axes.legend(fontsize=7.5, loc="lower right")
         about = record.machine()
-        versions = ", ".join(f"{k} {about['versions'][k]}" for k in ("otsync", "POT", "numpy", "numba"))
+        versions = ", ".join(f"{k} {v}" for k in ("otsync", "POT", "numpy", "numba") if (v := about["versions"][k]))
         axes.set_title(f"{about['processor']}, {about['cores']} cores; {versions}", fontsize=7.5, color="0.4")
         figure.tight_layout()
         path.parent.mkdir(parents=True, exist_ok=True)

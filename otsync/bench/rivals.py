@@ -22,12 +22,14 @@ class OttJax:
         import jax.numpy as jnp
         from ott.geometry.geometry import Geometry
         from ott.problems.quadratic.quadratic_problem import QuadraticProblem
+        from ott.solvers.linear.sinkhorn import Sinkhorn
         from ott.solvers.quadratic.gromov_wasserstein import GromovWasserstein
 
         problem = Problem.of(a, b, (Cosine(),), 0.222)
         structure = [Geometry(cost_matrix=jnp.asarray(C, jnp.float32)) for C in (problem.Ca, problem.Cb)]
         fused = QuadraticProblem(*structure, Geometry(cost_matrix=jnp.asarray(problem.M)), fused_penalty=0.111)
-        found = GromovWasserstein(epsilon=self.reg, relative_epsilon=True)(fused)
+        solver = GromovWasserstein(linear_solver=Sinkhorn(), epsilon=self.reg, relative_epsilon="mean")
+        found = solver(fused)
         plan = np.asarray(found.matrix, float)
         stats = {"objective": problem.objective(plan)}
         return from_plan(plan, problem.gradient(plan), problem.p, problem.q, 1.0, stats, False)
