@@ -50,7 +50,8 @@ def geometry(a: TrackSet, b: TrackSet, i: Int[np.ndarray, " M"], j: Int[np.ndarr
     if a.xyz is None or b.xyz is None:
         return float("nan")
     some = np.random.default_rng(len(i)).permutation(len(i))[:128]
-    d = [track_distance(x.xyz[k[some]], x.seen[k[some]]).astype(float) for x, k in ((a, i), (b, j))]
+    pairs = ((a.xyz, a.seen, i[some]), (b.xyz, b.seen, j[some]))
+    d = [track_distance(xyz[k], seen[k]).astype(float) for xyz, seen, k in pairs]
     known = np.isfinite(d[0]) & np.isfinite(d[1]) & ~np.eye(len(some), dtype=bool)
     unit = np.mean([np.median(x[known]) for x in d]) if known.any() else 0.0
     if not unit > 0:
