@@ -24,7 +24,8 @@ from otsync import (
     TrackSet,
     match,
 )
-from otsync.match import Problem, round_to_marginals, sinkhorn
+from otsync.match import Problem
+from otsync.sinkhorn import round_to_marginals, sinkhorn
 
 from .conftest import wiggle
 
