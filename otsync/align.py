@@ -14,10 +14,8 @@ from jaxtyping import Float, Int
 
 from .clock import CommonClock, common_clock
 from .costs import frame_cost, velocity
-from .types import Alignment, Matches, Refused, Status, TrackSet, gravest
-
-MIN_OVERLAP = 24
-"""Frames at 30 fps that two videos must share for an offset to be considered."""
+from .scan import MIN_OVERLAP, LikelihoodScan, unanswered, vertex
+from .types import Alignment, Matches, Refused, TrackSet
 
 VELOCITY_HALF = 3
 """Half window, in frames at 30 fps, of the velocities of the velocity cost."""
@@ -37,14 +35,14 @@ def align(
     Args:
         a, b: track sets with positions in one common world frame.
         matches: from :func:`otsync.match`, or ``Matches(pairs, score)`` of your own.
-        aligner: the algorithm; default :class:`DTW`, the paper's.
+        aligner: the algorithm; default :class:`LikelihoodScan`; the paper's is :class:`DTW`.
         throw: raise :class:`otsync.Refused` when the answer is flagged, instead of returning it.
     """
     a.check("a")
     b.check("b")
     matches.check("matches", len(a), len(b))
     started = time.perf_counter()
-    found = (aligner or DTW())(a, b, matches)
+    found = (aligner or LikelihoodScan())(a, b, matches)
     found.stats.setdefault("seconds", time.perf_counter() - started)
     if throw and not found.status.ok:
         raise Refused("align", found)
@@ -72,7 +70,7 @@ class DTW:
         cost = geometric_cost(pair, self.cost)
         known = np.isfinite(cost)
         if not known.any():
-            return nothing_in_common(pair, matches)
+            return unanswered(pair, matches)
         filled = np.where(known, cost, np.median(cost[known]))
         path = self._path(filled)
         lag = most_frequent(path[:, 0] - path[:, 1])
@@ -109,7 +107,7 @@ class ConstantShift:
     """
 
     cost: Literal["position", "velocity"] = "position"
-    min_overlap: float = MIN_OVERLAP / 30
+    min_overlap: float = MIN_OVERLAP
     max_lag: float | None = None
 
     def __call__(self, a: TrackSet, b: TrackSet, matches: Matches) -> Alignment:
@@ -124,7 +122,7 @@ class ConstantShift:
             if known.sum() >= least:
                 score[n] = -diagonal[known].mean()
         if not np.isfinite(score).any():
-            return nothing_in_common(pair, matches, cost)
+            return unanswered(pair, matches, cost)
         lag = peak(lags, score)
         return Alignment(
             float(pair.seconds(lag)),
@@ -158,22 +156,4 @@ def peak(lags: Int[np.ndarray, " K"], score: Float[np.ndarray, " K"]) -> float:
     Equal scores are decided for the smallest |lag|.
     """
     top = np.flatnonzero(score == score.max())
-    i = int(top[np.argmin(np.abs(lags[top]))])
-    if 0 < i < len(score) - 1 and np.isfinite(score[i - 1]) and np.isfinite(score[i + 1]):
-        bend = score[i - 1] - 2 * score[i] + score[i + 1]
-        if bend < 0:
-            return float(lags[i] + np.clip(0.5 * (score[i - 1] - score[i + 1]) / bend, -0.5, 0.5))
-    return float(lags[i])
-
-
-def nothing_in_common(pair: CommonClock, matches: Matches, cost: np.ndarray | None = None) -> Alignment:
-    """The answer when no lag leaves matched samples to compare."""
-    flags = (Status.FEW_MATCHES if len(matches) == 0 else Status.NO_OVERLAP,)
-    return Alignment(
-        float("nan"),
-        cost=cost,
-        fps=pair.fps,
-        status=gravest(flags),
-        flags=flags,
-        stats={"matches": float(len(matches))},
-    )
+    return vertex(lags, score, int(top[np.argmin(np.abs(lags[top]))]))

@@ -5,10 +5,28 @@ A refiner is an object in a slot: any callable ``refiner(a, b, matches, alignmen
 
 from __future__ import annotations
 
+import math
 import time
-from typing import Protocol
+from dataclasses import dataclass, field, replace
+from typing import Literal, Protocol
 
-from .types import Alignment, Matches, Refused, TrackSet
+import numpy as np
+
+from .clock import nominal_fps
+from .costs import binary_scale
+from .fit import Clock, Fit, fit_clock, overlap_seconds, velocity_correlation
+from .splines import SMOOTHING, TrackSplines
+from .trust import Trust
+from .types import Alignment, Matches, Refused, Status, TrackSet, gravest, in_order
+
+LEAST_SIGMA = 0.02 / 30
+"""Seconds; no sigma is reported below this."""
+
+LONG = 600 / 30
+"""Seconds of overlap from which a rate can be told from an offset."""
+
+VELOCITY = 5 / 30
+"""Half window, s, of the velocities whose correlation judges the fit."""
 
 
 class Refiner(Protocol):
@@ -18,22 +36,135 @@ class Refiner(Protocol):
 
 
 def refine(
-    a: TrackSet, b: TrackSet, matches: Matches, alignment: Alignment, refiner: Refiner, *, throw: bool = True
+    a: TrackSet,
+    b: TrackSet,
+    matches: Matches,
+    alignment: Alignment,
+    refiner: Refiner | None = None,
+    *,
+    throw: bool = True,
 ) -> Alignment:
     """Improve an alignment beyond the frame grid.
 
     Args:
         a, b, matches: as for :func:`otsync.align`.
         alignment: where to start; its flags stay in the answer.
-        refiner: the algorithm.
+        refiner: the algorithm; default :class:`SplineRefine`. :class:`Unrefined` leaves the alignment as it is.
         throw: raise :class:`otsync.Refused` when the answer is flagged, instead of returning it.
     """
     a.check("a")
     b.check("b")
     matches.check("matches", len(a), len(b))
     started = time.perf_counter()
-    found = refiner(a, b, matches, alignment)
+    found = (refiner or SplineRefine())(a, b, matches, alignment)
     found.stats.setdefault("refine_seconds", time.perf_counter() - started)
     if throw and not found.status.ok:
         raise Refused("refine", found)
     return found
+
+
+@dataclass(frozen=True)
+class Unrefined:
+    """Takes the aligner's answer as it is."""
+
+    def __call__(self, a: TrackSet, b: TrackSet, matches: Matches, alignment: Alignment) -> Alignment:
+        return alignment
+
+
+@dataclass(frozen=True)
+class SplineRefine:
+    """Offset of two sets of continuous curves by robust Gauss-Newton, with an honest sigma.
+
+    Tracks become penalised cubic splines that never answer within a gap. The residual of a match is the difference of
+    its two curves minus its mean over ±``windows[0]`` seconds, read at the frames of both videos, so that constant and
+    slowly drifting errors drop out and exchanging a and b flips the sign to rounding. Samples and whole matches that
+    fit badly lose weight. Sigma adds the scatter over matches, over blocks of one second, and the ``spread`` of the
+    answers with the other windows: errors of the model that no residual shows.
+
+    Args:
+        windows: half windows of detrending in seconds: the answer's, and those that it is compared with.
+        smoothing: of the splines, see :class:`otsync.splines.TrackSplines`.
+        rate: ``fixed`` takes the clocks as declared; ``fit`` frees the rate for overlaps of 20 s and more and keeps it
+            when it is significant. With ``fixed`` a significant rate on such clips raises RATE_MISMATCH.
+        trust: limits behind the flags.
+    """
+
+    windows: tuple[float, ...] = (20 / 30, 10 / 30, 40 / 30)
+    smoothing: float = SMOOTHING
+    rate: Literal["fixed", "fit"] = "fixed"
+    trust: Trust = field(default_factory=Trust)
+
+    def __call__(self, a: TrackSet, b: TrackSet, matches: Matches, alignment: Alignment) -> Alignment:
+        if not math.isfinite(alignment.offset):
+            return alignment
+        curves = self.splines(a, b, matches)
+        start = Clock(alignment.offset, alignment.rate)
+        fit = fit_clock(*curves, start, self.windows[0])
+        if fit is None:
+            flags = in_order((*alignment.flags, Status.NO_OVERLAP))
+            return replace(alignment, status=gravest(flags), flags=flags)
+        fit, rate_flag, rate_stats = self._rate(curves, fit)
+        others = [fit_clock(*curves, fit.clock, w, iterations=10) for w in self.windows[1:]]
+        spread = max((self._apart(o, fit, curves) for o in others), default=0.0)
+        fps = min(nominal_fps(a), nominal_fps(b))
+        variance = float(fit.covariance[0, 0])
+        stats = alignment.stats | rate_stats | {
+            "matches": float(len(matches)),
+            "effective_matches": fit.effective_matches,
+            "moved": abs(fit.clock.offset - alignment.offset),
+            "spread": spread,
+            "correlation": velocity_correlation(*curves, fit, VELOCITY),
+            "overlap": overlap_seconds(*curves, fit.clock),
+            "iterations": float(fit.iterations),
+        }  # fmt: skip
+        flags = in_order((*alignment.flags, *self._flags(stats), *rate_flag))
+        return replace(
+            alignment,
+            offset=fit.clock.offset,
+            rate=fit.clock.rate,
+            sigma=math.sqrt(variance + spread**2 + LEAST_SIGMA**2),
+            fps=fps,
+            status=gravest(flags),
+            flags=flags,
+            stats=stats,
+        )
+
+    def splines(self, a: TrackSet, b: TrackSet, matches: Matches) -> tuple[TrackSplines, TrackSplines]:
+        """Curves of the matched tracks, in units of a power of two near their size; repeated tracks are fitted once."""
+        xa, xb = a.positions(), b.positions()
+        scale = max(binary_scale(xa), binary_scale(xb))
+        curves = []
+        for tracks, x, column in ((a, xa, 0), (b, xb, 1)):
+            used, index = np.unique(matches.pairs[:, column], return_inverse=True)
+            curves.append(TrackSplines(tracks.times, x[used] / scale, smoothing=self.smoothing).take(index))
+        return curves[0], curves[1]
+
+    def _apart(self, other: Fit | None, fit: Fit, curves: tuple[TrackSplines, TrackSplines]) -> float:
+        """Seconds between two answers; a window without an answer counts as a frame."""
+        return curves[0].frame if other is None else abs(other.clock.offset - fit.clock.offset)
+
+    def _rate(
+        self, curves: tuple[TrackSplines, TrackSplines], fit: Fit
+    ) -> tuple[Fit, tuple[Status, ...], dict[str, float]]:
+        """The fit with a free rate where that is significant, or a warning that it would be."""
+        if overlap_seconds(*curves, fit.clock) < LONG - 1e-9:
+            return fit, (), {}
+        free = fit_clock(*curves, fit.clock, self.windows[0], fit_rate=True)
+        if free is None:
+            return fit, (), {}
+        sigma = math.sqrt(float(free.covariance[1, 1]))
+        stats = {"fitted_rate": free.clock.rate, "rate_sigma": sigma}
+        if abs(free.clock.rate - fit.clock.rate) <= self.trust.rate_sigmas * sigma:
+            return fit, (), stats
+        return (free, (), stats) if self.rate == "fit" else (fit, (Status.RATE_MISMATCH,), stats)
+
+    def _flags(self, stats: dict[str, float]) -> tuple[Status, ...]:
+        t = self.trust
+        found = {
+            Status.MOVED: stats["moved"] > t.moved,
+            Status.SPREAD: stats["spread"] > t.spread,
+            Status.SHORT_OVERLAP: stats["overlap"] < t.overlap - 1e-9,
+            Status.FEW_MATCHES: stats["effective_matches"] < t.matches,
+            Status.POOR_FIT: stats["correlation"] < t.correlation,
+        }
+        return tuple(flag for flag, raised in found.items() if raised)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from scipy.interpolate import BSpline
 from scipy.linalg import solveh_banded
@@ -44,6 +44,7 @@ class TrackSplines:
         self.step = span / intervals
         self.knots = times[0] + self.step * np.arange(-DEGREE, intervals + DEGREE + 1)
         self.n = intervals + DEGREE
+        self._by_track: np.ndarray | None = None
         #: (n, M*3) coefficients around each track's own mean, which keeps them small
         self.mean, self.coefficients = self._fit(xyz, smoothing * max(1.0, 1 / (30 * self.frame)))
 
@@ -70,6 +71,7 @@ class TrackSplines:
         """The splines of the tracks at ``index`` (repeats allowed), without fitting anew."""
         part = object.__new__(TrackSplines)
         part.__dict__ |= self.__dict__
+        part._by_track = None
         part.seen, part.mean = self.seen[index], self.mean[index]
         part.coefficients = self.coefficients.reshape(self.n, -1, 3)[:, index].reshape(self.n, -1)
         return part
@@ -84,6 +86,25 @@ class TrackSplines:
         slopes = np.diff(self.coefficients, axis=0) / self.step
         flat = self._design(self._inside(t), DEGREE - 1) @ slopes
         return flat.reshape(len(t), -1, 3).transpose(1, 0, 2)
+
+    @property
+    def by_track(self) -> Float[np.ndarray, "M n 3"]:
+        """Coefficients around each track's mean, one block a track: what compiled loops read."""
+        if self._by_track is None:
+            self._by_track = np.ascontiguousarray(self.coefficients.reshape(self.n, -1, 3).transpose(1, 0, 2))
+        return self._by_track
+
+    def basis(
+        self, t: Float[np.ndarray, " S"]
+    ) -> tuple[Int[np.ndarray, " S"], Float[np.ndarray, "S 4"], Float[np.ndarray, "S 4"]]:
+        """Which four coefficients make up the curve at ``t``: the first one's index, weights of value and of slope."""
+        u = (self._inside(t) - self.times[0]) / self.step
+        first = np.clip(np.floor(u).astype(np.int64), 0, self.n - DEGREE - 1)
+        x = u - first
+        y = 1 - x
+        value = np.stack([y**3, 3 * x**3 - 6 * x**2 + 4, 3 * y**3 - 6 * y**2 + 4, x**3], 1) / 6
+        slope = np.stack([-(y**2), 3 * x**2 - 4 * x, -(3 * y**2 - 4 * y), x**2], 1) / (2 * self.step)
+        return first, value, slope
 
     def support(self, t: Float[np.ndarray, " S"]) -> Bool[np.ndarray, "M S"]:
         """Where ``t`` lies between two consecutive samples that were seen and are at most 2.5 frames apart."""

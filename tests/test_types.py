@@ -233,7 +233,7 @@ def test_video_keeps_time_and_checks_counts():
     camera = Camera(np.eye(3), np.eye(4), 4, 4)
     video = Video([0, 1, 2], camera, timestamps=np.array([0.0, 0.1, 0.4]))
     np.testing.assert_array_equal(video.times, [0, 0.1, 0.4])
-    with pytest.raises(ValueError, match="Video.depth: expected 3 maps; found 1"):
+    with pytest.raises(ValueError, match=r"Video\.depth: expected 3 maps; found 1"):
         Video([0, 1, 2], camera, fps=30, depth=[0])
 
 

@@ -9,6 +9,9 @@ import numpy as np
 
 from ..types import Alignment, Offsets
 
+MAP_PIXELS = 100
+"""Longest side of an embedded cost map: ten of them keep the page below 400 KB."""
+
 CHOSEN, PATH, TRUTH, GREY = "#0a7d33", "#c22f2f", "#6b3fa0", "#8a8f98"
 
 
@@ -58,11 +61,11 @@ def pair_figure(
     """Left: the frame-to-frame cost with the warping path and the chosen offset. Right: the score over offsets."""
     figure, (left, right) = _axes(7.2, 2.5, 2)
     if cost is not None:
-        step = max(1, max(cost.shape) // 160)
+        step = max(1, -(-max(cost.shape) // MAP_PIXELS))
         extent = (-0.5, cost.shape[1] - 0.5, cost.shape[0] - 0.5, -0.5)
         known = cost[np.isfinite(cost)]
         top = float(np.quantile(known, 0.95)) if known.size else 1.0
-        left.imshow(cost[::step, ::step], extent=extent, cmap="magma", vmax=top, aspect="auto", interpolation="nearest")
+        left.imshow(cost[::step, ::step], extent=extent, cmap="magma", vmax=top, aspect="auto", interpolation="none")
         if path is not None:
             left.plot(path[:, 1], path[:, 0], color="#39c0ff", lw=1.2, label="DTW path")
         j = np.array([0, cost.shape[1] - 1])

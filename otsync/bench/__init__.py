@@ -1,0 +1,1 @@
+"""What accuracy costs in time: benchmarks that write CSV, JSON and a plot, with machine and versions."""

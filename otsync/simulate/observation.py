@@ -1,0 +1,122 @@
+"""What one video observes of a world: the thing that effects turn into a worse one, and their random streams."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from ..types import Camera
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """N canonical surface points: who a track is, the same in every video.
+
+    Args:
+        part: (N,) rigid part, -1 for an outlier.
+        object: (N,) figure or thing, -1 for an outlier.
+        local: (N,3) in the part's own frame; what moves with it.
+        position: (N,3) body coordinate: the point on its object in the rest pose, m.
+        mirrored: (N,3) the point on the other side of the body; of things, the point itself.
+    """
+
+    part: Int[np.ndarray, " N"]
+    object: Int[np.ndarray, " N"]
+    local: Float[np.ndarray, "N 3"]
+    position: Float[np.ndarray, "N 3"]
+    mirrored: Float[np.ndarray, "N 3"]
+
+    def __len__(self) -> int:
+        return len(self.part)
+
+
+@dataclass(frozen=True, eq=False)
+class Similarity:
+    """``x -> scale R x + t``: from the world to the frame in which a video reports positions."""
+
+    scale: float
+    R: Float[np.ndarray, "3 3"]
+    t: Float[np.ndarray, " 3"]
+
+    def __call__(self, xyz: Float[np.ndarray, "*B 3"]) -> Float[np.ndarray, "*B 3"]:
+        return (xyz @ (self.scale * self.R.T).astype(xyz.dtype) + self.t.astype(xyz.dtype)).astype(
+            xyz.dtype, copy=False
+        )
+
+    def inverse(self) -> Similarity:
+        return Similarity(1 / self.scale, self.R.T, -self.R.T @ self.t / self.scale)
+
+    def after(self, first: Similarity) -> Similarity:
+        """This one applied to what ``first`` gives."""
+        return Similarity(self.scale * first.scale, self.R @ first.R, self.scale * self.R @ first.t + self.t)
+
+    def camera(self, camera: Camera) -> Camera:
+        """The camera that sees the mapped points at the pixels where ``camera`` sees the originals."""
+        R, t = camera.w2c[:3, :3], camera.w2c[:3, 3]
+        w2c = np.eye(4)
+        w2c[:3, :3] = R @ self.R.T
+        w2c[:3, 3] = self.scale * t - w2c[:3, :3] @ self.t
+        return Camera(camera.K, w2c, camera.width, camera.height, camera.distortion, camera.readout)
+
+
+IDENTITY = Similarity(1.0, np.eye(3), np.zeros(3))
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """The tracks of one video while they are being made.
+
+    Args:
+        xyz: (N,T,3) positions in the video's frame, m. Finite everywhere; ``visible`` says what counts.
+        visible: (N,T).
+        features: (N,D) before normalisation, or None.
+        surface: who the tracks are.
+        times: (T,) frame times on the video's own clock, s.
+        regular: whether these are ``k / fps``.
+        fps: of the video.
+        rate, offset: of its clock; world time is ``rate * times + offset``.
+        camera: that sees ``xyz``.
+        frame: how ``xyz`` follows from world coordinates.
+        size: of the scene, m.
+        at: world times (T,) -> true world positions (N,T,3).
+        facing: world times (T,) -> cosine (N,T) between the surface normals and the directions to the camera.
+    """
+
+    xyz: Float[np.ndarray, "N T 3"]
+    visible: Bool[np.ndarray, "N T"]
+    features: Float[np.ndarray, "N D"] | None
+    surface: Surface
+    times: Float[np.ndarray, " T"]
+    regular: bool
+    fps: float
+    rate: float
+    offset: float
+    camera: Camera
+    frame: Similarity
+    size: float
+    at: Callable[[Float[np.ndarray, " T"]], Float[np.ndarray, "N T 3"]]
+    facing: Callable[[Float[np.ndarray, " T"]], Float[np.ndarray, "N T"]]
+
+    @property
+    def world_times(self) -> Float[np.ndarray, " T"]:
+        return self.rate * self.times + self.offset
+
+    def rays(self) -> Float[np.ndarray, "N T 3"]:
+        """From the camera centre to every sample: its length is the depth that depth errors are relative to."""
+        return self.xyz - self.camera.center.astype(self.xyz.dtype)
+
+    def moved(self, later: float | Float[np.ndarray, " T"]) -> Float[np.ndarray, "N T 3"]:
+        """How far the tracks' points move in ``later`` s of world time, in the video's frame; outliers do not."""
+        now = self.world_times
+        step = (self.at(now + later) - self.at(now)) @ (self.frame.scale * self.frame.R.T).astype(self.xyz.dtype)
+        return np.where((self.surface.part >= 0)[:, None, None], step, 0).astype(self.xyz.dtype, copy=False)
+
+
+def stream(seed: int, *key: int | str) -> np.random.Generator:
+    """An independent random stream for every key: adding or removing one leaves the bits of all others alone."""
+    words = [zlib.crc32(k.encode()) if isinstance(k, str) else int(k) for k in key]
+    return np.random.default_rng(np.random.SeedSequence(int(seed), spawn_key=tuple(words)))

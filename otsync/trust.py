@@ -1,0 +1,39 @@
+"""When an answer is to be trusted: the one place where the thresholds behind the flags are written down.
+
+Lengths of time are seconds (the designs' frame counts at 30 fps); nothing has a unit of length.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Trust:
+    """Limits beyond which an alignment is flagged.
+
+    Args:
+        evidence: WEAK below this rise of the score's peak over its median, in nats a match.
+        margin: AMBIGUOUS when the second peak comes this close to the first, as a share of the first's rise.
+        disagreement: DISAGREE when slow velocities or windowed positions peak further away than this, s.
+        alias: ALIAS when the score divided by the overlap peaks further away than this, s.
+        overlap: SHORT_OVERLAP below this many seconds in common.
+        matches: FEW_MATCHES below this effective number of matches.
+        motion: STATIC when the motion that both videos share is below this share of the scene's extent.
+        moved: MOVED when the sub-frame fit ends further from the scan's peak than this, s.
+        spread: SPREAD when fits with other detrending windows differ by more than this, s.
+        correlation: POOR_FIT below this pooled correlation of the matched velocities at the answer.
+        rate_sigmas: a fitted rate counts when it differs from the declared one by more than this many sigmas.
+    """
+
+    evidence: float = 10.0
+    margin: float = 0.1
+    disagreement: float = 3 / 30
+    alias: float = 3 / 30
+    overlap: float = 40 / 30
+    matches: float = 5.0
+    motion: float = 0.02
+    moved: float = 2 / 30
+    spread: float = 0.5 / 30
+    correlation: float = 0.45
+    rate_sigmas: float = 4.0

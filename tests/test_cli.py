@@ -1,0 +1,136 @@
+"""The command line: what it prints, writes, refuses and leaves behind."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from otsync import Offsets, TrackSet, __version__
+from otsync.cli import main
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("world")
+    assert main(["simulate", str(folder), "--motion", "tennis", "--preset", "clean", "--videos", "3", "--seed", "5", "--max-offset", "9"]) == 0  # fmt: skip
+    return folder
+
+
+def test_simulate_writes_track_sets_and_the_truth(world):
+    assert sorted(p.name for p in world.iterdir()) == ["truth.json", "video0.npz", "video1.npz", "video2.npz"]
+    truth = Offsets.load(world / "truth.json")
+    assert truth.names == ("video0", "video1", "video2") and truth.seconds[0] == 0
+    assert 0 < np.abs(truth.frames[1:]).max() <= 9 and len(TrackSet.load(world / "video1.npz")) > 50
+
+
+def test_sync_prints_a_table_and_writes_offsets_and_report(world, tmp_path, capsys):
+    files = [str(p) for p in sorted(world.glob("*.npz"))]
+    code = main(["sync", *files, "--out", str(tmp_path / "out"), "--truth", str(world / "truth.json"), "aligner:dtw"])
+    out = capsys.readouterr().out
+    assert code == 0 and "video1" in out and "reference" in out and "error" in out
+    found, truth = Offsets.load(tmp_path / "out" / "offsets.json"), Offsets.load(world / "truth.json")
+    assert np.abs(found.frames - truth.frames).max() < 1.5
+    assert "On the common clock" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_algorithms_are_chosen_from_the_shell(world, tmp_path, capsys):
+    files = [str(world / "video0.npz"), str(world / "video1.npz")]
+    assert (
+        main(["match", *files, "--out", str(tmp_path / "m.csv"), "matcher:optimal-transport", "--matcher.reg", "0.05"])
+        == 0
+    )
+    lines = (tmp_path / "m.csv").read_text().splitlines()
+    assert lines[0] == "a,b,score" and len(lines) > 50
+    out = capsys.readouterr().out
+    assert f"{len(lines) - 1} matches" in out and "objective" in out and "marginal_error" in out
+
+
+def test_reference_is_chosen_by_name(world, tmp_path):
+    files = [str(p) for p in sorted(world.glob("*.npz"))]
+    args = ["sync", *files, "--out", str(tmp_path), "--reference", "video1", "aligner:constant-shift"]
+    assert main([*args[:-1], "aligner:constant-shift"]) == 0
+    found = Offsets.load(tmp_path / "offsets.json")
+    assert found.reference == 1 and found.seconds[1] == 0
+
+
+def test_a_refused_answer_exits_with_one(tmp_path, capsys):
+    same = TrackSet(np.ones((6, 40, 3)), features=np.ones((6, 3)), fps=30, name="a")
+    for name in ("a", "b"):
+        same.save(tmp_path / f"{name}.npz")
+    files = [str(tmp_path / "a.npz"), str(tmp_path / "b.npz")]
+    assert main(["match", *files]) == 1
+    assert "no_information" in capsys.readouterr().err
+    assert main(["sync", *files, "--out", str(tmp_path)]) == 1
+    assert "a~2: no_information" in capsys.readouterr().err
+    assert json.loads((tmp_path / "offsets.json").read_text())["videos"][1]["offset_seconds"] is None
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (["sync", "nowhere.npz", "b.npz"], "nowhere.npz: no such file"),
+        (["sync", "{world}/video0.npz"], "tracks: expected at least two"),
+        (["sync", "{world}/video0.npz", "{world}/truth.json"], "truth.json: expected a readable .npz"),
+        (["sync", "{world}/video0.npz", "{world}/video1.npz", "--reference", "x"], "--reference: expected one of video0, video1"),
+        (["sync", "{world}/video0.npz", "{world}/video1.npz", "--truth", "{world}/video0.npz"], "video0.npz: expected JSON"),
+        (["match", "{world}/video0.npz", "{world}"], "expected a file; found a folder"),
+        (["match", "{world}/video0.npz", "{world}/video1.npz", "matcher:partial-fgw", "--matcher.mass", "7"], "PartialFGW.mass"),
+        (["simulate", "{world}/x", "--motion", "waltz"], "waltz"),
+        (["simulate", "{world}/x", "--fps", "0"], "fps"),
+    ],
+)  # fmt: skip
+def test_bad_arguments_and_files_exit_with_two(args, message, world, capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    try:
+        code = main([a.format(world=world) for a in args])
+    except SystemExit as stop:  # the parser's own way out
+        code = stop.code
+    assert code == 2
+    captured = capsys.readouterr()
+    assert message in captured.err + captured.out
+    assert list(tmp_path.iterdir()) == []
+
+
+def shell(*args: str, **options) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "otsync.cli", *args], capture_output=True, text=True, cwd=ROOT, timeout=120, **options
+    )
+
+
+def test_version_help_and_unknown_commands():
+    assert shell("--version").stdout.strip() == f"otsync {__version__}"
+    for command in ("demo", "simulate", "match", "sync"):
+        done = shell(command, "--help")
+        assert done.returncode == 0 and f"Example: otsync {command}" in done.stdout
+    assert shell("dance").returncode == 2 and shell().returncode == 2
+
+
+def test_no_progress_bar_when_the_output_is_no_terminal(world, tmp_path):
+    done = shell("sync", *map(str, sorted(world.glob("*.npz"))), "--out", str(tmp_path), "aligner:dtw")
+    assert done.returncode == 0 and "it/s" not in done.stderr and "pair/s" not in done.stderr
+
+
+def test_an_interrupt_leaves_nothing_half_written(tmp_path):
+    """SIGINT while simulating and matching."""
+    for delay in (1.5, 3.0, 5.0):
+        out = tmp_path / f"out{delay}"
+        command = [sys.executable, "-m", "otsync.cli", "demo", "--videos", "12", "--out", str(out)]
+        run = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)  # fmt: skip
+        time.sleep(delay)
+        os.killpg(run.pid, signal.SIGINT)
+        _, err = run.communicate(timeout=60)
+        assert run.returncode in (130, 0, -signal.SIGINT, 1), err
+        for path in out.rglob("*") if out.exists() else []:
+            assert path.name in ("offsets.json", "report.html")
+            if path.suffix == ".json":
+                Offsets.load(path)
