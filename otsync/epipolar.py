@@ -14,35 +14,12 @@ from jaxtyping import Float, Int
 
 from .align import MIN_OVERLAP, peak
 from .clock import SAME_FPS, is_uniform, nominal_fps
-from .costs import Cosine, Cost, total_cost
 from .geometry import fundamentals
-from .match import by_score
 from .splines import TrackSplines
 from .types import Alignment, Matches, Status, TrackSet, in_order
 
 MIXTURE_CAP, FLOOR, TRACK_CAP = 12.0, -1.0, 8.0
 """Per track: the most that one candidate counts, the outlier's floor, the most that the track counts."""
-
-
-@dataclass(frozen=True)
-class Candidates:
-    """A matcher that keeps every track's ``k`` cheapest partners, from both sides: many of them wrong, few right lost.
-
-    For aligners that weigh candidates themselves (:class:`EpipolarScan`).
-    """
-
-    k: int = 10
-    costs: tuple[Cost, ...] = (Cosine(center=False),)
-
-    def __call__(self, a: TrackSet, b: TrackSet) -> Matches:
-        cost = total_cost(self.costs, a, b)
-        rows = np.argsort(cost, axis=1, kind="stable")[:, : self.k]
-        columns = np.argsort(cost, axis=0, kind="stable")[: self.k]
-        chosen = np.zeros(cost.shape, bool)
-        np.put_along_axis(chosen, rows, True, 1)
-        np.put_along_axis(chosen, columns, True, 0)
-        pairs = np.argwhere(chosen)
-        return by_score(pairs, -cost[chosen], stats={"objective": float(cost[chosen].sum())})
 
 
 @dataclass(frozen=True)
