@@ -43,7 +43,8 @@ class EpipolarScan:
     window: float = 50 / 30
     motion_scale: float = 2.0
     position_scale: float = 6.0
-    min_overlap: float = MIN_OVERLAP / 30
+    min_overlap: float = MIN_OVERLAP
+    min_seen: float = 12 / 30
     max_lag: float | None = None
     weak: float = 5.0
     ambiguous: float = 0.1
@@ -83,7 +84,7 @@ class EpipolarScan:
 
         shape = (2, len(pairs), len(lags))
         mean, count = np.full(shape, np.nan), np.zeros(shape)
-        least, window = max(2, round(self.min_overlap * fps)), max(4, round(self.window * fps))
+        least, window = max(2, round(self.min_seen * fps)), max(4, round(self.window * fps))
         epipolar_evidence(
             np.ascontiguousarray(xa), np.ascontiguousarray(xb), F, pairs, int(lags[0]), int(lags[-1]), least,
             window, max(3, round(12 * fps / 30)), mean, count,
