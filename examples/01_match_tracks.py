@@ -4,9 +4,9 @@ python examples/01_match_tracks.py --n 500
 """
 
 import tyro
-from otsync.metrics import match_quality
 
 from otsync import FusedGromovWasserstein, PartialFGW, match
+from otsync.metrics import match_quality
 from otsync.simulate import matching_world
 
 
@@ -18,7 +18,7 @@ def main(n: int = 500, seed: int = 0) -> None:
 
     for matcher in (FusedGromovWasserstein(), PartialFGW(mass=0.65)):
         matches = match(a, b, matcher)
-        quality = match_quality(matches, truth, a, b)
+        quality = match_quality(matches, truth)
         print(f"\n{matcher}")
         print(f"  {len(matches)} matches, objective {matches.stats['objective']:.4f}, {matches.stats['seconds']:.1f} s")
         print("  " + "  ".join(f"{name} {value:.2f}" for name, value in quality.items()))

@@ -6,9 +6,9 @@ python examples/02_synchronize.py --motion tennis --videos 5 --out out/sync
 from pathlib import Path
 
 import tyro
-from otsync.metrics import offset_error
 
 from otsync import Offsets, synchronize
+from otsync.metrics import offset_error
 from otsync.report import write_report
 from otsync.simulate import simulate
 

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import tyro
 from matplotlib.figure import Figure
-from otsync.metrics import match_quality
 
 from otsync import FusedGromovWasserstein, OptimalTransport, match
+from otsync.metrics import match_quality
 from otsync.simulate import matching_world
 
 MATCHERS = {"features only (EMD)": OptimalTransport(), "fused (FGW)": FusedGromovWasserstein()}
@@ -23,36 +23,32 @@ def main(n: int = 1000, seeds: tuple[int, ...] = (0, 1, 2), out: Path = Path("ou
     rows: dict[str, list[dict[str, float]]] = {name: [] for name in MATCHERS}
     found = {}
     for seed in seeds:
-        a, b, truth = matching_world(n, seed=seed)
+        a, b, truth = matching_world(n, seed=seed, shared_frame=True)
         for name, matcher in MATCHERS.items():
             found[name] = match(a, b, matcher)
-            rows[name].append(match_quality(found[name], truth, a, b))
+            rows[name].append(match_quality(found[name], truth))
 
     print(f"{n} tracks a video, mean of {len(seeds)} worlds")
     print(f"{'':22}" + "".join(f"{key:>11}" for key in rows["fused (FGW)"][0]))
     for name, qualities in rows.items():
         print(f"{name:22}" + "".join(f"{np.mean([q[key] for q in qualities]):11.3f}" for key in qualities[0]))
 
-    # the last world: both videos side by side, the best tenth of the matches coloured by where they start in a
-    figure = Figure(figsize=(9, 4.5), layout="constrained")
+    # The last world, both videos side by side (both happen to be upright here; matching never sees that): a sample of
+    # the better half of the matches, coloured by height in the left video, so that coherent ones do not mix colours.
+    rng = np.random.default_rng(0)
+    figure = Figure(figsize=(9, 4), layout="constrained")
     for ax, (name, matches) in zip(figure.subplots(1, 2), found.items(), strict=True):
-        best = matches.best(n // 10).pairs
-        xy = [t.xyz[:, t.n_frames // 2, [0, 2]] - np.median(t.xyz[:, t.n_frames // 2, [0, 2]], 0) for t in (a, b)]
-        shift = np.array([1.2 * np.ptp(np.quantile(xy[0], (0.02, 0.98), axis=0)[:, 0]), 0])
-        for points, at in ((xy[0], 0), (xy[1], shift)):
-            ax.plot(*(points + at).T, ".", ms=1.5, color="0.75")
-        order = np.argsort(np.argsort(xy[0][best[:, 0], 1]))
-        for rank, (i, j) in zip(order, best, strict=True):
-            start, end = xy[0][i], xy[1][j] + shift
-            ax.plot(
-                [start[0], end[0]],
-                [start[1], end[1]],
-                lw=0.5,
-                alpha=0.7,
-                color=(rank / len(best), 0.3, 1 - rank / len(best)),
-            )
-        low, high = np.quantile(np.concatenate([xy[0], xy[1] + shift]), (0.01, 0.99), axis=0)
-        ax.set(title=name, xlim=(low[0] - 0.2, high[0] + 0.2), ylim=(low[1] - 0.2, high[1] + 0.2), aspect="equal")
+        best = rng.permutation(matches.best(n // 2).pairs)[:120]
+        left, right = (t.xyz[:, t.n_frames // 2][:, [0, 2]] for t in (a, b))
+        right = right + [1.6 * np.ptp(np.quantile(left[:, 0], (0.05, 0.95))), 0]
+        ax.plot(*left.T, ".", *right.T, ".", ms=1.5, color="0.78")
+        height = np.clip(
+            (left[best[:, 0], 1] - np.quantile(left[:, 1], 0.05)) / np.ptp(np.quantile(left[:, 1], (0.05, 0.95))), 0, 1
+        )
+        for (i, j), h in zip(best, height, strict=True):
+            ax.plot([left[i, 0], right[j, 0]], [left[i, 1], right[j, 1]], lw=0.6, color=(h, 0.25, 1 - h))
+        low, high = np.quantile(np.concatenate([left, right]), (0.03, 0.97), axis=0)
+        ax.set(title=name, xlim=(low[0] - 0.3, high[0] + 0.3), ylim=(low[1] - 0.3, high[1] + 0.3), aspect="equal")
         ax.set_axis_off()
     out.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(out, dpi=130)

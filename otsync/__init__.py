@@ -11,8 +11,9 @@ Tracks in, offsets out::
 Nouns are frozen dataclasses of arrays, verbs validate and report a status, algorithms are objects in slots.
 """
 
-from .align import DTW, ConstantShift, align
+from .align import DTW, ConstantShift, LikelihoodScan, align
 from .costs import Cosine, track_distance
+from .graph import Graph
 from .match import (
     EntropicFGW,
     FusedGromovWasserstein,
@@ -22,8 +23,9 @@ from .match import (
     PartialFGW,
     match,
 )
-from .refine import refine
+from .refine import SplineRefine, Unrefined, refine
 from .sync import synchronize
+from .trust import Trust
 from .types import Alignment, Camera, Matches, Offsets, Refused, Status, TrackSet, Video
 
 __version__ = "0.1.0"
@@ -36,15 +38,20 @@ __all__ = [
     "Cosine",
     "EntropicFGW",
     "FusedGromovWasserstein",
+    "Graph",
     "GromovWasserstein",
+    "LikelihoodScan",
     "Matches",
     "NearestNeighbor",
     "Offsets",
     "OptimalTransport",
     "PartialFGW",
     "Refused",
+    "SplineRefine",
     "Status",
     "TrackSet",
+    "Trust",
+    "Unrefined",
     "Video",
     "align",
     "match",

@@ -116,6 +116,8 @@ class Match:
 
     def run(self) -> int:
         a, b = TrackSet.load(self.a), TrackSet.load(self.b)
+        if sys.stderr.isatty():  # one solve has no steps to count
+            print(f"matching {len(a)} x {len(b)} tracks ...", file=sys.stderr)
         found = match(a, b, self.matcher, throw=False)
         print(f"{len(found)} matches between {len(a)} and {len(b)} tracks")
         print("  ".join(f"{name} {value:.6g}" for name, value in found.stats.items()))
@@ -165,7 +167,38 @@ class Sync:
         return report(offsets, tracks, truth, self.out, "Synchronisation report")
 
 
-COMMANDS: dict[str, Callable[..., Any]] = {"demo": Demo, "simulate": Simulate, "match": Match, "sync": Sync}
+SUITES = {"core": "otsync.bench.core"}
+
+
+@dataclass
+class Bench:
+    """What accuracy costs in time: tables, CSV, JSON and plots, with machine and versions.
+
+    Example: otsync bench core --out bench/out --gate
+    """
+
+    suite: tyro.conf.Positional[Literal["core", "all"]]
+    out: Path = Path("bench/out")
+    """Folder for CSV, JSON and plots."""
+    gate: bool = False
+    """Compare with the committed baseline; exit code 1 when something got worse."""
+    rebase: bool = False
+    """Make the figures of this run the baseline that --gate compares with."""
+
+    def run(self) -> int:
+        import importlib
+
+        suites = SUITES.values() if self.suite == "all" else [SUITES[self.suite]]
+        return max(importlib.import_module(name).run(self.out, gate=self.gate, rebase=self.rebase) for name in suites)
+
+
+COMMANDS: dict[str, Callable[..., Any]] = {
+    "demo": Demo,
+    "simulate": Simulate,
+    "match": Match,
+    "sync": Sync,
+    "bench": Bench,
+}
 
 
 def true_offsets(path: Path, names: tuple[str, ...], reference: int) -> np.ndarray:

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from jaxtyping import Float
 
 from .types import Matches
 
+if TYPE_CHECKING:
+    from .simulate import Truth
+
 #: a match is right within this share of the scene's size, on the same object
 TOLERANCE = 0.06
 
 
 def match_quality(
-    matches: Matches, truth: Any, a: int = 0, b: int = 1, tolerance: float = TOLERANCE
+    matches: Matches, truth: Truth, a: int = 0, b: int = 1, tolerance: float = TOLERANCE
 ) -> dict[str, float]:
     """Precision, recall, flips and P50 of the matches between videos a and b of a simulated world.
 
@@ -23,7 +26,7 @@ def match_quality(
     body at rest. It is flipped when it is not right, but would be on the other side of the body.
 
     Args:
-        truth: a :class:`otsync.simulate.Truth`.
+        truth: of the simulated world.
 
     Returns:
         ``precision``: right matches / matches (nan when there are none).

@@ -1,58 +1,94 @@
-"""Offsets of all videos from their pairs: ``synchronize(tracks)`` (paper, Sec. 3.4: a star around the reference)."""
+"""Offsets of all videos from their pairs: ``synchronize(tracks)`` (paper, Sec. 3.4, whose star becomes a graph)."""
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from .align import Aligner, align
+from .costs import Cosine
+from .graph import Graph, Pair
 from .match import Matcher, match
-from .refine import Refiner, refine
-from .types import Alignment, Matches, Offsets, Status, TrackSet
+from .refine import Refiner, SplineRefine, refine
+from .rematch import SynchronousMatching
+from .settle import Answer, Settled, settle
+from .trust import Trust
+from .types import Alignment, Matches, Offsets, Status, TrackSet, gravest
 
 log = logging.getLogger("otsync")
 
-Pair = tuple[int, int]
 MapLike = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 
 
 def synchronize(
     tracks: Sequence[TrackSet],
     *,
-    reference: int = 0,
+    reference: int | Literal["auto"] = 0,
     matcher: Matcher | None = None,
     aligner: Aligner | None = None,
     refiner: Refiner | None = None,
     matches: Mapping[Pair, Matches] | None = None,
+    graph: Graph | None = None,
+    rematch: int = 1,
+    rate: Literal["fixed", "fit"] = "fixed",
     map: MapLike = map,
 ) -> Offsets:
     """Put every video on the reference's clock.
 
+    Pairs of videos are matched, aligned and refined; a robust solution over the graph of pairs gives the offsets, and
+    pairs that contradict it are fitted anew from where it puts them. Videos that no sound pair links to the reference
+    form components with references of their own.
+
     Args:
         tracks: one set per video, all in one world frame.
-        reference: index of the video whose clock is the world's.
-        matcher, aligner, refiner: the algorithms of each stage; None takes the default (no refinement without one).
+        reference: index of the video whose clock is the world's; "auto" takes the one with the surest pairs.
+        matcher, aligner, refiner: the algorithms of each stage; None takes the default, :class:`Unrefined` as refiner
+            leaves the aligner's answers as they are.
         matches: ``{(i, j): Matches}`` of your own; those pairs skip matching and no others are tried.
-        map: any map-like callable: the builtin, an executor's, dask's.
+        graph: which pairs are compared and how they are combined; default :class:`Graph`. ``Graph(extra=0)`` is the
+            paper's star.
+        rematch: how often pairs whose first answer is trusted are matched again with positions at the synchronised
+            times (more than once adds nothing); matches of your own are left alone.
+        rate: "fixed" takes frame rates as declared; "fit" frees them for pairs that overlap by 20 s and more, and
+            keeps what is significant.
+        map: any map-like callable: the builtin, an executor's, dask's. Results do not depend on it.
 
     A pair that fails gets a status and nan; the others live. Wrong input raises ValueError before any work.
     """
-    check_tracks(tracks, reference)
+    reference = check_tracks(tracks, reference)
+    if rate not in ("fixed", "fit"):
+        raise ValueError(f"rate: expected 'fixed' or 'fit'; found {rate!r}.")
     started = time.perf_counter()
-    jobs = []
-    for v in range(len(tracks)):
-        if v == reference:
-            continue
-        given = given_matches(matches, (reference, v), tracks)
-        if matches is None or given is not None:
-            jobs.append(Job((reference, v), tracks[reference], tracks[v], matcher, aligner, refiner, given))
-    answers = list(map(run, jobs))
-    return star(tracks, reference, answers, time.perf_counter() - started)
+    graph = graph or Graph()
+    refiner = with_rate(refiner, rate)
+    centre = most_seen(tracks) if reference is None else reference
+    pairs = given_pairs(matches, tracks) if matches is not None else graph.pairs(len(tracks), centre)
+    jobs = [
+        Job(pair, tracks[pair[0]], tracks[pair[1]], matcher, aligner, refiner, matches[pair] if matches else None)
+        for pair in pairs
+    ]
+    trust = getattr(refiner, "trust", None) or Trust()
+
+    def refit(tasks: list[tuple[Answer, float, float]]) -> list[Alignment]:
+        return list(map(run_refit, [Refit.of(*task, tracks, refiner) for task in tasks])) if tasks else []
+
+    def settled(answers: Sequence[Answer]) -> Settled:
+        return settle(len(tracks), answers, reference, centre, graph, trust, refit)
+
+    found = settled(list(map(run, jobs)))
+    for _ in range(rematch if matches is None else 0):
+        again = rematching(jobs, found)
+        if not again:
+            break
+        fresh = {answer.pair: answer for answer in map(run, again)}
+        found = settled([fresh.get(a.pair, a) for a in found.answers])
+    return to_offsets(tracks, found, time.perf_counter() - started)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,84 +100,127 @@ class Job:
     b: TrackSet
     matcher: Matcher | None
     aligner: Aligner | None
-    refiner: Refiner | None
+    refiner: Refiner
     matches: Matches | None
 
 
-def run(job: Job) -> tuple[Pair, Matches, Alignment]:
+def run(job: Job) -> Answer:
     """Match, align and refine one pair. An exception becomes the status FAILED, told in the log."""
     matches = Matches(np.zeros((0, 2), int), status=Status.FAILED, flags=(Status.FAILED,))
     try:
-        found_matches = job.matches if job.matches is not None else match(job.a, job.b, job.matcher, throw=False)
-        matches = found_matches.without_plan()
+        found = job.matches if job.matches is not None else match(job.a, job.b, job.matcher, throw=False)
+        matches = found.without_plan()
         if not matches.status.ok:
             failed = Alignment(float("nan"), status=matches.status, flags=matches.flags, stats=matches.stats)
-            return job.pair, matches, failed
-        found = align(job.a, job.b, matches, job.aligner, throw=False)
-        if job.refiner is not None and np.isfinite(found.offset):
-            found = refine(job.a, job.b, matches, found, job.refiner, throw=False)
-        return job.pair, matches, found
+            return Answer(job.pair, matches, failed, failed)
+        scanned = align(job.a, job.b, matches, job.aligner, throw=False)
+        refined = scanned
+        if np.isfinite(scanned.offset):
+            refined = refine(job.a, job.b, matches, scanned, job.refiner, throw=False)
+        return Answer(job.pair, matches, scanned, refined)
     except Exception as error:
         log.warning("pair %s: %s: %s", job.pair, type(error).__name__, error)
-        return job.pair, matches, Alignment(float("nan"), status=Status.FAILED, flags=(Status.FAILED,))
+        failed = Alignment(float("nan"), status=Status.FAILED, flags=(Status.FAILED,))
+        return Answer(job.pair, matches, failed, failed)
 
 
-def star(
-    tracks: Sequence[TrackSet], reference: int, answers: list[tuple[Pair, Matches, Alignment]], seconds: float
-) -> Offsets:
-    """Every video's offset is its pair's with the reference."""
-    alignments = {pair: alignment for pair, _, alignment in answers}
-    V = len(tracks)
-    offset, rate, sigma = np.full(V, np.nan), np.ones(V), np.full(V, np.nan)
-    offset[reference] = sigma[reference] = 0.0
-    status, flags = [Status.OK] * V, [()] * V  # type: list[Status], list[tuple[Status, ...]]
-    for v in range(V):
-        if v == reference:
+@dataclass(frozen=True, eq=False)
+class Refit:
+    """A pair to be refined anew from elsewhere."""
+
+    a: TrackSet
+    b: TrackSet
+    matches: Matches
+    start: Alignment
+    refiner: Refiner
+
+    @classmethod
+    def of(cls, answer: Answer, offset: float, rate: float, tracks: Sequence[TrackSet], refiner: Refiner) -> Refit:
+        i, j = answer.pair
+        start = dataclasses.replace(answer.scanned, offset=offset, rate=rate, stats=dict(answer.scanned.stats))
+        return cls(tracks[i], tracks[j], answer.matches, start, with_rate(refiner, "fixed"))
+
+
+def run_refit(job: Refit) -> Alignment:
+    try:
+        return refine(job.a, job.b, job.matches, job.start, job.refiner, throw=False)
+    except Exception as error:
+        log.warning("refitting: %s: %s", type(error).__name__, error)
+        return Alignment(float("nan"), status=Status.FAILED, flags=(Status.FAILED,))
+
+
+def rematching(jobs: list[Job], found: Settled) -> list[Job]:
+    """The pairs between trusted videos of one component, to be matched at their synchronised times."""
+    again = []
+    for job in jobs:
+        i, j = job.pair
+        if found.flags[i] or found.flags[j] or found.component[i] != found.component[j]:
             continue
-        found = alignments.get((reference, v))
-        if found is None:
-            status[v], flags[v] = Status.DISCONNECTED, (Status.DISCONNECTED,)
-            continue
-        offset[v], rate[v], sigma[v] = found.offset, found.rate, found.sigma
-        status[v], flags[v] = found.status, found.flags
+        # t_a = (r_b t_b + x_b - x_a) / r_a
+        offset, rate = (found.x[j] - found.x[i]) / found.rates[i], found.rates[j] / found.rates[i]
+        costs = getattr(job.matcher, "costs", (Cosine(),))
+        again.append(dataclasses.replace(job, matcher=SynchronousMatching(float(offset), float(rate), costs)))
+    return again
+
+
+def with_rate(refiner: Refiner | None, rate: Literal["fixed", "fit"]) -> Refiner:
+    """The refiner (or the default) told how to treat rates, where it can be told."""
+    refiner = SplineRefine() if refiner is None else refiner
+    if dataclasses.is_dataclass(refiner) and hasattr(refiner, "rate"):
+        return dataclasses.replace(refiner, rate=rate)  # type: ignore[type-var]
+    return refiner
+
+
+def to_offsets(tracks: Sequence[TrackSet], found: Settled, seconds: float) -> Offsets:
     return Offsets(
         names=unique_names(tracks),
         fps=np.array([t.fps for t in tracks], float),
-        seconds=offset,
-        rates=rate,
-        sigma=sigma,
-        reference=reference,
-        component=np.full(V, reference),
-        status=tuple(status),
-        flags=tuple(flags),
-        alignments=alignments,
-        matches={pair: matches for pair, matches, _ in answers},
-        stats={"seconds": seconds, "pairs": float(len(alignments))},
+        seconds=found.x,
+        rates=found.rates,
+        sigma=found.sigma,
+        reference=found.reference,
+        component=found.component,
+        status=tuple(gravest(f) for f in found.flags),
+        flags=found.flags,
+        alignments={a.pair: a.refined for a in found.answers},
+        matches={a.pair: a.matches for a in found.answers},
+        stats=found.stats | {"seconds": seconds},
     )
 
 
-def check_tracks(tracks: Sequence[TrackSet], reference: int) -> None:
-    """ValueError unless there are at least two sound track sets and the reference is one of them."""
+def check_tracks(tracks: Sequence[TrackSet], reference: int | Literal["auto"]) -> int | None:
+    """ValueError unless there are at least two sound track sets; the reference's index, None when it is to be chosen."""
     if isinstance(tracks, TrackSet) or len(tracks) < 2:
         raise ValueError("tracks: expected a sequence of at least two track sets, one per video; found fewer.")
-    if not -len(tracks) <= reference < len(tracks):
-        raise ValueError(f"reference: expected an index of the {len(tracks)} videos; found {reference}.")
+    chosen = None
+    if reference != "auto":
+        if isinstance(reference, str) or not -len(tracks) <= reference < len(tracks):
+            raise ValueError(
+                f"reference: expected an index of the {len(tracks)} videos, or 'auto'; found {reference!r}."
+            )
+        chosen = reference % len(tracks)
     for v, t in enumerate(tracks):
         t.check(f"tracks[{v}]")
     frames = {t.frame for t in tracks if t.frame is not None}
     if len(frames) > 1:
         raise ValueError(f"tracks: expected one world frame; found {sorted(frames)}. Bring the positions into one.")
+    return chosen
 
 
-def given_matches(matches: Mapping[Pair, Matches] | None, pair: Pair, tracks: Sequence[TrackSet]) -> Matches | None:
-    """The matches that the caller brought for ``pair``, in its order; (j, i) serves (i, j)."""
-    if matches is None:
-        return None
-    i, j = pair
-    found = matches[pair] if pair in matches else matches[j, i].swapped() if (j, i) in matches else None
-    if found is not None:
-        found.check(f"matches[{pair}]", len(tracks[i]), len(tracks[j]))
-    return found
+def most_seen(tracks: Sequence[TrackSet]) -> int:
+    """The video with the most observed samples; the first on ties."""
+    return int(np.argmax([t.seen.sum() for t in tracks]))
+
+
+def given_pairs(matches: Mapping[Pair, Matches], tracks: Sequence[TrackSet]) -> list[Pair]:
+    """Sorted pairs that the caller brought matches for; ValueError when they do not fit the tracks."""
+    for (i, j), found in matches.items():
+        if not (0 <= i < len(tracks) and 0 <= j < len(tracks)) or i == j:
+            raise ValueError(f"matches: expected pairs of two of the {len(tracks)} videos; found {(i, j)}.")
+        if (j, i) in matches:
+            raise ValueError(f"matches: expected each pair once; found both {(i, j)} and {(j, i)}.")
+        found.check(f"matches[{(i, j)}]", len(tracks[i]), len(tracks[j]))
+    return sorted(matches)
 
 
 def unique_names(tracks: Sequence[TrackSet]) -> tuple[str, ...]:

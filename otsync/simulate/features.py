@@ -20,7 +20,7 @@ class FeatureModel:
         length_scale: m over which these change.
         limb: a random vector for every kind of limb or thing, the same left and right.
         side: the left/right cue: a random vector, added on the right and subtracted on the left.
-        view: a bias that is smooth on the body and differs from video to video.
+        view, view_scale: a bias that differs from video to video, and the m over which it changes on the body.
         shift: a constant of the video.
         person: a random vector for every figure but the first (0 when all look alike).
         noise: white, per component.
@@ -31,6 +31,7 @@ class FeatureModel:
     limb: float = 0.8
     side: float = 0.15
     view: float = 0.6
+    view_scale: float = 0.7
     shift: float = 0.3
     person: float = 0.4
     noise: float = 0.35
@@ -43,7 +44,7 @@ class FeatureModel:
         figure = parts.figure[surface.part]
         folded = surface.position.copy()
         folded[figure, 0] = np.abs(folded[figure, 0])
-        features = self._fourier(folded, world, dtype)
+        features = self._fourier(folded, self.length_scale, world, dtype)
         kinds = self.limb * world.standard_normal((64, self.dim))
         cue = self.side * world.standard_normal(self.dim)
         people = self.person * world.standard_normal((16, self.dim))
@@ -54,22 +55,17 @@ class FeatureModel:
         if self.person and len(surface) and surface.object.max() > 0:
             features += np.where(figure[:, None], people[surface.object % 16], 0.0).astype(dtype)
         if self.view:
-            features += dtype(self.view) * self._fourier(surface.position, own, dtype)
+            features += dtype(self.view) * self._fourier(surface.position, self.view_scale, own, dtype)
         if self.shift:
             features += (self.shift * own.standard_normal(self.dim)).astype(dtype)
         if self.noise:
             features += dtype(self.noise) * own.standard_normal((len(surface), self.dim), dtype=dtype)
         return features
 
-    def scale(self) -> float:
-        """Root mean square of a component: that of a feature of the background."""
-        parts = (1.0, self.limb, self.side, self.view, self.noise)
-        return float(np.sqrt(np.square(parts).sum()))
-
-    def _fourier(self, x: np.ndarray, rng: np.random.Generator, dtype: type) -> np.ndarray:
+    def _fourier(self, x: np.ndarray, length: float, rng: np.random.Generator, dtype: type) -> np.ndarray:
         """Random Fourier features of unit variance for the Gaussian kernel (Rahimi & Recht 2007)."""
-        w = (rng.standard_normal((3, self.dim)) / self.length_scale).astype(dtype)
-        phase = rng.uniform(0, 2 * np.pi, self.dim).astype(dtype)
+        w: np.ndarray = (rng.standard_normal((3, self.dim)) / length).astype(dtype)
+        phase: np.ndarray = rng.uniform(0, 2 * np.pi, self.dim).astype(dtype)
         angle = x.astype(dtype) @ w
         angle += phase
         np.cos(angle, out=angle)

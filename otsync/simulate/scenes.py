@@ -110,7 +110,7 @@ def boxes(rng: np.random.Generator) -> Scene:
         R = bodies[0][0][CHEST] @ euler(wobble(t))
         return R, 0.5 * (grip(bodies[0], 0) + grip(bodies[0], LEFT))
 
-    half = rng.uniform((0.15, 0.12, 0.10), (0.22, 0.18, 0.18))
+    half = rng.uniform((0.15, 0.12, 0.10), (0.22, 0.18, 0.18)).tolist()
     return stage([actor], [Thing(thing(1, BOX, half, box=True), held)])
 
 
@@ -363,7 +363,7 @@ def articulated(rng: np.random.Generator) -> Scene:
         [actor],
         [
             Thing(thing(1, BALL, (0.12,) * 3), drift(0)),
-            Thing(thing(2, BOX, (0.2, 0.15, 0.15), box=True), drift(1)),
+            Thing(thing(2, BOX, (0.15, 0.12, 0.12), box=True), drift(1)),
         ],
     )
 

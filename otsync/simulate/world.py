@@ -209,7 +209,7 @@ def _place(
     """Points of parts at the parts' poses: one small matrix product a part."""
     R, p = poses
     T = R.shape[1]
-    xyz = np.empty((len(part), T, 3), dtype)
+    xyz: np.ndarray = np.empty((len(part), T, 3), dtype)
     order = np.argsort(part, kind="stable")
     edges = np.searchsorted(part[order], np.arange(len(R) + 1))
     for i in np.flatnonzero(np.diff(edges)):
@@ -221,15 +221,15 @@ def _place(
 
 
 def as_tracks(obs: Observation, name: str, frame: str | None, uv: bool = True) -> TrackSet:
-    hidden = ~obs.visible
-    xyz = obs.xyz.copy()
-    xyz[hidden] = np.nan
+    # nothing is seen behind the camera, nor on its lens
+    visible = obs.visible & (obs.camera.to_camera(obs.xyz)[..., 2] > 0.05)
+    xyz = np.where(visible[..., None], obs.xyz, obs.xyz.dtype.type(np.nan))
     features = obs.features
     if features is not None:
         features = features / np.linalg.norm(features, axis=1, keepdims=True)
     return TrackSet(
         xyz,
-        obs.visible,
+        visible,
         features,
         fps=obs.fps,
         timestamps=None if obs.regular else obs.times,

@@ -1,0 +1,273 @@
+"""Many videos at once: which pairs to compare, and offsets of the videos from offsets of the pairs.
+
+Offsets here are world seconds: an edge (a, b) measures ``x[b] - x[a]``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+Pair = tuple[int, int]
+
+CAUCHY = 2.5
+"""Residuals beyond this many sigmas count for less."""
+
+L1_FLOOR = 0.3
+"""Sigmas below which the L1 weight grows no further."""
+
+
+@dataclass(frozen=True)
+class Graph:
+    """Which pairs are compared, and how their answers become one.
+
+    Args:
+        extra: pairs of every video besides the one with the reference. 0: the star of the paper.
+        complete: up to so many videos all pairs are compared (unless ``extra`` is 0).
+        curves: settle contradictions and flagged pairs by the sum of the pairs' whole score curves, where aligners
+            give one. A pair's highest peak may be wrong; the peaks of many pairs agree only at the truth.
+        starts: random spanning trees that the search over summed curves starts from, besides the obvious ones.
+        seed: of the choice of pairs and trees.
+    """
+
+    extra: int = 4
+    complete: int = 10
+    curves: bool = True
+    starts: int = 4
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("extra", "complete", "starts"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"Graph.{name}: expected a number >= 0; found {getattr(self, name)}.")
+
+    def pairs(self, n: int, centre: int) -> list[Pair]:
+        """Sorted pairs (a, b) with a < b: a star around ``centre`` and rings that add ``extra`` pairs a video."""
+        if self.extra and n <= self.complete:
+            return [(i, j) for i in range(n) for j in range(i + 1, n)]
+        found = {(min(centre, v), max(centre, v)) for v in range(n) if v != centre}
+        ring = np.random.default_rng(self.seed).permutation(n)
+        for s in range(1, (self.extra + 1) // 2 + 1):
+            # strides 1, 4, 9, ...: neighbours of neighbours are far apart, cycles are long and short
+            for i in range(n):
+                a, b = int(ring[i]), int(ring[(i + s * s) % n])
+                if a != b:
+                    found.add((min(a, b), max(a, b)))
+        return sorted(found)
+
+
+@dataclass(frozen=True, eq=False)
+class Edge:
+    """One pair's answer as the graph sees it.
+
+    Args:
+        a, b: videos. offset: world seconds, of b relative to a. sigma: seconds.
+        trusted: whether the pair itself vouches for it.
+        curve: (K,2) offset in seconds and score, or None.
+    """
+
+    a: int
+    b: int
+    offset: float
+    sigma: float
+    trusted: bool
+    curve: Float[np.ndarray, "K 2"] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Offsets of V videos. x: (V,) seconds, 0 for the anchor; sigma: (V,); residual: (E,) x_b - x_a - offset."""
+
+    x: Float[np.ndarray, " V"]
+    sigma: Float[np.ndarray, " V"]
+    residual: Float[np.ndarray, " E"]
+
+
+def components(n: int, edges: Sequence[Edge] | Sequence[Pair]) -> Int[np.ndarray, " V"]:
+    """The smallest index of each video's connected component."""
+    root = list(range(n))
+
+    def find(v: int) -> int:
+        while root[v] != v:
+            root[v] = root[root[v]]
+            v = root[v]
+        return v
+
+    for e in edges:
+        a, b = (e.a, e.b) if isinstance(e, Edge) else e
+        i, j = find(a), find(b)
+        root[max(i, j)] = min(i, j)
+    return np.array([find(v) for v in range(n)])
+
+
+def solve(
+    n: int, edges: Sequence[Edge], anchor: int, start: np.ndarray | None = None, inflation: float = 1.0
+) -> Solution:
+    """Robust synchronisation: weighted L1 by reweighting, then Cauchy from there (from ``start`` when given).
+
+    Videos that no edge links to ``anchor`` stay at nan. ``inflation`` multiplies the sigmas, which take edges as
+    independent although they share tracks.
+    """
+    near = components(n, edges) if edges else np.arange(n)
+    inside = near == near[anchor]
+    free = np.flatnonzero(inside & (np.arange(n) != anchor))
+    x, sigma = np.full(n, np.nan), np.full(n, np.nan)
+    x[anchor] = sigma[anchor] = 0.0
+    used = [e for e in edges if inside[e.a]]
+    if not len(free):
+        return Solution(x, sigma, np.full(len(edges), np.nan))
+    column = np.full(n, -1)
+    column[free] = np.arange(len(free))
+    A = np.zeros((len(used), len(free)))
+    for row, e in enumerate(used):
+        if column[e.b] >= 0:
+            A[row, column[e.b]] += 1
+        if column[e.a] >= 0:
+            A[row, column[e.a]] -= 1
+    d, s = np.array([e.offset for e in used]), np.array([e.sigma for e in used])
+    y = _reweighted(A, d, s, np.linalg.lstsq(A / s[:, None], d / s, rcond=None)[0], _l1)[0] if start is None else None
+    first = y if y is not None else np.asarray(start)[free] - np.asarray(start)[anchor]
+    y, normal = _reweighted(A, d, s, first, _cauchy)
+    x[free] = y
+    sigma[free] = inflation * np.sqrt(np.diag(np.linalg.inv(normal)))
+    return Solution(x, sigma, np.array([x[e.b] - x[e.a] - e.offset for e in edges]))
+
+
+def _l1(r: np.ndarray) -> np.ndarray:
+    return 1 / np.maximum(np.abs(r), L1_FLOOR)
+
+
+def _cauchy(r: np.ndarray) -> np.ndarray:
+    return 1 / (1 + (r / CAUCHY) ** 2)
+
+
+def _reweighted(A, d, s, x, weight, iterations: int = 60) -> tuple[np.ndarray, np.ndarray]:  # type: ignore[no-untyped-def]
+    """Iteratively reweighted least squares of A x = d with sigmas s; the answer and its normal matrix."""
+    for _ in range(iterations):
+        w = weight((A @ x - d) / s) / s**2
+        normal = A.T @ (A * w[:, None])
+        new = np.linalg.solve(normal, A.T @ (w * d))
+        done = np.abs(new - x).max() < 1e-9
+        x = new
+        if done:
+            break
+    return x, normal
+
+
+class CurveSum:
+    """The pairs' score curves as one function of all offsets, and its ascent one video at a time.
+
+    Curves count from their median, which is what an offset without overlap scores.
+    """
+
+    def __init__(self, n: int, edges: Sequence[Edge], step: float):
+        self.n, self.step = n, step
+        self.edges = [e for e in edges if e.curve is not None and np.isfinite(e.curve[:, 1]).any()]
+        self.curves = [_levelled(e.curve) for e in self.edges]
+        self.around: list[list[int]] = [[] for _ in range(n)]
+        for k, e in enumerate(self.edges):
+            self.around[e.a].append(k)
+            self.around[e.b].append(k)
+
+    def total(self, x: Float[np.ndarray, " V"]) -> float:
+        return float(
+            sum(
+                np.interp(x[e.b] - x[e.a], *c, left=0.0, right=0.0)
+                for e, c in zip(self.edges, self.curves, strict=True)
+            )
+        )
+
+    def of_video(self, v: int, x: Float[np.ndarray, " V"]) -> tuple[np.ndarray, np.ndarray]:
+        """Candidates for x[v] and what they score with the others held; candidates lie on a grid through x[v]."""
+        low, high = np.inf, -np.inf
+        for k in self.around[v]:
+            e, (t, _) = self.edges[k], self.curves[k]
+            ends = x[e.a] + t[[0, -1]] if e.b == v else x[e.b] - t[[-1, 0]]
+            low, high = min(low, ends[0]), max(high, ends[1])
+        if not low < high:
+            return np.array([x[v]]), np.zeros(1)
+        candidates = x[v] + self.step * np.arange(np.ceil((low - x[v]) / self.step), (high - x[v]) / self.step + 1)
+        score = np.zeros(len(candidates))
+        for k in self.around[v]:
+            e, c = self.edges[k], self.curves[k]
+            offset = candidates - x[e.a] if e.b == v else x[e.b] - candidates
+            score += np.interp(offset, *c, left=0.0, right=0.0)
+        return candidates, score
+
+    def ascend(self, x: Float[np.ndarray, " V"], fixed: int, sweeps: int = 20) -> Float[np.ndarray, " V"]:
+        """Coordinate ascent from x; the video ``fixed`` stays."""
+        x = x.copy()
+        for _ in range(sweeps):
+            before = x.copy()
+            for v in range(self.n):
+                if v != fixed and self.around[v]:
+                    candidates, score = self.of_video(v, x)
+                    best = int(np.argmax(score))
+                    if score[best] > np.interp(x[v], candidates, score) + 1e-9:
+                        x[v] = candidates[best]
+            if np.array_equal(x, before):
+                break
+        return x
+
+    def search(self, starts: Sequence[np.ndarray], fixed: int) -> Float[np.ndarray, " V"]:
+        """The ascent with the largest total; the earliest on ties."""
+        found = [self.ascend(x, fixed) for x in starts]
+        return max(found, key=self.total)
+
+
+def _levelled(curve: Float[np.ndarray, "K 2"] | None) -> tuple[np.ndarray, np.ndarray]:
+    assert curve is not None
+    t, c = curve.T
+    finite = np.isfinite(c)
+    level = float(np.median(c[finite]))
+    return t, np.where(finite, c, level) - level
+
+
+def spanning_trees(
+    n: int, edges: Sequence[Edge], weight: Sequence[float], anchor: int, count: int, seed: int
+) -> list[Float[np.ndarray, " V"]]:
+    """Offsets along maximum spanning trees of ``weight``: the first as it is, the others with random factors."""
+    rng = np.random.default_rng(seed)
+    found = []
+    for k in range(count):
+        w = np.asarray(weight, float) * (1.0 if k == 0 else rng.uniform(0.2, 1.0, len(edges)))
+        x = np.full(n, np.nan)
+        x[anchor] = 0.0
+        while True:
+            known = np.isfinite(x)
+            crossing = [i for i, e in enumerate(edges) if known[e.a] != known[e.b]]
+            if not crossing:
+                break
+            e = edges[max(crossing, key=lambda i: (w[i], -i))]
+            if known[e.a]:
+                x[e.b] = x[e.a] + e.offset
+            else:
+                x[e.a] = x[e.b] - e.offset
+        found.append(np.where(np.isfinite(x), x, 0.0))
+    return found
+
+
+def cycle_errors(edges: Sequence[Edge]) -> Float[np.ndarray, " C"]:
+    """|sum of offsets| around every triangle of edges, s."""
+    offset = {(e.a, e.b): e.offset for e in edges} | {(e.b, e.a): -e.offset for e in edges}
+    near: dict[int, set[int]] = {}
+    for a, b in offset:
+        near.setdefault(a, set()).add(b)
+    sums = [
+        abs(offset[a, b] + offset[b, c] + offset[c, a])
+        for a in sorted(near)
+        for b in sorted(near[a])
+        if b > a
+        for c in sorted(near[a] & near[b])
+        if c > b
+    ]
+    return np.array(sums)
+
+
+def agreeing(edges: Sequence[Edge], solution: Solution, least: float) -> Bool[np.ndarray, " E"]:
+    """Edges within four sigmas, or ``least`` seconds, of the solution."""
+    sigma = np.array([e.sigma for e in edges])
+    return np.abs(solution.residual) <= np.maximum(least, 4 * sigma)

@@ -1,0 +1,58 @@
+"""What goes wrong between a surface and its tracks: each effect is an object ``(observation, rng) -> observation``.
+
+Effects stand in a tuple and are applied in order; what is not in the tuple is not computed. Every effect draws from a
+stream of its own, so that adding, removing or reordering others leaves its draws bit for bit as they are. An effect of
+strength zero changes no bit of the positions. Depth errors act along the viewing ray and are relative to depth;
+lengths are metres, times seconds, so nothing depends on the frame rate.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+from ..observation import Observation
+from .camera import CameraFrame, ClockDrift, DroppedFrames, RigidFrame, RollingShutter
+from .noise import (
+    CameraDepthDrift,
+    DepthBias,
+    DepthDrift,
+    DepthJitter,
+    LateralJitter,
+    LimbDrift,
+    PositionNoise,
+    SlowDrift,
+)
+from .tracker import Gaps, Hallucination, IdentitySwitch, Occlusion, Outliers, RayCompression, Smoothing
+
+__all__ = [
+    "CameraDepthDrift",
+    "CameraFrame",
+    "ClockDrift",
+    "DepthBias",
+    "DepthDrift",
+    "DepthJitter",
+    "DroppedFrames",
+    "Effect",
+    "Gaps",
+    "Hallucination",
+    "IdentitySwitch",
+    "LateralJitter",
+    "LimbDrift",
+    "Occlusion",
+    "Outliers",
+    "PositionNoise",
+    "RayCompression",
+    "RigidFrame",
+    "RollingShutter",
+    "SlowDrift",
+    "Smoothing",
+]
+
+
+@runtime_checkable
+class Effect(Protocol):
+    """Anything that turns an observation into another. A user's own goes into the tuple like these."""
+
+    def __call__(self, observation: Observation, rng: np.random.Generator, /) -> Observation: ...

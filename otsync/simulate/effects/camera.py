@@ -1,0 +1,96 @@
+"""What cameras and clocks do: frames of reference that are off, rows read one by one, clocks that wander."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from ..observation import Observation, Similarity
+from .noise import smooth_noise
+
+
+@dataclass(frozen=True)
+class CameraFrame:
+    """The video's frame is off: scale (relative), rotation (degrees, about a random axis), translation (m per axis)."""
+
+    scale: float = 0.01
+    rotation: float = 1.0
+    translation: float = 0.03
+
+    def __call__(self, obs: Observation, rng: np.random.Generator) -> Observation:
+        axis = rng.standard_normal(3)
+        angle = np.radians(self.rotation) * rng.standard_normal()
+        scale = 1 + self.scale * rng.standard_normal()
+        error = Similarity(scale, rotation(axis, angle), self.translation * rng.standard_normal(3))
+        return _reframed(obs, error)
+
+
+@dataclass(frozen=True)
+class RigidFrame:
+    """The video has a frame of its own: any rotation, an origin within ``distance`` m."""
+
+    distance: float = 5.0
+
+    def __call__(self, obs: Observation, rng: np.random.Generator) -> Observation:
+        q, r = np.linalg.qr(rng.standard_normal((3, 3)))
+        q *= np.sign(np.diag(r))
+        q[:, 0] *= np.linalg.det(q)
+        return _reframed(obs, Similarity(1.0, q, rng.uniform(-self.distance, self.distance, 3)))
+
+
+def _reframed(obs: Observation, change: Similarity) -> Observation:
+    return replace(obs, xyz=change(obs.xyz), frame=change.after(obs.frame), camera=change.camera(obs.camera))
+
+
+def rotation(axis: Float[np.ndarray, " 3"], angle: float) -> Float[np.ndarray, "3 3"]:
+    """About ``axis`` by ``angle`` rad (Rodrigues)."""
+    x, y, z = axis / np.linalg.norm(axis)
+    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
+
+
+@dataclass(frozen=True)
+class RollingShutter:
+    """Rows are read one after the other over ``readout`` s, the middle one at the frame's time.
+
+    The motion within a readout is followed by a polynomial through five exact instants.
+    """
+
+    readout: float = 0.02
+
+    def __call__(self, obs: Observation, rng: np.random.Generator) -> Observation:
+        row = obs.camera.project(obs.frame(obs.at(obs.world_times)))[..., 1] / obs.camera.height - 0.5
+        row = np.nan_to_num(np.clip(row, -0.5, 0.5))
+        nodes = np.linspace(-0.5, 0.5, 5)
+        moved = np.zeros_like(obs.xyz)
+        for i, node in enumerate(nodes):
+            others = np.delete(nodes, i)
+            weight = np.prod((row[..., None] - others) / (node - others), axis=2)
+            moved += weight[..., None].astype(moved.dtype) * obs.moved(obs.rate * node * self.readout)
+        return replace(obs, xyz=obs.xyz + moved, camera=replace(obs.camera, readout=self.readout))
+
+
+@dataclass(frozen=True)
+class ClockDrift:
+    """The video's clock wanders: frames are exposed up to ``size`` s (one sigma) off the times the file tells."""
+
+    size: float = 0.005
+    correlation: float = 2.0
+
+    def __call__(self, obs: Observation, rng: np.random.Generator) -> Observation:
+        off = self.size * smooth_noise((1,), obs.times, self.correlation, rng, np.float64)[0]
+        return replace(obs, xyz=obs.xyz + obs.moved(off))
+
+
+@dataclass(frozen=True)
+class DroppedFrames:
+    """A ``share`` of the frames never reached the file; the first stays. The others keep their timestamps."""
+
+    share: float = 0.05
+
+    def __call__(self, obs: Observation, rng: np.random.Generator) -> Observation:
+        keep = rng.random(len(obs.times)) >= self.share
+        keep[0] = True
+        return replace(obs, xyz=obs.xyz[:, keep], visible=obs.visible[:, keep], times=obs.times[keep], regular=False)
