@@ -24,13 +24,14 @@ class Selection:
     Args:
         count: tracks (100 measured worse, 400 no better). min_life: frames at 30 fps.
         extent: pixels at 640 of width that a track must move in x or in y; a static false foreground does not.
-        apart: pixels; a track that stays within it of a kept one tells nothing new.
+        apart: pixels; a track that stays within it of a kept one tells nothing new. 10 let a person close to the
+            camera take all places: 12 % of such depth-free pairs failed by more than 2 frames, 4 % with 16.
     """
 
     count: int = 200
     min_life: int = 24
     extent: float = 6.0
-    apart: float = 10.0
+    apart: float = 16.0
 
     def __call__(self, uv: Float[np.ndarray, "N T 2"], width: int, fps: float) -> Int[np.ndarray, " K"]:
         """Indices into ``uv`` (pixels, nan unseen), by life."""
