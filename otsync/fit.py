@@ -235,4 +235,3 @@ def overlap_seconds(a: TrackSplines, b: TrackSplines, clock: Clock) -> float:
     """Seconds of a's clock that both videos cover, one frame included."""
     ends = clock.a(b.times[[0, -1]])
     return max(0.0, float(min(a.times[-1], ends[1]) - max(a.times[0], ends[0])) + max(a.frame, b.frame))
-

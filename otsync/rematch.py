@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from .costs import Cosine, Cost, binary_scale, total_cost
 from .splines import TrackSplines
@@ -37,26 +37,26 @@ class SynchronousMatching:
     Args:
         offset, rate: t_a = rate * t_b + offset, from :func:`otsync.align`.
         costs: the linear terms of features, as of any matcher.
-        max_cost: pairs that cost more than this many units are left out.
+        limit: of larger sets only so many tracks take part, those seen longest: the cost is a dense matrix.
     """
 
     offset: float
     rate: float = 1.0
     costs: tuple[Cost, ...] = (Cosine(),)
-    max_cost: float = 6.0
+    limit: int = 2000
 
     def __call__(self, a: TrackSet, b: TrackSet) -> Matches:
-        cost = self.cost(a, b)
+        own_a, own_b = longest_seen(a, self.limit), longest_seen(b, self.limit)
+        cost = self.cost(a.take(own_a), b.take(own_b))
         if not np.isfinite(cost).any():
             return Matches(np.zeros((0, 2), int), status=Status.NO_OVERLAP, flags=(Status.NO_OVERLAP,))
         best_b, best_a = cost.argmin(1), cost.argmin(0)
-        i = np.flatnonzero(best_a[best_b] == np.arange(len(a)))
+        i = np.flatnonzero((best_a[best_b] == np.arange(len(own_a))) & np.isfinite(cost.min(1)))
         value = cost[i, best_b[i]]
-        i, value = i[value <= self.max_cost], value[value <= self.max_cost]
         order = np.argsort(value, kind="stable")
         flags = () if len(i) else (Status.NO_MATCH,)
         return Matches(
-            np.stack([i, best_b[i]], 1)[order],
+            np.stack([own_a[i], own_b[best_b[i]]], 1)[order],
             -value[order],
             status=flags[0] if flags else Status.OK,
             flags=flags,
@@ -98,6 +98,11 @@ class SynchronousMatching:
 
         kernels.over_blocks(work, [(i, min(i + 64, len(a))) for i in range(0, len(a), 64)])
         return place, motion
+
+
+def longest_seen(tracks: TrackSet, limit: int) -> Int[np.ndarray, " n"]:
+    """At most ``limit`` tracks, those with the most observed samples, in their order."""
+    return np.sort(np.argsort(-tracks.seen.sum(1), kind="stable")[:limit])
 
 
 def rms_extent(x: Float[np.ndarray, "N S 3"]) -> float:

@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 
 from .clock import CommonClock, common_clock
 from .costs import binary_scale, velocity
+from .splines import TrackSplines
 from .trust import Trust
 from .types import Alignment, Matches, Status, TrackSet, gravest, in_order
 
@@ -26,6 +27,12 @@ MIN_FRAMES, MIN_WINDOW = 12 / 30, 10 / 30
 
 APART = 4 / 30
 """Seconds between peaks that count as different hypotheses."""
+
+
+COMMON_RATES = (4 / 5, 5 / 6, 24 / 25, 25 / 24, 6 / 5, 5 / 4)
+"""Clock ratios of the frame rates 24, 25 and 30, by which a container's fps may be wrong."""
+
+RATE_MATCHES = 40
 
 
 @dataclass(frozen=True)
@@ -54,7 +61,7 @@ class LikelihoodScan:
     trust: Trust = field(default_factory=Trust)
 
     def __call__(self, a: TrackSet, b: TrackSet, matches: Matches) -> Alignment:
-        pair = normalised(common_clock(a, b, matches))
+        pair, scale = normalised(common_clock(a, b, matches))
         lags = pair.lags(max(1, round(self.min_overlap * pair.fps)), self.max_lag)
         if len(matches) == 0 or len(lags) == 0:
             return unanswered(pair, matches)
@@ -65,6 +72,7 @@ class LikelihoodScan:
         tops = local_peaks(lags, score, round(APART * pair.fps), self.peaks)
         offset = float(pair.seconds(vertex(lags, score, tops[0])))
         stats = self._stats(pair, lags, curves, tops) | {"matches": float(len(matches))}
+        stats["other_rate"], stats["other_rate_gain"] = other_rate(a, b, pair, lags, matches, scale)
         flags = self._flags(stats)
         return Alignment(
             offset,
@@ -110,6 +118,7 @@ class LikelihoodScan:
             Status.FEW_MATCHES: stats["observed_matches"] < t.matches,
             Status.STATIC: stats["motion"] < t.motion,
             Status.BORDER: stats["border"] > 0,
+            Status.RATE_MISMATCH: stats["other_rate_gain"] > t.rate_gain,
         }
         return in_order(flag for flag, raised in found.items() if raised)
 
@@ -212,6 +221,35 @@ def velocity_score(pair: CommonClock, lags: Int[np.ndarray, " K"], half: int, le
     return np.where((count > 0).any(0), score, -np.inf)
 
 
+def other_rate(
+    a: TrackSet, b: TrackSet, pair: CommonClock, lags: Int[np.ndarray, " K"], matches: Matches, scale: float
+) -> tuple[float, float]:
+    """Which of :data:`COMMON_RATES` suits the slow velocities best, and how many times better than the declared clocks.
+
+    A warning, not an answer: read from a few dozen matches only, as every pair pays for it.
+    """
+    some = np.unique(np.linspace(0, len(matches) - 1, RATE_MATCHES).astype(int))
+    half, least = max(1, round(SLOW * pair.fps)), max(1, round(MIN_FRAMES * pair.fps))
+
+    def rise(p: CommonClock, k: np.ndarray) -> float:
+        score = velocity_score(p, k, half, least)
+        finite = score[np.isfinite(score)]
+        return float(finite.max() - np.median(finite)) if len(finite) else 0.0
+
+    declared = CommonClock(pair.a[some], pair.b[some], pair.fps, pair.origin)
+    curves = TrackSplines(b.times, b.take(matches.pairs[some, 1]).positions() / scale)
+    rises = {}
+    for rate in COMMON_RATES:
+        n = int(np.floor((b.times[-1] - b.times[0]) * rate * pair.fps + 1e-6)) + 1
+        t = b.times[0] + np.arange(n) / (rate * pair.fps)
+        other = CommonClock(declared.a, curves.sample(t), pair.fps, float(a.times[0] - rate * b.times[0]))
+        k = other.lags(max(1, round(MIN_OVERLAP * pair.fps)), None)
+        rises[rate] = rise(other, k) if len(k) else 0.0
+    best = max(rises, key=rises.__getitem__)
+    now = rise(declared, lags)
+    return best, rises[best] / now if now > 0 else 0.0
+
+
 def local_peaks(lags: Int[np.ndarray, " K"], score: Float[np.ndarray, " K"], apart: int, n: int) -> list[int]:
     """Indices of the ``n`` highest local maxima at least ``apart`` lags from a higher one; the smallest |lag| on ties."""
     padded = np.pad(score, 1, constant_values=-np.inf)
@@ -241,7 +279,7 @@ def unanswered(pair: CommonClock, matches: Matches, cost: np.ndarray | None = No
     return Alignment(float("nan"), cost=cost, fps=pair.fps, status=gravest(flags), flags=flags, stats=stats)
 
 
-def normalised(pair: CommonClock) -> CommonClock:
-    """The same in units of a power of two near its size: squares neither overflow nor vanish."""
+def normalised(pair: CommonClock) -> tuple[CommonClock, float]:
+    """The same in units of a power of two near its size, and that unit: squares neither overflow nor vanish."""
     scale = max(binary_scale(pair.a), binary_scale(pair.b))
-    return CommonClock(pair.a / scale, pair.b / scale, pair.fps, pair.origin)
+    return CommonClock(pair.a / scale, pair.b / scale, pair.fps, pair.origin), scale

@@ -174,10 +174,12 @@ def _first_guess(n: int, answers: list[Answer], anchor: int, rates: np.ndarray, 
         inside = [edges[k] for k in own]
         members = int((component == root).sum())
         residual = np.array([x[e.b] - x[e.a] - e.offset for e in inside])
-        settled = agreeing(inside, Solution(x, x, residual), ASTRAY) & [e.trusted for e in inside]
+        settled = agreeing(inside, Solution(x, x, residual), ASTRAY) & np.array([e.trusted for e in inside], bool)
         if len(inside) < members or settled.all():
             continue
-        weight = [answers[k].refined.stats.get("evidence", 1.0) * answers[k].refined.stats.get("margin", 1.0) for k in own]
+        weight = [
+            answers[k].refined.stats.get("evidence", 1.0) * answers[k].refined.stats.get("margin", 1.0) for k in own
+        ]
         fps = max(answers[k].refined.fps for k in own)
         y = np.where(component == root, x, 0.0)
         star = y.copy()
@@ -264,8 +266,7 @@ def _judge(
     alone = np.bincount(component, minlength=n)[component] == 1
     x[alone & (np.arange(n) != reference)] = sigma[alone & (np.arange(n) != reference)] = np.nan
     flags = tuple(
-        _flags(v, answers, links, agrees, bool(trusted[v]), component[v] == reference, v == reference)
-        for v in range(n)
+        _flags(v, answers, links, agrees, bool(trusted[v]), component[v] == reference, v == reference) for v in range(n)
     )
     used = {a.pair: (float(r), e.sigma) for a, e, r in zip(links, edges, residual, strict=True)}
     for a in answers:

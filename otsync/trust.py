@@ -23,6 +23,7 @@ class Trust:
         moved: MOVED when the sub-frame fit ends further from the scan's peak than this, s.
         spread: SPREAD when fits with other detrending windows differ by more than this, s.
         correlation: POOR_FIT below this pooled correlation of the matched velocities at the answer.
+        rate_gain: RATE_MISMATCH when another common ratio of frame rates raises the score's peak by this factor.
         rate_sigmas: a fitted rate counts when it differs from the declared one by more than this many sigmas.
     """
 
@@ -37,3 +38,4 @@ class Trust:
     spread: float = 0.5 / 30
     correlation: float = 0.45
     rate_sigmas: float = 4.0
+    rate_gain: float = 1.3

@@ -23,7 +23,7 @@ ALLOWED = {
     "match": {"types", "costs"},
     "trust": set(),
     "graph": set(),
-    "scan": {"types", "costs", "clock", "kernels", "trust"},
+    "scan": {"types", "costs", "clock", "splines", "kernels", "trust"},
     "align": {"types", "costs", "clock", "kernels", "scan"},
     "fit": {"splines", "kernels"},
     "refine": {"types", "costs", "clock", "splines", "fit", "trust"},

@@ -43,9 +43,10 @@ class Similarity:
     t: Float[np.ndarray, " 3"]
 
     def __call__(self, xyz: Float[np.ndarray, "*B 3"]) -> Float[np.ndarray, "*B 3"]:
-        return (xyz @ (self.scale * self.R.T).astype(xyz.dtype) + self.t.astype(xyz.dtype)).astype(
-            xyz.dtype, copy=False
-        )
+        # one long product: numpy's stacked ones are slow for small matrices
+        moved = xyz.reshape(-1, 3) @ (self.scale * self.R.T).astype(xyz.dtype)
+        moved += self.t.astype(xyz.dtype)
+        return moved.reshape(xyz.shape)
 
     def inverse(self) -> Similarity:
         return Similarity(1 / self.scale, self.R.T, -self.R.T @ self.t / self.scale)

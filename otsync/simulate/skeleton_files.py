@@ -168,10 +168,11 @@ def _bvh_hierarchy(words: list[str], path: Path) -> tuple[list[str], list[int], 
             raise ValueError(f"{path}: hierarchy: did not expect {word[:40]!r}.")
     if not names or open_joints:
         raise ValueError(f"{path}: hierarchy: expected one ROOT with matching braces.")
-    for j in range(1, len(names)):
-        # a bone leads to the first child
-        if not tips[parents[j]].any():
-            tips[parents[j]] = offsets[j]
+    for j in range(len(names)):
+        # a bone leads to the next joint: of several to the most central one
+        ahead = [offsets[k] for k in range(len(names)) if parents[k] == j and offsets[k].any()]
+        if ahead and not tips[j].any():
+            tips[j] = min(ahead, key=lambda x: abs(x[0]) / np.linalg.norm(x))
     return names, parents, offsets, tips, channels
 
 

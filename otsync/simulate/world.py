@@ -91,7 +91,7 @@ def simulate(
         frames: of every video, or one entry a video: a count, or the timestamps (T,) in seconds of a video whose frames
             are not evenly spaced.
         fps: frames per second of every video, or one a video.
-        tracks: how many a video, or one a video; None: 1.4 times the preset's matches.
+        tracks: how many a video, or one a video; None: what the preset's matches take (1.6 of them, 2.4 for teams).
         offsets: seconds, one a video. None: drawn uniformly, up to ``max_offset`` frames of the reference, all after or
             all before the reference, so that no pair is further apart.
         max_offset: frames of the reference.
@@ -112,7 +112,8 @@ def simulate(
     _check(videos, max_offset, seed)
     scene = _scene(motion, seed)
     clocks = _clocks(videos, frames, fps)
-    counts = _per_video(level.tracks if tracks is None else tracks, videos, "tracks", int)
+    figures = len(np.unique(scene.parts.object[scene.parts.figure]))
+    counts = _per_video(level.tracks(figures) if tracks is None else tracks, videos, "tracks", int)
     given_rates = _per_video(1.0 if rates is None else rates, videos, "rates", float)
     if not all(np.isfinite(r) and r > 0 for r in given_rates):
         raise ValueError(f"rates: expected positive numbers; found {given_rates}. 1 is a clock like the world's.")
@@ -222,7 +223,8 @@ def _place(
 
 def as_tracks(obs: Observation, name: str, frame: str | None, uv: bool = True) -> TrackSet:
     # nothing is seen behind the camera, nor on its lens
-    visible = obs.visible & (obs.camera.to_camera(obs.xyz)[..., 2] > 0.05)
+    forward, away = obs.camera.w2c[2, :3].astype(obs.xyz.dtype), obs.camera.w2c[2, 3]
+    visible = obs.visible & (obs.xyz.reshape(-1, 3) @ forward + away > 0.05).reshape(obs.visible.shape)
     xyz = np.where(visible[..., None], obs.xyz, obs.xyz.dtype.type(np.nan))
     features = obs.features
     if features is not None:
@@ -283,8 +285,13 @@ def _check(videos: int, max_offset: float, seed: int) -> None:
         raise ValueError(f"seed: expected a number >= 0; found {seed}.")
 
 
+def _is_one(value: Any) -> bool:
+    """One value for all, rather than a sequence."""
+    return not hasattr(value, "__len__")
+
+
 def _per_video(value: Any, videos: int, name: str, kind: type) -> list[Any]:
-    values = [value] * videos if np.ndim(value) == 0 else list(value)
+    values = [value] * videos if _is_one(value) else list(value)
     if len(values) != videos:
         raise ValueError(f"{name}: expected one for all or one for each of {videos} videos; found {len(values)}.")
     if kind is int and not all(float(x) == int(x) and int(x) >= 1 for x in values):
@@ -297,12 +304,12 @@ def _clocks(videos: int, frames: Any, fps: Any) -> list[tuple[np.ndarray, float,
     speeds = _per_video(fps, videos, "fps", float)
     if not all(np.isfinite(f) and f > 0 for f in speeds):
         raise ValueError(f"fps: expected frames per second > 0; found {speeds}.")
-    entries = [frames] * videos if np.ndim(frames) == 0 else list(frames)
+    entries = [frames] * videos if _is_one(frames) else list(frames)
     if len(entries) != videos:
         raise ValueError(f"frames: expected a number or one entry for each of {videos} videos; found {len(entries)}.")
     clocks = []
     for entry, speed in zip(entries, speeds, strict=True):
-        if np.ndim(entry) == 0:
+        if _is_one(entry):
             if float(entry) != int(entry) or int(entry) < 1:
                 raise ValueError(f"frames: expected whole numbers >= 1, or timestamps in seconds; found {entry}.")
             clocks.append((np.arange(int(entry)) / speed, speed, True))

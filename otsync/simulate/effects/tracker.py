@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from ..observation import Observation, Surface
 from .noise import along_ray, dtype_of, smooth_noise
@@ -70,12 +71,34 @@ class Smoothing:
         return replace(obs, xyz=np.where(obs.visible[..., None], xyz, obs.xyz))
 
 
+def lost_spans(
+    times: Float[np.ndarray, " T"], n: int, share: float, lengths: tuple[float, float], rng: np.random.Generator
+) -> Bool[np.ndarray, "n T"]:
+    """Where ``n`` tracks are lost: a ``share`` of all samples, in runs of random length (seconds, from, to).
+
+    Runs and the spans between them follow each other as a stationary renewal process, so the share holds in the mean,
+    also at the ends of the clip, where runs are cut.
+    """
+    hidden = sum(lengths) / 2
+    shown = hidden * (1 - share) / share
+    cycle = shown + hidden
+    cycles = (times[-1] - times[0]) / cycle + 4
+    start = times[0] - rng.uniform(3, 4, (n, 1)) * cycle
+    count = int(np.ceil(cycles + 4 * np.sqrt(cycles)))
+    runs = rng.uniform(*lengths, (n, count))
+    ends = start + np.cumsum(rng.exponential(shown, (n, count)) + runs, 1)
+    change = np.zeros((n, len(times) + 1))
+    rows = np.repeat(np.arange(n), count)
+    np.add.at(change, (rows, np.searchsorted(times, ends - runs).ravel()), 1)
+    np.add.at(change, (rows, np.searchsorted(times, ends).ravel()), -1)
+    return np.cumsum(change[:, :-1], 1) > 0
+
+
 @dataclass(frozen=True)
 class Gaps:
     """A ``share`` of all samples is not observed, in runs of ``shortest`` to ``longest`` seconds.
 
-    Runs and the spans between them follow each other as a stationary renewal process, so the share holds in the mean,
-    also at the ends of the clip. A track that would be hidden throughout is left whole: it would not be a track.
+    A track that would be hidden throughout is left whole: it would not be a track.
     """
 
     share: float = 0.2
@@ -83,47 +106,35 @@ class Gaps:
     longest: float = 45 / 30
 
     def __call__(self, obs: Observation, rng: np.random.Generator) -> Observation:
-        if self.share <= 0 or len(obs.times) < 2:
+        if self.share <= 0:
             return obs
-        n = len(obs.xyz)
-        hidden = (self.shortest + self.longest) / 2
-        shown = hidden * (1 - self.share) / self.share
-        cycle = shown + hidden
-        start, end = obs.times[0] - rng.uniform(3, 4, (n, 1)) * cycle, obs.times[-1]
-        count = int(np.ceil((end - obs.times[0]) / cycle + 4 + 4 * np.sqrt((end - obs.times[0]) / cycle + 4)))
-        spans = rng.exponential(shown, (n, count))
-        runs = rng.uniform(self.shortest, self.longest, (n, count))
-        ends = start + np.cumsum(spans + runs, 1)
-        change = np.zeros((n, len(obs.times) + 1))
-        rows = np.repeat(np.arange(n), count)
-        np.add.at(change, (rows, np.searchsorted(obs.times, ends - runs).ravel()), 1)
-        np.add.at(change, (rows, np.searchsorted(obs.times, ends).ravel()), -1)
-        seen = np.cumsum(change[:, :-1], 1) == 0
+        seen = ~lost_spans(obs.times, len(obs.xyz), self.share, (self.shortest, self.longest), rng)
         seen[~(seen & obs.visible).any(1)] = True
         return replace(obs, visible=obs.visible & seen)
 
 
 @dataclass(frozen=True)
 class Hallucination:
-    """A ``share`` of the spans that are missing so far is reported as seen: interpolated linearly, held at the ends."""
+    """A ``share`` of all samples is lost in runs as by :class:`Gaps`, but reported as seen.
+
+    There the tracker goes straight from the last to the next true sample, and stands still at the ends of the clip.
+    """
 
     share: float = 0.3
+    shortest: float = 8 / 30
+    longest: float = 45 / 30
 
     def __call__(self, obs: Observation, rng: np.random.Generator) -> Observation:
-        edge = np.diff(np.pad(obs.visible, ((0, 0), (1, 1)), constant_values=True).astype(np.int8), axis=1)
-        rows, first = np.nonzero(edge == -1)
-        last = np.nonzero(edge == 1)[1]  # one past the span
-        chosen = np.flatnonzero(rng.random(len(rows)) < self.share)
-        xyz, visible = obs.xyz.copy(), obs.visible.copy()
-        for i in chosen:
-            n, a, b = rows[i], first[i], last[i]
-            if a == 0 and b == len(obs.times):
-                continue
-            before, after = max(a - 1, 0) if a else b, min(b, len(obs.times) - 1) if b < len(obs.times) else a - 1
-            s = np.clip((obs.times[a:b] - obs.times[before]) / max(obs.times[after] - obs.times[before], 1e-9), 0, 1)
-            xyz[n, a:b] = obs.xyz[n, before] + s[:, None] * (obs.xyz[n, after] - obs.xyz[n, before])
-            visible[n, a:b] = True
-        return replace(obs, xyz=xyz, visible=visible)
+        if self.share <= 0:
+            return obs
+        lost = lost_spans(obs.times, len(obs.xyz), self.share, (self.shortest, self.longest), rng)
+        known = obs.visible & ~lost
+        lost[~known.any(1)] = False
+        xyz = obs.xyz.copy()
+        for i in np.flatnonzero(lost.any(1)):
+            for axis in range(3):
+                xyz[i, lost[i], axis] = np.interp(obs.times[lost[i]], obs.times[known[i]], obs.xyz[i, known[i], axis])
+        return replace(obs, xyz=xyz, visible=obs.visible | lost)
 
 
 @dataclass(frozen=True)

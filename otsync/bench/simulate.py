@@ -1,0 +1,39 @@
+"""What effects cost: an effect that is not in the tuple costs nothing, and each one only its own time."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from statistics import median
+from typing import Any
+
+from ..simulate import PRESETS, simulate
+
+
+def effect_costs(motion: str = "juggle", tracks: int = 140, repeats: int = 15) -> list[dict[str, Any]]:
+    """Milliseconds of two videos without effects, with each effect of the hardest preset alone, and with all.
+
+    The first row is a world whose preset has no effects, the second the same asked of the hardest preset by
+    ``effects=()``: their ratio is the price of an absent effect, 1 but for noise. Runs are interleaved, so that a busy
+    machine slows all rows alike; medians over ``repeats``.
+    """
+    brutal = PRESETS["brutal"]
+    bare = replace(brutal, effects=())
+
+    def world(preset: Any, effects: Any) -> Callable[[int], Any]:
+        return lambda seed: simulate(motion, preset=preset, effects=effects, tracks=tracks, seed=seed)
+
+    cases = {"none": world(bare, None), "absent": world(brutal, ())}
+    cases |= {type(e).__name__: world(brutal, (e,)) for e in brutal.effects}
+    cases["all"] = world(brutal, None)
+    taken: dict[str, list[float]] = {name: [] for name in cases}
+    for run in cases.values():
+        run(0)
+    for seed in range(repeats):
+        for name, run in cases.items():
+            start = time.perf_counter()
+            run(seed)
+            taken[name].append(1e3 * (time.perf_counter() - start))
+    base = median(taken["none"])
+    return [{"effects": n, "ms": median(ts), "times none": median(ts) / base} for n, ts in taken.items()]
