@@ -15,6 +15,7 @@ import tyro
 
 from . import __version__
 from .align import DTW, ConstantShift
+from .commands_recordings import Check, Init, RecordingOptions, sync_recording
 from .match import (
     EntropicFGW,
     FusedGromovWasserstein,
@@ -134,23 +135,33 @@ class Match:
 
 @dataclass
 class Sync:
-    """Synchronise videos from their track sets.
+    """Synchronise a recording (scene.json or its folder), or videos from their track sets.
 
-    Example: otsync sync world/*.npz --out result matcher:optimal-transport --matcher.reg 0.05 aligner:dtw
+    Examples:
+        otsync sync recording/ --out result
+        otsync sync world/*.npz --out result matcher:optimal-transport --matcher.reg 0.05 aligner:dtw
     """
 
     tracks: tyro.conf.Positional[tuple[Path, ...]]
-    """Track sets (.npz written by otsync), one per video, in one world frame."""
+    """A scene.json or a folder with one (also in Panoptic layout); or track sets (.npz written by otsync), one per
+    video, in one world frame."""
     out: Path = Path("sync")
-    """Folder for offsets.json and report.html."""
+    """Folder for offsets.json and report.html, and the stages of a recording, from which a killed run continues."""
     reference: str | None = None
     """Name of the reference video; default: the first."""
     truth: Path | None = None
     """truth.json of a simulated world: adds errors to the table."""
     matcher: Matcher = field(default_factory=FusedGromovWasserstein)
+    """For track sets; a recording's route brings its own."""
     aligner: Aligner = field(default_factory=DTW)
+    """For track sets; a recording's route brings its own."""
+    recording: RecordingOptions = field(default_factory=RecordingOptions)
 
     def run(self) -> int:
+        if len(self.tracks) == 1 and self.tracks[0].suffix != ".npz":
+            return sync_recording(
+                self.tracks[0], self.out, self.recording, reference=self.reference, truth=self.truth
+            )
         if len(self.tracks) < 2:
             raise ValueError(f"tracks: expected at least two .npz files; found {len(self.tracks)}.")
         tracks = [TrackSet.load(path) for path in self.tracks]
@@ -196,6 +207,8 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "demo": Demo,
     "simulate": Simulate,
     "match": Match,
+    "init": Init,
+    "check": Check,
     "sync": Sync,
     "bench": Bench,
 }

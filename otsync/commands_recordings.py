@@ -72,22 +72,26 @@ class Check:
         return 1 if errors else 0
 
 
-def sync_recording(
-    path: Path,
-    out: Path,
-    *,
-    route: Literal["auto", "tracks", "epipolar", "stereo"] = "auto",
-    reference: str | None = None,
-    cameras: tuple[str, ...] = (),
-    cache: Path | None = None,
-    truth: Path | None = None,
-    allow_outside: bool = False,
-    workers: int = 0,
-) -> int:
-    """``otsync sync SCENE``: offsets.json, run.json and report.html in ``out``; stages are kept in ``out``/stages.
+@dataclass(frozen=True)
+class RecordingOptions:
+    """How ``otsync sync`` treats a recording."""
 
-    Exit code 1 when an answer is flagged.
-    """
+    route: Literal["auto", "tracks", "epipolar", "stereo"] = "auto"
+    """tracks needs depth, stereo a static rig of five and more, epipolar nothing but calibration; auto decides."""
+    cameras: tuple[str, ...] = ()
+    """Names of the videos to use; default: all."""
+    cache: Path | None = None
+    """Folder where stages are kept; default: stages in --out."""
+    allow_outside: bool = False
+    """Let the scene name files outside its folder."""
+    workers: int = 0
+    """Threads; 0: one per core."""
+
+
+def sync_recording(
+    path: Path, out: Path, options: RecordingOptions, *, reference: str | None = None, truth: Path | None = None
+) -> int:
+    """``otsync sync SCENE``: offsets.json, run.json and report.html in ``out``. Exit code 1 when an answer is flagged."""
     from .cli import table, true_offsets
     from .files import write_json
     from .io import open_scene
@@ -95,9 +99,9 @@ def sync_recording(
     from .recordings import synchronize_scene
     from .report.frames import write_recording_report
 
-    scene = open_scene(path, allow_outside=allow_outside)
-    if cameras:
-        scene = scene.take(cameras)
+    scene = open_scene(path, allow_outside=options.allow_outside)
+    if options.cameras:
+        scene = scene.take(options.cameras)
     chosen = 0
     if reference is not None:
         if reference not in scene.names:
@@ -106,9 +110,9 @@ def sync_recording(
     known = None if truth is None else true_offsets(truth, scene.names, chosen)
     for note in scene.notes:
         print(f"note: {note}", file=sys.stderr)
-    with ThreadPoolExecutor(workers or os.cpu_count() or 1) as pool:
+    with ThreadPoolExecutor(options.workers or os.cpu_count() or 1) as pool:
         found = synchronize_scene(
-            scene, route=route, reference=chosen, cache=Cache(cache or out / "stages"), map=pool.map,
+            scene, route=options.route, reference=chosen, cache=Cache(options.cache or out / "stages"), map=pool.map,
             tell=lambda text: print(text, file=sys.stderr, flush=True),
         )  # fmt: skip
     print(table(found.offsets, known))
