@@ -128,9 +128,13 @@ def synchronize_scene(
         line = f"stereo found no depth for {', '.join(bare)}: the epipolar answer stands"
         tell(line)
         return Synchronized(first, tuple(flat), "epipolar", (*why, line), None, clock.seconds)
-    offsets = pairs_in_space(lifted, reference, stages, cache, map)
+    offsets = without_times(pairs_in_space(lifted, reference, stages, cache, map))
     clock.lap("synchronise")
-    return Synchronized(without_times(offsets), tuple(lifted), chosen, why, first, clock.seconds)
+    if _flagged(offsets) > _flagged(first):
+        line = "the lifted tracks leave more doubt than the pixels did: the epipolar answer stands"
+        tell(line)
+        return Synchronized(first, tuple(flat), "epipolar", (*why, line), None, clock.seconds)
+    return Synchronized(offsets, tuple(lifted), chosen, why, first, clock.seconds)
 
 
 def choose_route(scene: Scene, route: Route, stages: Stages) -> tuple[str, tuple[str, ...]]:
@@ -269,6 +273,10 @@ def without_times(offsets: Offsets) -> Offsets:
 
     alignments = {pair: replace(a, stats=clean(a.stats)) for pair, a in offsets.alignments.items()}
     return replace(offsets, alignments=alignments, stats=clean(offsets.stats))
+
+
+def _flagged(offsets: Offsets) -> int:
+    return sum(not s.ok for s in offsets.status)
 
 
 def _too_doubtful(first: Offsets, stages: Stages) -> str:
