@@ -61,12 +61,13 @@ class EpipolarScan:
         origin = float(a.times[0] - b.times[0])
         least = max(2, round(self.min_overlap * fps))
         lags = np.arange(-(xb.shape[1] - least), xa.shape[1] - least + 1)
+        lags = lags[np.minimum(xa.shape[1], xb.shape[1] + lags) - np.maximum(0, lags) >= least]
         if self.max_lag is not None:
             lags = lags[np.abs(origin + lags / fps) <= self.max_lag + 1e-9]
         if len(matches) == 0 or len(lags) == 0:
             return _nothing(fps, Status.FEW_MATCHES if len(matches) == 0 else Status.NO_OVERLAP)
         total = self.evidence(xa, xb, fundamentals(a.camera, b.camera), matches.pairs, lags, fps, unit_of(a, b))
-        if not np.isfinite(total).any():
+        if np.ptp(total) == 0:
             return _nothing(fps, Status.NO_OVERLAP)
         return self._answer(lags, total, origin, fps, len(matches))
 

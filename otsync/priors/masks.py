@@ -68,7 +68,7 @@ class FlowResidual:
 
     threshold: float = 1.0
     min_area: int = 300
-    step: int = 2
+    step: int = 1
     flow: DISFlow = DISFlow()
 
     def __call__(self, frames: WorkingFrames, camera: Camera) -> Bool[np.ndarray, "T h w"]:
