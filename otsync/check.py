@@ -73,7 +73,7 @@ def _pose(entry: dict[str, Any], name: str) -> Iterable[Finding]:
     """det(R) and orthonormality, before the strict constructor refuses them with fewer words."""
     camera = entry.get("camera")
     try:
-        w2c = np.asarray(camera["w2c"], float)  # type: ignore[index]
+        w2c: np.ndarray = np.asarray((camera or {})["w2c"], np.float64)
         if w2c.shape[-2:] != (4, 4) or w2c.ndim not in (2, 3) or not np.isfinite(w2c).all():
             raise ValueError(f"expected finite 4x4 matrices; found shape {w2c.shape}")
     except (TypeError, KeyError, ValueError) as error:
@@ -96,7 +96,10 @@ def _pose(entry: dict[str, Any], name: str) -> Iterable[Finding]:
         )  # fmt: skip
     if not np.allclose(w2c[..., 3, :], [0, 0, 0, 1], atol=1e-6):
         yield Finding(
-            "error", name, "the last row of camera.w2c is not 0 0 0 1.", "Perhaps the matrix is transposed: transpose it."
+            "error",
+            name,
+            "the last row of camera.w2c is not 0 0 0 1.",
+            "Perhaps the matrix is transposed: transpose it.",
         )
 
 

@@ -159,9 +159,7 @@ class Sync:
 
     def run(self) -> int:
         if len(self.tracks) == 1 and self.tracks[0].suffix != ".npz":
-            return sync_recording(
-                self.tracks[0], self.out, self.recording, reference=self.reference, truth=self.truth
-            )
+            return sync_recording(self.tracks[0], self.out, self.recording, reference=self.reference, truth=self.truth)
         if len(self.tracks) < 2:
             raise ValueError(f"tracks: expected at least two .npz files; found {len(self.tracks)}.")
         tracks = [TrackSet.load(path) for path in self.tracks]

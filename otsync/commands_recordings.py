@@ -118,7 +118,7 @@ def sync_recording(
     print(table(found.offsets, known))
     found.offsets.save(out / "offsets.json")
     write_json(out / "run.json", {"route": found.route, "why": list(found.why), "seconds": found.seconds})
-    write_recording_report(out / "report.html", scene, found, truth=known)
+    write_recording_report(out / "report.html", scene, found, truth=None if known is None else list(known))
     print(f"route {found.route}; wrote {out / 'offsets.json'}, {out / 'run.json'} and {out / 'report.html'}")
     for name, flags in zip(found.offsets.names, found.offsets.flags, strict=True):
         for flag in flags:

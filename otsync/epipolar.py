@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 
 from .align import MIN_OVERLAP, peak
 from .clock import SAME_FPS, is_uniform, nominal_fps
-from .geometry import fundamentals
+from .geometry import fundamentals, seen_pixels
 from .splines import TrackSplines
 from .types import Alignment, Matches, Status, TrackSet, in_order
 
@@ -56,6 +56,7 @@ class EpipolarScan:
         for name, tracks in (("a", a), ("b", b)):
             if tracks.uv is None or tracks.camera is None:
                 raise ValueError(f"{name}: expected pixels (uv) and a camera for the epipolar scan; one is missing.")
+        assert a.camera is not None and b.camera is not None
         fps = min(nominal_fps(a), nominal_fps(b))
         xa, xb = on_clock(a, fps), on_clock(b, fps)
         origin = float(a.times[0] - b.times[0])
@@ -89,7 +90,14 @@ class EpipolarScan:
         return total
 
     def scores(
-        self, xa: np.ndarray, xb: np.ndarray, F: np.ndarray, pairs: np.ndarray, lags: np.ndarray, fps: float, unit: float
+        self,
+        xa: np.ndarray,
+        xb: np.ndarray,
+        F: np.ndarray,
+        pairs: np.ndarray,
+        lags: np.ndarray,
+        fps: float,
+        unit: float,
     ) -> list[Float[np.ndarray, "M K"]]:
         """Log-likelihood of every candidate and lag against the typical one, by motion and by position; -inf unseen."""
         from .kernels_tracks import epipolar_evidence
@@ -179,7 +187,7 @@ def separate_peaks(curve: Float[np.ndarray, " K"], apart: int) -> Int[np.ndarray
 
 def on_clock(tracks: TrackSet, fps: float) -> Float[np.ndarray, "N T 2"]:
     """Pixels on an even clock of ``fps``; nan where unseen. Splines answer for other clocks and never bridge gaps."""
-    uv = np.where(tracks.seen[..., None], tracks.uv, np.nan).astype(float)
+    uv = seen_pixels(tracks)
     if is_uniform(tracks) and abs(nominal_fps(tracks) / fps - 1) <= SAME_FPS:
         return uv
     times = tracks.times

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from .clock import nominal_fps
 from .epipolar import EpipolarScan, on_clock, unit_of
-from .geometry import fundamentals
+from .geometry import fundamentals, seen_pixels
 from .splines import TrackSplines
 from .trust import Trust
 from .types import Alignment, Matches, Status, TrackSet, gravest, in_order
@@ -36,7 +36,7 @@ class EpipolarRefine:
     windows: tuple[float, ...] = (20 / 30, 10 / 30, 40 / 30)
     reach: float = 2 / 30
     iterations: int = 12
-    scan: EpipolarScan = EpipolarScan()
+    scan: EpipolarScan = field(default_factory=EpipolarScan)
     trust: Trust = field(default_factory=lambda: Trust(evidence=1.0))
 
     needs_xyz = False
@@ -53,16 +53,16 @@ class EpipolarRefine:
         others = [problem.solve(offset, w, 4, self.reach)[0] for w in self.windows[1:] if np.isfinite(offset)]
         spread = max((abs(o - offset) for o in others if np.isfinite(o)), default=0.0)
         sigma = float(np.hypot(sigma, spread))
-        flags = list(alignment.flags)
+        raised = list(alignment.flags)
         if not np.isfinite(offset) or abs(offset - alignment.offset) > self.reach:
             offset, sigma = alignment.offset, 0.5 / fps
-            flags.append(Status.MOVED)
+            raised.append(Status.MOVED)
         stats = alignment.stats | {
             "moved": abs(offset - alignment.offset),
             "spread": spread,
             "fitted_matches": float(len(problem.weight)),
         }
-        ordered = in_order(flags)
+        ordered = in_order(raised)
         return replace(
             alignment, offset=float(offset), sigma=float(np.hypot(sigma, LEAST_SIGMA)), flags=ordered,
             status=gravest(ordered), stats=stats,
@@ -96,7 +96,7 @@ class _Problem:
             return None
         i, j = matches.pairs[best].T
         used, where = np.unique(j, return_inverse=True)
-        uv = np.where(b.seen[used][..., None], b.uv[used], np.nan).astype(float)  # type: ignore[index]
+        uv = seen_pixels(b)[used]
         flat = np.concatenate([uv, np.where(np.isfinite(uv[..., :1]), 0.0, np.nan)], 2)
         splines = TrackSplines(b.times, flat).take(where)
         times = a.times[0] + np.arange(xa.shape[1]) / fps
@@ -146,9 +146,7 @@ class _Problem:
         return offset, sigma
 
 
-def detrended(
-    x: Float[np.ndarray, "M T"], known: Bool[np.ndarray, "M T"], half: int
-) -> Float[np.ndarray, "M T"]:
+def detrended(x: Float[np.ndarray, "M T"], known: Bool[np.ndarray, "M T"], half: int) -> Float[np.ndarray, "M T"]:
     """``x`` minus its masked moving mean over ±``half`` frames; 0 where not known."""
     filled = np.where(known, x, 0.0)
     T = x.shape[1]

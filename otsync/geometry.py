@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from .types import Camera
+from .types import Camera, TrackSet
 
 
 def fundamental(a: Camera, b: Camera, frame_a: int = 0, frame_b: int = 0) -> Float[np.ndarray, "3 3"]:
@@ -52,6 +52,13 @@ def undistort(camera: Camera, uv: Float[np.ndarray, "*N 2"]) -> Float[np.ndarray
         points = flat[ok].astype(np.float64).reshape(-1, 1, 2)
         out[ok] = cv2.undistortPoints(points, camera.K, camera.distortion, P=camera.K).reshape(-1, 2)
     return out.reshape(uv.shape)
+
+
+def seen_pixels(tracks: TrackSet) -> Float[np.ndarray, "N T 2"]:
+    """``uv`` in float64 with nan where not visible. ValueError when the set holds none."""
+    if tracks.uv is None:
+        raise ValueError("uv: expected pixels; this track set holds positions only.")
+    return np.where(tracks.seen[..., None], tracks.uv, np.nan).astype(float)
 
 
 def view_angle(a: Camera, b: Camera, target: Float[np.ndarray, " 3"]) -> float:

@@ -40,7 +40,7 @@ class KeptPairs:
 def digest(tracks: TrackSet) -> str:
     """A hash of everything in a track set that an answer can depend on."""
     camera = tracks.camera
-    parts = [tracks.xyz, tracks.uv, tracks.seen, tracks.features, tracks.sigma, tracks.times, tracks.frame]
+    parts: list[Any] = [tracks.xyz, tracks.uv, tracks.seen, tracks.features, tracks.sigma, tracks.times, tracks.frame]
     if camera is not None:
         parts += [camera.K, camera.w2c, camera.distortion, camera.width, camera.height]
     return digest_of(*parts)

@@ -143,7 +143,9 @@ def synchronous_distances(A, B, at, least):
                 u = at[t]
                 if u < 0 or np.isnan(A[i, t, 0]) or np.isnan(B[j, u, 0]):
                     continue
-                total += np.sqrt((A[i, t, 0] - B[j, u, 0]) ** 2 + (A[i, t, 1] - B[j, u, 1]) ** 2 + (A[i, t, 2] - B[j, u, 2]) ** 2)
+                total += np.sqrt(
+                    (A[i, t, 0] - B[j, u, 0]) ** 2 + (A[i, t, 1] - B[j, u, 1]) ** 2 + (A[i, t, 2] - B[j, u, 2]) ** 2
+                )
                 n += 1
             if n >= least:
                 out[i, j] = total / n

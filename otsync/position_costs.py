@@ -81,7 +81,9 @@ class SynchronousDistance:
         ta, tb = a.times, b.times + self.offset
         step = float(np.median(np.diff(ta))) if len(ta) > 1 else 1.0
         at = np.clip(np.round(np.interp(ta, tb, np.arange(len(tb)))).astype(int), 0, len(tb) - 1)
-        at = np.where(np.abs(tb[at] - ta) <= 0.51 * max(step, float(np.median(np.diff(tb))) if len(tb) > 1 else 0), at, -1)
+        at = np.where(
+            np.abs(tb[at] - ta) <= 0.51 * max(step, float(np.median(np.diff(tb))) if len(tb) > 1 else 0), at, -1
+        )
         least = max(2, round(self.min_overlap / step))
         distance = synchronous_distances(xa, xb, at, least)
         unit = self.scale * scene_scale(xa, xb)

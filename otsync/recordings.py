@@ -20,6 +20,7 @@ from .align import Aligner
 from .costs import Cosine
 from .epipolar import EpipolarScan
 from .epipolar_fit import EpipolarRefine
+from .geometry import seen_pixels
 from .graph import Graph
 from .io.scene import Scene
 from .keep import KeptPairs
@@ -47,17 +48,19 @@ COLOUR = 3.0
 class Stages:
     """The objects in the slots of every stage."""
 
-    tracking: Tracking = Tracking()
-    selection: Selection = Selection()
-    stereo: HullStereo = HullStereo()
-    lift: Lift = Lift()
-    graph: Graph = Graph()
-    epipolar_matcher: Matcher = Candidates(20, None)
-    epipolar_aligner: Aligner = EpipolarScan()
-    epipolar_refiner: Refiner = EpipolarRefine()
-    matcher: Matcher = Candidates(2, 200, (Cosine(weight=COLOUR, center=False), CurveDistance()))
-    aligner: Aligner = LikelihoodScan()
-    refiner: Refiner = SplineRefine()
+    tracking: Tracking = field(default_factory=Tracking)
+    selection: Selection = field(default_factory=Selection)
+    stereo: HullStereo = field(default_factory=HullStereo)
+    lift: Lift = field(default_factory=Lift)
+    graph: Graph = field(default_factory=Graph)
+    epipolar_matcher: Matcher = field(default_factory=lambda: Candidates(20, None))
+    epipolar_aligner: Aligner = field(default_factory=EpipolarScan)
+    epipolar_refiner: Refiner = field(default_factory=EpipolarRefine)
+    matcher: Matcher = field(
+        default_factory=lambda: Candidates(2, 200, (Cosine(weight=COLOUR, center=False), CurveDistance()))
+    )
+    aligner: Aligner = field(default_factory=LikelihoodScan)
+    refiner: Refiner = field(default_factory=SplineRefine)
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,8 +236,7 @@ def lift_given(
         key = (stages.tracking.key(video, None), _digest(video.depth), digest_of(uv))
         depth = cache.arrays("depth", key, lambda: {"z": depth_at(video.depth or [], flat, uv)})["z"]
         lifted = stages.lift(flat, depth)
-        seen = np.where(lifted.seen[..., None], lifted.uv, np.nan)
-        chosen = lifted.take(stages.selection(seen, video.camera.width, video.fps or 30.0))
+        chosen = lifted.take(stages.selection(seen_pixels(lifted), video.camera.width, video.fps or 30.0))
         if len(chosen) == 0:
             raise ValueError(
                 f"video {video.name}: expected depth where things move; no track could be lifted. Check the depth "
@@ -250,19 +252,13 @@ def stereo_depth(
 ) -> list[np.ndarray]:
     """Depth of every track sample by hull and stereo over the videos whose clocks ``offsets`` knows."""
     content = [stages.tracking.key(v, m) for v, m in zip(scene.videos, scene.masks, strict=True)]
-    masks = list(
-        map(
-            lambda item: stages.tracking.masks(*item, cache),
-            list(zip(scene.videos, scene.masks, strict=True)),
-        )
-    )
-    # whole frames of the reference: the rig shows what its cameras took, no sooner and no later
+    given = list(zip(scene.videos, scene.masks, strict=True))
+    masks = list(map(lambda item: stages.tracking.masks(item[0], item[1], cache), given))
+    # rounding keeps the cache's key the same over the last bits of a solution
     rig = Rig.at(scene.videos, masks, np.round(offsets.seconds, 6), stages.tracking.width)
-    uv = [np.where(t.seen[..., None], t.uv, np.nan) for t in tracks]
+    uv = [seen_pixels(t) for t in tracks]
     poses = [(v.camera.K.tobytes(), v.camera.w2c.tobytes()) for v in scene.videos]
     return stages.stereo(rig, uv, cache, (*content, digest_of(*poses)), map)
-
-
 
 
 def without_times(offsets: Offsets) -> Offsets:

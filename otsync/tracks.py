@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -78,8 +78,8 @@ class Tracking:
     """
 
     masker: Masker | None = None
-    points: ChainedFlow = ChainedFlow()
-    features: Describer = LabHistogram()
+    points: ChainedFlow = field(default_factory=ChainedFlow)
+    features: Describer = field(default_factory=LabHistogram)
     width: int = WIDTH
 
     def __call__(
@@ -128,10 +128,7 @@ class Tracking:
     def key(self, video: Video, masks: Sequence[np.ndarray] | None) -> str:
         """What the pixels and poses of a video are, for the cache."""
         pixels = getattr(video.frames, "digest", None)
-        if pixels is None:
-            content = digest_of(*[np.asarray(f) for f in video.frames])
-        else:
-            content = pixels()
+        content = pixels() if pixels is not None else digest_of(*[np.asarray(f) for f in video.frames])
         mask_digest = getattr(masks, "digest", None)
         poses = video.camera.w2c if video.camera.w2c.ndim == 3 else None
         return digest_of(content, mask_digest() if mask_digest else masks is None, video.camera.K, poses)

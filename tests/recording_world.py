@@ -54,7 +54,7 @@ def render(camera: Camera, centres: np.ndarray, colours: np.ndarray, radius: flo
 
     def pixel(x: np.ndarray) -> tuple[int, int]:
         p = camera.K @ x / x[2]
-        return int(round((p[0] - 0.5) * 16)), int(round((p[1] - 0.5) * 16))
+        return round(float(p[0] - 0.5) * 16), round(float(p[1] - 0.5) * 16)
 
     for b in np.argsort(-(centres @ R.T + t)[:, 2]):
         local = R @ centres[b] + t

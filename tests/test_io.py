@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from pathlib import Path
 
@@ -139,10 +140,8 @@ values = st.recursive(
 def test_any_json_in_any_field_is_read_or_refused(folder, field, value):
     document = {"format": FORMAT, "version": VERSION, "videos": [{**entry("left"), field: value}, entry("right")]}
     (folder / "scene.json").write_text(json.dumps(document))
-    try:
+    with contextlib.suppress(ValueError, OSError):
         open_scene(folder)
-    except (ValueError, OSError):
-        pass
 
 
 @GUARD
@@ -211,8 +210,9 @@ def test_masks_of_ones_and_of_255s_mean_the_same(tmp_path):
 
 def write_video(path: Path, times: list[int], b_frames: int = 2) -> None:
     """A video whose frame k is of grey level 4k + 20, at ``times`` in 1/90000 s."""
-    import av
     from fractions import Fraction
+
+    import av
 
     with av.open(str(path), "w") as out:
         stream = out.add_stream("libx264", rate=30, options={"crf": "1", "bf": str(b_frames), "g": "12"})

@@ -93,9 +93,9 @@ def test_flow_behind_a_mask_ends_tracks(slide):
 def test_gaps_are_joined_where_both_velocities_lead():
     t = np.arange(40.0)
     line = np.stack([10 + 3 * t, 50 + 0 * t], 1)
-    other = line + [0, 30]
+    other = line + np.array([0, 30])
     uv = np.full((4, 40, 2), np.nan, np.float32)
-    uv[0, :18], uv[1, 22:], uv[2, :18], uv[3, 22:] = line[:18], line[22:], other[:18], line[22:] + [0, 100]
+    uv[0, :18], uv[1, 22:], uv[2, :18], uv[3, 22:] = line[:18], line[22:], other[:18], line[22:] + np.array([0, 100])
     joined = join_gaps(uv, 8, 4.0)
     assert len(joined) == 3
     assert np.isfinite(joined[0, :18]).all() and np.isfinite(joined[0, 22:]).all() and np.isnan(joined[0, 18:22]).all()
@@ -152,8 +152,10 @@ def test_bilinear_is_exact_on_planes():
 
 def test_selection_keeps_the_long_the_moving_and_the_separate():
     t = np.arange(60.0)
-    move = np.stack([2 * t, 0 * t], 1)
-    uv = np.stack([move + [10, 10], move + [12, 11], move + [10, 100], 0 * move + [200, 50], move + [10, 150]])
+    move, at = np.stack([2 * t, 0 * t], 1), np.array
+    uv = np.stack(
+        [move + at([10, 10]), move + at([12, 11]), move + at([10, 100]), 0 * move + at([200, 50]), move + at([10, 150])]
+    )
     uv[2, 50:] = np.nan
     uv[4, 15:] = np.nan
     assert Selection()(uv, 640, 30.0).tolist() == [0, 2]
@@ -260,7 +262,7 @@ def test_hull_and_stereo_find_the_balls():
             mask |= (x - p[0]) ** 2 + (y - p[1]) ** 2 < (camera.K[0, 0] * 0.3 / local[b][2]) ** 2
         nearest = int(np.argmin(local[:, 2]))
         for du in (-8, 0, 8):
-            point = (camera.K @ local[nearest] / local[nearest][2])[:2] + [du, 3]
+            point = (camera.K @ local[nearest] / local[nearest][2])[:2] + np.array([du, 3])
             ray = np.linalg.inv(camera.K) @ np.append(point, 1)
             # first root of |z ray - centre| = r
             a, bb, c = ray @ ray, -2 * ray @ local[nearest], local[nearest] @ local[nearest] - 0.09

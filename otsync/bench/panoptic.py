@@ -23,7 +23,7 @@ import numpy as np
 
 from ..align import DTW
 from ..files import atomic_write
-from ..geometry import common_target, view_angle
+from ..geometry import common_target, seen_pixels, view_angle
 from ..graph import Graph
 from ..io import open_scene
 from ..io.scene import Scene
@@ -119,9 +119,7 @@ class Material:
         raw = list(map(track, range(len(scene.videos))))
         tell(f"tracks of {len(raw)} cameras: {time.perf_counter() - started:.0f} s")
         wide = replace(stages.selection, count=3 * stages.selection.count, min_life=16, apart=6.0)
-        chosen = [
-            wide(r["uv"], v.camera.width, v.fps or 30.0) for r, v in zip(raw, scene.videos, strict=True)
-        ]
+        chosen = [wide(r["uv"], v.camera.width, v.fps or 30.0) for r, v in zip(raw, scene.videos, strict=True)]
         rich = [r["uv"][c] for r, c in zip(raw, chosen, strict=True)]
         masks = list(
             map(lambda i: stages.tracking.masks(scene.videos[i], scene.masks[i], cache), range(len(scene.videos)))
@@ -132,7 +130,7 @@ class Material:
             pixel_tracks(uv, None, v.camera, fps=v.fps, timestamps=v.timestamps)
             for uv, v in zip(rich, scene.videos, strict=True)
         ]
-        straight = [np.where(t.seen[..., None], t.uv, np.nan) for t in flat]
+        straight = [seen_pixels(t) for t in flat]
         depth = stages.stereo(rig, straight, cache, tuple(content), map)
         tell(f"depth of {len(raw)} cameras: {time.perf_counter() - started:.0f} s")
         return cls(
@@ -148,11 +146,12 @@ class Material:
         uv = source[:, frames]
         if not lifted:
             keep = self.stages.selection(uv, video.camera.width, fps)
-            return pixel_tracks(uv[keep], features[keep], video.camera, fps=fps, name=video.name, frame=self.scene.frame)
+            return pixel_tracks(
+                uv[keep], features[keep], video.camera, fps=fps, name=video.name, frame=self.scene.frame
+            )
         tracks = pixel_tracks(uv, features, video.camera, fps=fps, name=video.name, frame=self.scene.frame)
         tracks = self.stages.lift(tracks, self.depth[v][:, frames])
-        seen = np.where(tracks.seen[..., None], tracks.uv, np.nan)
-        return tracks.take(self.stages.selection(seen, video.camera.width, fps))
+        return tracks.take(self.stages.selection(seen_pixels(tracks), video.camera.width, fps))
 
     @property
     def frames(self) -> int:
@@ -171,7 +170,11 @@ def measure(
     rng.shuffle(pairs)
     jobs = []
     for a, b in pairs[: protocol.pairs]:
-        for kind, (low, high), step in (*((f"band {k}", band, 1) for k, band in enumerate(BANDS)), ("short", SHORT, 1), ("half", (1, 30), 2)):
+        for kind, (low, high), step in (
+            *((f"band {k}", band, 1) for k, band in enumerate(BANDS)),
+            ("short", SHORT, 1),
+            ("half", (1, 30), 2),
+        ):
             shift = int(rng.integers(low, high + 1))
             if step == 2 and shift % 2 == 0:
                 shift += 1
@@ -205,7 +208,12 @@ def measure(
 def _solver(route: str, stages: Stages) -> Callable[[list[TrackSet]], Offsets]:
     if route == "paper":
         return lambda tracks: synchronize(
-            tracks, matcher=FusedGromovWasserstein(), aligner=DTW(), refiner=Unrefined(), graph=Graph(extra=0), rematch=0
+            tracks,
+            matcher=FusedGromovWasserstein(),
+            aligner=DTW(),
+            refiner=Unrefined(),
+            graph=Graph(extra=0),
+            rematch=0,
         )
     if route == "default":
         return lambda tracks: pairs_in_space(tracks, 0, stages, Cache())

@@ -54,18 +54,18 @@ class FrameRange(LazyFrames):
     """Some frames of a sequence, in a new order or number."""
 
     def __init__(self, base: LazyFrames, index: Sequence[int]):
-        self.base, self.index = base, index
+        self.base, self.picks = base, index
 
     def __len__(self) -> int:
-        return len(self.index)
+        return len(self.picks)
 
     def frame(self, k: int) -> np.ndarray:
-        return self.base[self.index[k]]
+        return self.base[self.picks[k]]
 
     def digest(self) -> str:
         if isinstance(self.base, ImageFrames):
-            return ImageFrames([self.base.paths[i] for i in self.index], self.base.read, self.base.tag).digest()
-        return hashlib.blake2b(f"{self.base.digest()} {list(self.index)}".encode(), digest_size=16).hexdigest()
+            return ImageFrames([self.base.paths[i] for i in self.picks], self.base.read, self.base.tag).digest()
+        return hashlib.blake2b(f"{self.base.digest()} {list(self.picks)}".encode(), digest_size=16).hexdigest()
 
 
 class ImageFrames(LazyFrames):
@@ -210,4 +210,4 @@ class _Errors:
 def file_digest(path: Path) -> str:
     """A hash of one file's bytes."""
     with open(existing(path), "rb") as stream:
-        return hashlib.file_digest(stream, lambda: hashlib.blake2b(digest_size=16)).hexdigest()  # type: ignore[arg-type]
+        return hashlib.file_digest(stream, lambda: hashlib.blake2b(digest_size=16)).hexdigest()

@@ -64,9 +64,7 @@ class Scene:
                 f"cameras: expected some of {', '.join(self.names)}; found {', '.join(missing)}. Check the names."
             )
         index = [self.names.index(n) for n in names]
-        return replace(
-            self, videos=tuple(self.videos[i] for i in index), masks=tuple(self.masks[i] for i in index)
-        )
+        return replace(self, videos=tuple(self.videos[i] for i in index), masks=tuple(self.masks[i] for i in index))
 
 
 def open_scene(path: str | os.PathLike[str], *, allow_outside: bool = False) -> Scene:
@@ -110,7 +108,9 @@ def scene_from_document(document: dict[str, Any], root: Path, *, allow_outside: 
     if not isinstance(entries, list) or not 1 <= len(entries) <= MAX_VIDEOS:
         raise ValueError(f"scene.videos: expected a list of 1 to {MAX_VIDEOS} videos; found {_short(entries)}.")
     if document.get("missing"):
-        raise ValueError(f"scene.json: still missing: {_short(document['missing'])}. Fill it in, then delete 'missing'.")
+        raise ValueError(
+            f"scene.json: still missing: {_short(document['missing'])}. Fill it in, then delete 'missing'."
+        )
     builder = Paths(root, allow_outside)
     built = [_video(entry, n, builder) for n, entry in enumerate(entries)]
     names = [video.name for video, _ in built]

@@ -54,9 +54,7 @@ class LabHistogram:
                 total[at] += bilinear(window, (uv[at, k] + 0.5) * shrink - 0.5)
         return np.sqrt(total / np.maximum(total.sum(1, keepdims=True), 1e-12))
 
-    def _windows(
-        self, frames: WorkingFrames, mask: Bool[np.ndarray, "h w"], k: int
-    ) -> Float[np.ndarray, "h/4 w/4 D"]:
+    def _windows(self, frames: WorkingFrames, mask: Bool[np.ndarray, "h w"], k: int) -> Float[np.ndarray, "h/4 w/4 D"]:
         """Windowed histograms at every fourth pixel; a blur at that resolution costs a sixteenth."""
         import cv2
 

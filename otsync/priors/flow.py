@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -24,6 +24,9 @@ class DISFlow:
         """Pixels that each point moves by, from ``before`` to ``after`` and from ``after`` back."""
         import cv2
 
+        # the solver divides the image among OpenCV's threads and its answer depends on how many there are; videos run
+        # in parallel instead
+        cv2.setNumThreads(1)
         presets = {"fast": cv2.DISOPTICAL_FLOW_PRESET_FAST, "medium": cv2.DISOPTICAL_FLOW_PRESET_MEDIUM}
-        solver = cv2.DISOpticalFlow_create(presets[self.preset])
+        solver: Any = cv2.DISOpticalFlow.create(presets[self.preset])
         return solver.calc(before, after, None), solver.calc(after, before, None)

@@ -46,14 +46,28 @@ def carve(masks, coarse_masks, P, low, voxel, dims, block, min_views, misses, ne
     for a in range(dims[0] // block):
         for b in range(dims[1] // block):
             for c in range(dims[2] // block):
-                i, f = _votes(low[0] + (a + 0.5) * size, low[1] + (b + 0.5) * size, low[2] + (c + 0.5) * size, P, coarse_masks, near)
+                i, f = _votes(
+                    low[0] + (a + 0.5) * size,
+                    low[1] + (b + 0.5) * size,
+                    low[2] + (c + 0.5) * size,
+                    P,
+                    coarse_masks,
+                    near,
+                )
                 if i < min_views or f < i - misses:
                     continue
                 for p in range(block):
                     for q in range(block):
                         for r in range(block):
                             k, m, n = a * block + p, b * block + q, c * block + r
-                            i, f = _votes(low[0] + (k + 0.5) * voxel, low[1] + (m + 0.5) * voxel, low[2] + (n + 0.5) * voxel, P, masks, near)
+                            i, f = _votes(
+                                low[0] + (k + 0.5) * voxel,
+                                low[1] + (m + 0.5) * voxel,
+                                low[2] + (n + 0.5) * voxel,
+                                P,
+                                masks,
+                                near,
+                            )
                             if i >= min_views and f >= i - misses:
                                 grid[k, m, n] = 1
     return grid
@@ -80,7 +94,9 @@ def first_hit(grid, low, voxel, center, rays, step, near, far):
 def _bilinear(image, u, v):
     i, j = int(u), int(v)
     a, b = u - i, v - j
-    return (1 - b) * ((1 - a) * image[j, i] + a * image[j, i + 1]) + b * ((1 - a) * image[j + 1, i] + a * image[j + 1, i + 1])
+    return (1 - b) * ((1 - a) * image[j, i] + a * image[j, i + 1]) + b * (
+        (1 - a) * image[j + 1, i] + a * image[j + 1, i + 1]
+    )
 
 
 @_jit(fastmath=_fast)
@@ -136,7 +152,7 @@ def sweep(points, start, depths, image, others, P, R, center, inverse_K, half, n
                 Us = (P[v, 0, 0] * sx + P[v, 0, 1] * sy + P[v, 0, 2] * sz - U * ds) / depth
                 Vs = (P[v, 1, 0] * sx + P[v, 1, 1] * sy + P[v, 1, 2] * sz - V * ds) / depth
                 reach = half * max(abs(Ur) + abs(Us), abs(Vr) + abs(Vs)) + 2
-                if U < reach or V < reach or U >= w - reach or V >= h - reach:
+                if reach > U or reach > V or w - reach <= U or h - reach <= V:
                     continue
                 q, mean = 0, 0.0
                 for b in range(-half, half + 1):

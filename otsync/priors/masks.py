@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -69,7 +69,7 @@ class FlowResidual:
     threshold: float = 1.0
     min_area: int = 300
     step: int = 1
-    flow: DISFlow = DISFlow()
+    flow: DISFlow = field(default_factory=DISFlow)
 
     def __call__(self, frames: WorkingFrames, camera: Camera) -> Bool[np.ndarray, "T h w"]:
         from ..geometry import fundamental, sampson

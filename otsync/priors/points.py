@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -37,7 +37,7 @@ class ChainedFlow:
     min_life: int = 8
     max_gap: int = 0
     join: float = 4.0
-    flow: DISFlow = DISFlow()
+    flow: DISFlow = field(default_factory=DISFlow)
 
     def __call__(
         self, frames: WorkingFrames, masks: Bool[np.ndarray, "T h w"], fps: float

@@ -100,9 +100,7 @@ class HullStereo:
                 out[:, frames] = found[f"depth{v}"]
         return depth
 
-    def _chunk(
-        self, rig: Rig, space: _Space, uv: Sequence[np.ndarray], first: int
-    ) -> dict[str, np.ndarray]:
+    def _chunk(self, rig: Rig, space: _Space, uv: Sequence[np.ndarray], first: int) -> dict[str, np.ndarray]:
         moments = range(first, min(first + self.chunk, len(rig.index)))
         used = [[int(k) for s in moments if (k := rig.index[s, v]) >= 0] for v in range(len(uv))]
         out = {f"frames{v}": np.array(used[v], int) for v in range(len(uv))}
@@ -111,14 +109,14 @@ class HullStereo:
             present = np.flatnonzero(rig.index[s] >= 0)
             if len(present) < max(3, self.min_views - self.misses):
                 continue
-            images = {int(v): space.image(rig, int(v), int(rig.index[s, v])) for v in present}
+            images = {v: space.image(rig, v, int(rig.index[s, v])) for v in present.tolist()}
             hull = space.hull(self, rig, s, present)
-            for v in present:
+            for v in present.tolist():
                 k = int(rig.index[s, v])
                 at = np.flatnonzero(np.isfinite(uv[v][:, k, 0]))
                 if len(at):
                     points = uv[v][at, k].astype(float) * rig.frames[v].scale
-                    out[f"depth{v}"][at, used[v].index(k)] = self._depths(space, hull, images, int(v), points, k)
+                    out[f"depth{v}"][at, used[v].index(k)] = self._depths(space, hull, images, v, points, k)
         return out
 
     def _depths(
@@ -146,7 +144,12 @@ class HullStereo:
         )  # fmt: skip
         shape = (len(points), len(around))
         depth, quality = choose_depth(
-            scores.reshape(*shape, -1), start.reshape(shape), float(depths[0]), self.step * unit, 0.05 * unit, 0.6 / unit
+            scores.reshape(*shape, -1),
+            start.reshape(shape),
+            float(depths[0]),
+            self.step * unit,
+            0.05 * unit,
+            0.6 / unit,
         )
         return np.where(quality > self.least, depth, 0.0).astype(np.float32)
 
@@ -210,8 +213,8 @@ class _Space:
         kernel = np.ones((grow | 1, grow | 1), np.uint8)
         out = []
         for v in present:
-            mask = rig.masks[v][rig.index[s, v]].astype(np.uint8)
-            mask = _straight(mask, rig.cameras[v], self.K[v], cv2.INTER_NEAREST)
+            mask = rig.masks[int(v)][int(rig.index[s, v])].astype(np.uint8)
+            mask = _straight(mask, rig.cameras[int(v)], self.K[v], cv2.INTER_NEAREST)
             out.append(cv2.dilate(mask, kernel) if grow > 1 else mask)
         return np.stack(out)
 

@@ -27,7 +27,7 @@ class WorkingFrames(Sequence[np.ndarray]):
     def __len__(self) -> int:
         return len(self.frames)
 
-    def __getitem__(self, k):  # type: ignore[override]
+    def __getitem__(self, k: int) -> np.ndarray:  # type: ignore[override]
         import cv2
 
         frame = self.frames[k]

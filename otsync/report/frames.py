@@ -85,12 +85,14 @@ def matches_drawn(scene: Scene, found: Synchronized) -> tuple[np.ndarray, str] |
     pairs = [(p, a) for p, a in offsets.alignments.items() if offsets.reference in p and len(offsets.matches[p])]
     if not pairs:
         return None
-    (i, j), alignment = min(pairs, key=lambda item: (not item[1].status.ok, item[1].sigma, item[0]))
+    (i, j), _ = min(pairs, key=lambda item: (not item[1].status.ok, item[1].sigma, item[0]))
     a, b = found.tracks[i], found.tracks[j]
     if a.uv is None or b.uv is None or not np.isfinite(offsets.between(i, j)):
         return None
     pairs_ij = offsets.matches[i, j].best(200).pairs
-    kb = np.clip(np.round(np.interp(a.times - offsets.between(i, j), b.times, np.arange(b.n_frames))), 0, b.n_frames - 1)
+    kb = np.clip(
+        np.round(np.interp(a.times - offsets.between(i, j), b.times, np.arange(b.n_frames))), 0, b.n_frames - 1
+    )
     inside = (a.times - offsets.between(i, j) >= b.times[0]) & (a.times - offsets.between(i, j) <= b.times[-1])
     both = a.seen[pairs_ij[:, 0]] & b.seen[pairs_ij[:, 1]][:, kb.astype(int)] & inside
     if not both.any():
@@ -108,7 +110,7 @@ def matches_drawn(scene: Scene, found: Synchronized) -> tuple[np.ndarray, str] |
         color = tuple(int(c) for c in rng.integers(60, 255, 3))
         p = a.uv[u, k] * width / scene.videos[i].camera.width
         q = b.uv[v, m] * width / scene.videos[j].camera.width + [width, 0]
-        ends = [tuple(int(round(x)) for x in e) for e in (p, q)]
+        ends = [tuple(round(float(x)) for x in e) for e in (p, q)]
         cv2.line(canvas, ends[0], ends[1], color, 1, cv2.LINE_AA)
         for e in ends:
             cv2.circle(canvas, e, 2, color, -1, cv2.LINE_AA)
