@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from .costs import Cosine, Cost, total_cost
 from .match import by_score, is_flat, no_information
+from .position_costs import CurveDistance, MedianPosition, SynchronousDistance
 from .types import Matches, TrackSet
 
 
@@ -26,6 +27,16 @@ class Candidates:
     k: int = 2
     top: int | None = 200
     costs: tuple[Cost, ...] = (Cosine(center=False),)
+
+    def at(self, offset: float, rate: float = 1.0) -> Candidates:
+        """The matcher to use once ``t_a = rate * t_b + offset`` is known: distance at equal times replaces the costs
+        of position that need no time.
+
+        Mutual nearest neighbours at equal times leave 25-33 matches on basketball and a mean error of .11 frame;
+        three partners a track leave 200 and .07.
+        """
+        timeless = tuple(c for c in self.costs if not isinstance(c, CurveDistance | MedianPosition))
+        return replace(self, k=self.k + 1, costs=(*timeless, SynchronousDistance(offset, rate=rate)))
 
     def __call__(self, a: TrackSet, b: TrackSet) -> Matches:
         cost = total_cost(self.costs, a, b)

@@ -64,7 +64,7 @@ class SynchronousDistance:
     """Mean distance at equal times under a known offset: what to match by once a first answer is there.
 
     Args:
-        offset: of b on a's clock, in seconds. Samples are paired with the nearest frame of the other video.
+        offset, rate: t_a = rate * t_b + offset, seconds. Samples are paired with the nearest frame of the other video.
         min_overlap: seconds that two tracks must share.
     """
 
@@ -73,12 +73,13 @@ class SynchronousDistance:
     scale: float = 0.11
     cap: float = 3.0
     min_overlap: float = 12 / 30
+    rate: float = 1.0
 
     def matrix(self, a: TrackSet, b: TrackSet) -> Float[np.ndarray, "Na Nb"]:
         from .kernels_tracks import synchronous_distances
 
         xa, xb = positions_in_common_frame(a, b)
-        ta, tb = a.times, b.times + self.offset
+        ta, tb = a.times, self.rate * b.times + self.offset
         step = float(np.median(np.diff(ta))) if len(ta) > 1 else 1.0
         at = np.clip(np.round(np.interp(ta, tb, np.arange(len(tb)))).astype(int), 0, len(tb) - 1)
         at = np.where(

@@ -158,8 +158,10 @@ def rematching(jobs: list[Job], found: Settled) -> list[Job]:
             continue
         # t_a = (r_b t_b + x_b - x_a) / r_a
         offset, rate = (found.x[j] - found.x[i]) / found.rates[i], found.rates[j] / found.rates[i]
+        at = getattr(job.matcher, "at", None)  # a matcher may know better how to match at known times
         costs = getattr(job.matcher, "costs", (Cosine(),))
-        again.append(dataclasses.replace(job, matcher=SynchronousMatching(float(offset), float(rate), costs)))
+        matcher = at(float(offset), float(rate)) if at else SynchronousMatching(float(offset), float(rate), costs)
+        again.append(dataclasses.replace(job, matcher=matcher))
     return again
 
 

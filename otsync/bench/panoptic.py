@@ -192,7 +192,7 @@ def measure(
         angle = view_angle(material.scene.videos[a].camera, material.scene.videos[b].camera, target)
         return {
             "route": route, "kind": kind, "a": names[a], "b": names[b], "angle": angle, "shift": shift if later else -shift,
-            "error": float(error), "sigma": float(found.sigma * found.fps), "flags": " ".join(f.code for f in found.flags),
+            "error": _number(error), "sigma": _number(found.sigma * found.fps), "flags": " ".join(f.code for f in found.flags),
         }  # fmt: skip
 
     details = list(map(pair, jobs))
@@ -236,7 +236,7 @@ def _graph(
     return [
         {
             "route": route, "kind": kind, "a": found.names[0], "b": found.names[v], "shift": int(starts[v] - starts[0]),
-            "error": float(error[v]), "sigma": float(found.sigma[v] * found.fps[v]),
+            "error": _number(error[v]), "sigma": _number(found.sigma[v] * found.fps[v]),
             "flags": " ".join(f.code for f in found.flags[v]),
         }
         for v in range(1, cameras)
@@ -260,7 +260,7 @@ def _row(
         return round(float(np.quantile(known, q)), 4) if known.size else None
 
     long = errors(details, "band")
-    below = np.abs(np.array([d["error"] for d in details if d["kind"].startswith("band") and d["angle"] < 95]))
+    below = errors([d for d in details if d["kind"].startswith("band") and d["angle"] < 95])
     return {
         "route": route,
         "pairs_mean": mean(long),
@@ -281,6 +281,11 @@ def _row(
     }
 
 
+def _number(x: float) -> float | None:
+    """For files: None where there is no answer."""
+    return float(x) if np.isfinite(x) else None
+
+
 def _plot(path: Path, details: list[dict[str, Any]]) -> None:
     """Share of pairs within an error, per route."""
     from matplotlib.figure import Figure
@@ -288,8 +293,8 @@ def _plot(path: Path, details: list[dict[str, Any]]) -> None:
     figure = Figure(figsize=(6.4, 3.6), layout="constrained")
     ax = figure.subplots()
     for route in dict.fromkeys(d["route"] for d in details):
-        error = np.array([abs(d["error"]) for d in details if d["route"] == route and d["kind"].startswith("band")])
-        error = np.sort(np.where(np.isfinite(error), error, np.inf))
+        known = [d["error"] for d in details if d["route"] == route and d["kind"].startswith("band")]
+        error = np.sort([np.inf if e is None else abs(e) for e in known])
         ax.step(np.maximum(error, 1e-3), (np.arange(len(error)) + 1) / len(error), where="post", label=route)
     ax.set(xscale="log", xlabel="|error|, frames", ylabel="share of pairs", ylim=(0, 1))
     ax.legend()
