@@ -40,7 +40,7 @@ def main(n: int = 1000, seeds: tuple[int, ...] = (0, 1, 2), out: Path = Path("ou
     for ax, (name, matches) in zip(figure.subplots(1, 2), found.items(), strict=True):
         best = rng.permutation(matches.best(n // 2).pairs)[:120]
         left, right = (t.xyz[:, t.n_frames // 2][:, [0, 2]] for t in (a, b))
-        right = right + [1.6 * np.ptp(np.quantile(left[:, 0], (0.05, 0.95))), 0]
+        right = right + np.array([1.6 * np.ptp(np.quantile(left[:, 0], (0.05, 0.95))), 0])
         ax.plot(*left.T, ".", *right.T, ".", ms=1.5, color="0.78")
         height = np.clip(
             (left[best[:, 0], 1] - np.quantile(left[:, 1], 0.05)) / np.ptp(np.quantile(left[:, 1], (0.05, 0.95))), 0, 1

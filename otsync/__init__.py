@@ -2,7 +2,8 @@
 
 Tracks in, offsets out::
 
-    from otsync import simulate, synchronize
+    from otsync import synchronize
+    from otsync.simulate import simulate
 
     tracks, truth = simulate("tennis", videos=4, seed=3)
     offsets = synchronize(tracks)

@@ -1,4 +1,4 @@
-"""The command line: ``otsync demo | simulate | match | sync | bench``, over the same dataclasses as the library.
+"""The command line: ``otsync demo | simulate | match | init | check | sync | bench``, over the same dataclasses as the library.
 
 Exit codes: 0 done; 1 an answer was refused (its status is printed); 2 bad arguments or files; 130 interrupted.
 """
@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import tyro
 
 from . import __version__
-from .align import DTW, ConstantShift
+from .align import DTW, ConstantShift, LikelihoodScan
 from .commands_recordings import Check, Init, RecordingOptions, sync_recording
+from .graph import Graph
 from .match import (
     EntropicFGW,
     FusedGromovWasserstein,
@@ -25,6 +26,7 @@ from .match import (
     PartialFGW,
     match,
 )
+from .refine import SplineRefine, Unrefined
 from .sync import synchronize, unique_names
 from .types import Offsets, Refused, Status, TrackSet
 
@@ -34,7 +36,8 @@ if TYPE_CHECKING:
 Motion = Literal["boxes", "juggle", "softball", "tennis", "basketball", "football", "static"]
 Preset = Literal["clean", "mid", "hard", "brutal"]
 Matcher = FusedGromovWasserstein | PartialFGW | EntropicFGW | GromovWasserstein | OptimalTransport | NearestNeighbor
-Aligner = DTW | ConstantShift
+Aligner = LikelihoodScan | DTW | ConstantShift
+Refiner = SplineRefine | Unrefined
 
 
 @dataclass
@@ -137,9 +140,9 @@ class Match:
 class Sync:
     """Synchronise a recording (scene.json or its folder), or videos from their track sets.
 
-    Examples:
-        otsync sync recording/ --out result
-        otsync sync world/*.npz --out result matcher:optimal-transport --matcher.reg 0.05 aligner:dtw
+    Examples: otsync sync recording/ --out result; otsync sync world/*.npz --out result
+    The paper's method: otsync sync world/*.npz --rematch 0 --graph.extra 0 aligner:dtw refiner:unrefined
+    A recording's route brings its own matcher, aligner and refiner; --recording.route chooses another.
     """
 
     tracks: tyro.conf.Positional[tuple[Path, ...]]
@@ -148,13 +151,19 @@ class Sync:
     out: Path = Path("sync")
     """Folder for offsets.json and report.html, and the stages of a recording, from which a killed run continues."""
     reference: str | None = None
-    """Name of the reference video; default: the first."""
+    """Name of the reference video, or "auto" for the one with the surest pairs; default: the first."""
     truth: Path | None = None
     """truth.json of a simulated world: adds errors to the table."""
+    rate: Literal["fixed", "fit"] = "fixed"
+    """Frame rates as declared, or fitted on long clips and kept where significant."""
+    rematch: int = 1
+    """How often trusted pairs are matched again at the synchronised times."""
+    workers: int = 1
+    """Processes that pairs are spread over; results do not depend on it."""
+    graph: Graph = field(default_factory=Graph)
     matcher: Matcher = field(default_factory=FusedGromovWasserstein)
-    """For track sets; a recording's route brings its own."""
-    aligner: Aligner = field(default_factory=DTW)
-    """For track sets; a recording's route brings its own."""
+    aligner: Aligner = field(default_factory=LikelihoodScan)
+    refiner: Refiner = field(default_factory=SplineRefine)
     recording: RecordingOptions = field(default_factory=RecordingOptions)
 
     def run(self) -> int:
@@ -164,15 +173,17 @@ class Sync:
             raise ValueError(f"tracks: expected at least two .npz files; found {len(self.tracks)}.")
         tracks = [TrackSet.load(path) for path in self.tracks]
         names = unique_names(tracks)
-        reference = 0
+        reference: int | str = 0
         if self.reference is not None:
-            if self.reference not in names:
-                raise ValueError(f"--reference: expected one of {', '.join(names)}; found {self.reference!r}.")
-            reference = names.index(self.reference)
-        truth = None if self.truth is None else true_offsets(self.truth, names, reference)
+            if self.reference not in (*names, "auto"):
+                raise ValueError(f"--reference: expected auto or one of {', '.join(names)}; found {self.reference!r}.")
+            reference = "auto" if self.reference == "auto" else names.index(self.reference)
+        known = None if self.truth is None else true_offsets(self.truth, names)
         offsets = with_progress(
-            tracks, "synchronising", reference=reference, matcher=self.matcher, aligner=self.aligner
-        )
+            tracks, "synchronising", self.workers, reference=reference, matcher=self.matcher, aligner=self.aligner,
+            refiner=self.refiner, graph=self.graph, rematch=self.rematch, rate=self.rate,
+        )  # fmt: skip
+        truth = None if known is None else known - known[offsets.component]
         return report(offsets, tracks, truth, self.out, "Synchronisation report")
 
 
@@ -183,20 +194,32 @@ SUITES = {"core": "otsync.bench.core"}
 class Bench:
     """What accuracy costs in time: tables, CSV, JSON and plots, with machine and versions.
 
-    Example: otsync bench core --out bench/out --gate
+    Examples: otsync bench core --out bench/out --gate; otsync bench panoptic recording/ --json
     """
 
-    suite: tyro.conf.Positional[Literal["core", "all"]]
+    suite: tyro.conf.Positional[Literal["core", "panoptic", "all"]]
+    scene: tyro.conf.Positional[Path | None] = None
+    """For panoptic: a truly synchronised recording (its folder or scene.json). "all" leaves it out."""
     out: Path = Path("bench/out")
     """Folder for CSV, JSON and plots."""
     gate: bool = False
     """Compare with the committed baseline; exit code 1 when something got worse."""
     rebase: bool = False
     """Make the figures of this run the baseline that --gate compares with."""
+    json: bool = False
+    """For panoptic: one line of JSON on standard output instead of tables."""
+    cache: Path | None = None
+    """For panoptic: where tracks and depth are kept; default: stages in --out."""
 
     def run(self) -> int:
         import importlib
 
+        if self.suite == "panoptic":
+            if self.scene is None:
+                raise ValueError("scene: expected a recording: otsync bench panoptic SCENE.")
+            return importlib.import_module("otsync.bench.panoptic").run(
+                self.scene, self.out, json=self.json, cache=self.cache
+            )
         suites = SUITES.values() if self.suite == "all" else [SUITES[self.suite]]
         return max(importlib.import_module(name).run(self.out, gate=self.gate, rebase=self.rebase) for name in suites)
 
@@ -212,28 +235,38 @@ COMMANDS: dict[str, Callable[..., Any]] = {
 }
 
 
-def true_offsets(path: Path, names: tuple[str, ...], reference: int) -> np.ndarray:
-    """True offsets of the named videos relative to the reference; ValueError names what the file lacks."""
+def true_offsets(path: Path, names: tuple[str, ...]) -> np.ndarray:
+    """True offsets of the named videos; ValueError names what the file lacks."""
     import numpy as np
 
     known = Offsets.load(path)
     missing = [name for name in names if name not in known.names]
     if missing:
         raise ValueError(f"{path}: expected offsets of {', '.join(names)}; {', '.join(missing)} are not in it.")
-    seconds = np.array([known.seconds[known.names.index(name)] for name in names])
-    return seconds - seconds[reference]
+    return np.array([known.seconds[known.names.index(name)] for name in names])
 
 
-def with_progress(tracks: list[TrackSet], what: str, **options: Any) -> Offsets:
-    """:func:`otsynchronize` with a progress bar on a terminal."""
+def with_progress(tracks: list[TrackSet], what: str, workers: int = 1, **options: Any) -> Offsets:
+    """:func:`otsync.synchronize` on some processes, with a progress bar on a terminal."""
+    from concurrent.futures import ProcessPoolExecutor
+    from multiprocessing import get_context
 
-    def progress(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterable[Any]:
-        from tqdm import tqdm
+    from tqdm import tqdm
 
-        items = list(items)
-        return tqdm(map(function, items), total=len(items), desc=what, unit="pair", disable=None, leave=False)
+    if workers < 1:
+        raise ValueError(f"--workers: expected at least 1; found {workers}.")
 
-    return synchronize(tracks, map=progress, **options)
+    def progress(run: Callable[..., Iterable[Any]]) -> Callable[..., Iterable[Any]]:
+        def mapped(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterable[Any]:
+            items = list(items)
+            return tqdm(run(function, items), total=len(items), desc=what, unit="pair", disable=None, leave=False)
+
+        return mapped
+
+    if workers == 1:
+        return synchronize(tracks, map=progress(map), **options)
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        return synchronize(tracks, map=progress(pool.map), **options)
 
 
 def report(offsets: Offsets, tracks: list[TrackSet], truth: Any, out: Path, title: str) -> int:

@@ -107,7 +107,9 @@ def sync_recording(
         if reference not in scene.names:
             raise ValueError(f"--reference: expected one of {', '.join(scene.names)}; found {reference!r}.")
         chosen = scene.names.index(reference)
-    known = None if truth is None else true_offsets(truth, scene.names, chosen)
+    known = None if truth is None else true_offsets(truth, scene.names)
+    if known is not None:
+        known = known - known[chosen]
     for note in scene.notes:
         print(f"note: {note}", file=sys.stderr)
     with ThreadPoolExecutor(options.workers or os.cpu_count() or 1) as pool:

@@ -63,6 +63,14 @@ def test_reference_is_chosen_by_name(world, tmp_path):
     assert found.reference == 1 and found.seconds[1] == 0
 
 
+def test_workers_change_nothing(world, tmp_path):
+    files = [str(p) for p in sorted(world.glob("*.npz"))]
+    for n in ("1", "2"):
+        assert main(["sync", *files, "--out", str(tmp_path / n), "--workers", n, "matcher:optimal-transport"]) == 0
+    one, two = (json.loads((tmp_path / n / "offsets.json").read_text()) for n in ("1", "2"))
+    assert one["videos"] == two["videos"]
+
+
 def test_a_refused_answer_exits_with_one(tmp_path, capsys):
     same = TrackSet(np.ones((6, 40, 3)), features=np.ones((6, 3)), fps=30, name="a")
     for name in ("a", "b"):
@@ -81,7 +89,7 @@ def test_a_refused_answer_exits_with_one(tmp_path, capsys):
         (["sync", "nowhere.npz", "b.npz"], "nowhere.npz: no such file"),
         (["sync", "{world}/video0.npz"], "tracks: expected at least two"),
         (["sync", "{world}/video0.npz", "{world}/truth.json"], "truth.json: expected a readable .npz"),
-        (["sync", "{world}/video0.npz", "{world}/video1.npz", "--reference", "x"], "--reference: expected one of video0, video1"),
+        (["sync", "{world}/video0.npz", "{world}/video1.npz", "--reference", "x"], "--reference: expected auto or one of video0, video1"),
         (["sync", "{world}/video0.npz", "{world}/video1.npz", "--truth", "{world}/video0.npz"], "video0.npz: expected JSON"),
         (["match", "{world}/video0.npz", "{world}"], "expected a file; found a folder"),
         (["match", "{world}/video0.npz", "{world}/video1.npz", "matcher:partial-fgw", "--matcher.mass", "7"], "PartialFGW.mass"),
@@ -129,7 +137,8 @@ def test_an_interrupt_leaves_nothing_half_written(tmp_path):
         time.sleep(delay)
         os.killpg(run.pid, signal.SIGINT)
         _, err = run.communicate(timeout=60)
-        assert run.returncode in (130, 0, -signal.SIGINT, 1), err
+        # a compiled extension that is just being imported may abort instead; what counts is what is left
+        assert run.returncode in (130, 0, 1, -signal.SIGINT, -signal.SIGABRT), err
         for path in out.rglob("*") if out.exists() else []:
             assert path.name in ("offsets.json", "report.html")
             if path.suffix == ".json":

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from otsync.simulate import MOTIONS, PRESETS, FeatureModel, Rig, Similarity, effects, matching_world, simulate
-from otsync.simulate.body import Parts, euler, human, sample_surface, thing
-from otsync.simulate.motions import Wander, event_times
+from otsync.simulate.body import Parts, euler, forward_kinematics, human, sample_surface, thing
+from otsync.simulate.motions import Actor, Gesture, Wander, event_times
 from otsync.simulate.observation import IDENTITY, stream
 
 MOVING = ["boxes", "juggle", "softball", "tennis", "basketball", "football"]
@@ -371,6 +371,24 @@ def test_limbs_are_rigid_and_joined():
     tall = np.ptp(rest.rest_position[:, 2])
     assert 1.3 < tall < 1.6  # joints from ankle to neck
     np.testing.assert_allclose(rest.rest_position[3:9] * [-1, 1, 1], rest.rest_position[9:15], atol=1e-12)
+
+
+def test_size_scales_the_whole_figure():
+    angles, root = np.zeros((1, 15, 3)), np.zeros((1, 3))
+    one, big = (forward_kinematics(angles, root, np.zeros(1), size)[1] for size in (1.0, 1.2))
+    np.testing.assert_allclose(big, 1.2 * one)
+    assert np.linalg.norm(one[7] - one[6]) == pytest.approx(0.42)
+
+
+def test_lasting_gestures_add_up_however_long_ago():
+    still = Wander(np.random.default_rng(0), 45, 0.0, 0.1, 1), Wander(np.random.default_rng(0), 2, 0.0, 0.1, 1)
+    nod = Gesture(2, 0, 0.3, delay=0.0, width=0.2, lasting=True), Gesture(1, 0, 0.5, delay=0.0, width=0.2)
+    actor = Actor(np.zeros((15, 3)), still[0], still[1], still[0], events=np.array([1.0, 5.0, 9.0]), gestures=nod)
+    R = actor(np.array([40.0]))[0]
+    np.testing.assert_allclose(R[2, 0], Rotation.from_euler("x", -0.9).as_matrix(), atol=1e-9)
+    np.testing.assert_allclose(R[1, 0], np.eye(3), atol=1e-9)
+    np.testing.assert_allclose(actor(np.array([0.0, 5.0, 40.0]))[0][:, -1], R[:, 0], atol=1e-9)
+    np.testing.assert_allclose(actor(np.array([5.0]))[0][1, 0], Rotation.from_euler("x", -0.5).as_matrix(), atol=1e-9)
 
 
 def test_surface_points_lie_on_the_surface_evenly():

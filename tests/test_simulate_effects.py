@@ -193,11 +193,13 @@ def test_outliers_are_static_or_float_and_belong_to_nothing():
 
 def test_rolling_shutter_shows_every_row_at_its_time():
     readout = 0.03
-    exact, worse, truth, _ = with_and_without(effects.RollingShutter(readout), tracks=40, motion="football")
+    exact, worse, truth, _ = with_and_without(
+        effects.RollingShutter(readout), tracks=40, motion="football", offsets=[0.4, 0], rates=[1.1, 1]
+    )
     row = np.clip(exact.uv[..., 1] / 720 - 0.5, -0.5, 0.5)
     for k in (3, 50, 149):
         for i in range(0, 40, 7):
-            want = truth.positions(0, exact.times[k : k + 1] + row[i, k] * readout)[i, 0]
+            want = truth.positions(0, 0.4 + 1.1 * (exact.times[k : k + 1] + row[i, k] * readout))[i, 0]
             np.testing.assert_allclose(worse.xyz[i, k], want, atol=2e-5)
     assert np.abs(worse.xyz - exact.xyz).max() > 0.01
     assert worse.camera.readout == readout

@@ -175,6 +175,15 @@ def test_a_capture_becomes_a_world_in_metres_with_z_up(files):
     assert len(still[0]) == len(tracks[0])
 
 
+def test_turns_past_half_a_circle_are_smooth(files):
+    rows = [[0, 90, 0, 40 * f, 0, 0] + [0] * 9 for f in range(12)]
+    text = BVH.split("Frames:")[0] + "Frames: 12\nFrame Time: 0.04\n" + "\n".join(" ".join(map(str, r)) for r in rows)
+    _, truth = simulate(Mocap(files(a_bvh=text) / "a.bvh", start=0.0), frames=3, effects=(), seed=0)
+    R_, _ = truth.scene.pose(np.linspace(0.08, 0.32, 49))  # the same speed all the way
+    steps = Rotation.from_matrix(R_[0, 1:] @ R_[0, :-1].swapaxes(1, 2)).magnitude()
+    np.testing.assert_allclose(np.degrees(steps), 40 / 8, atol=0.3)
+
+
 def test_beyond_its_ends_a_capture_runs_backwards(files):
     _, truth = simulate(Mocap(files(a_bvh=BVH) / "a.bvh", start=0.0), frames=3, effects=(), seed=0)
     t = np.array([0.03, 0.07, 0.1])

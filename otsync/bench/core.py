@@ -13,6 +13,7 @@ from ..metrics import match_quality
 from ..simulate import matching_world, simulate
 from . import record
 from .record import run_python, table, write_rows
+from .simulate import effect_costs
 
 CLASSES = ("boxes", "juggle", "softball", "tennis", "basketball", "football")
 BANDS = ((0, 10), (10, 30), (30, 50))
@@ -47,9 +48,10 @@ def run(
     print(f"Frame-level offsets, {seeds} fresh seeds per class and band, true matches of the preset, frames:")
     print(f"{table(summary)}\n")
     write_rows(out, "core_offsets", errors, {"seeds": seeds, "first_seed": first_seed})
-    timing = [import_time(), *no_effect_time()]
-    print(table(timing))
-    write_rows(out, "core_timing", timing)
+    imported = import_time()
+    print(table([imported]), table(effects := effect_costs()), sep="\n\n")
+    write_rows(out, "core_import", [imported])
+    write_rows(out, "core_effects", effects)
     figures = {
         "p50_gain": ablation[1]["p50"] - ablation[0]["p50"],
         "flips_ratio": ablation[1]["flips"] / ablation[0]["flips"],
@@ -128,14 +130,3 @@ def import_time() -> dict:
     """Median seconds of `import otsync` in five fresh interpreters."""
     code = "import time; t = time.perf_counter(); import otsync; print(time.perf_counter() - t)"
     return {"what": "import otsync", "seconds": float(np.median([float(run_python(code)) for _ in range(5)]))}
-
-
-def no_effect_time(repeats: int = 15) -> list[dict]:
-    """Seconds of a world with all of mid's effects and without any, alternating in one run; medians."""
-    spent: dict[str, list[float]] = {"simulate, mid's effects": [], "simulate, effects=()": []}
-    for k in range(repeats):
-        for name, effects in zip(spent, (None, ()), strict=True):
-            started = time.perf_counter()
-            simulate("tennis", videos=2, seed=k, effects=effects)
-            spent[name].append(time.perf_counter() - started)
-    return [{"what": name, "seconds": float(np.median(times))} for name, times in spent.items()]

@@ -13,7 +13,7 @@ from ..files import atomic_write
 from ..types import Alignment, Matches, Offsets, Status, TrackSet
 from . import figures
 
-DETAILED_PAIRS = 10
+DETAILED_PAIRS = 8
 """Pairs shown with their figure; the others stand in the table. Keeps the page below 400 KB."""
 
 STYLE = """

@@ -160,7 +160,7 @@ def juggle(rng: np.random.Generator) -> Scene:
 def softball(rng: np.random.Generator) -> Scene:
     """One pitcher: a few steps, then a windmill pitch (a whole turn of the right arm), and the ball flies off."""
     events = event_times(rng, (1.9, 3.1), (3.2, 4.8))
-    turn = rng.uniform(0.14, 0.19)
+    turn = rng.uniform(0.18, 0.24)
     actor = Actor(
         posture=posture(elbows=0.25),
         sway=Wander(rng, 45, sway_scale(0.13), 0.2, 1.2),
