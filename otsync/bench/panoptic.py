@@ -22,23 +22,27 @@ from typing import Any
 import numpy as np
 
 from ..align import DTW
+from ..costs import Cosine
 from ..files import atomic_write
 from ..geometry import common_target, seen_pixels, view_angle
 from ..graph import Graph
 from ..io import open_scene
 from ..io.scene import Scene
-from ..match import FusedGromovWasserstein
+from ..match import FusedGromovWasserstein, OptimalTransport, PartialFGW
+from ..partners import Candidates
+from ..position_costs import CurveDistance, MedianPosition
 from ..priors.cache import Cache
 from ..priors.stereo import Rig
-from ..recordings import Stages, pairs_in_pixels, pairs_in_space
+from ..recordings import COLOUR, Stages, pairs_in_pixels, pairs_in_space
 from ..refine import Unrefined
 from ..sync import MapLike, synchronize
 from ..tracks import pixel_tracks
-from ..types import Offsets, TrackSet
+from ..types import Matches, Offsets, TrackSet
 from .record import table, write_rows
 
 BANDS = ((1, 10), (11, 30), (31, 50))
 SHORT = (51, 100)
+NEAR = 0.15
 PUBLISHED = {"route": "published", "pairs_by_band": [6.44, 8.57, 9.87], "graph_mean": 9.689, "graph_refined": 0.260}
 NOTE = (
     "Depth was built from the synchronised frames of all cameras, as the paper's was; the depth-free row does not use "
@@ -53,6 +57,7 @@ class Protocol:
     Args:
         pairs: random camera pairs, each in the three bands, once more with a short overlap and once at half rate.
         graph_cameras, graph_seeds, graph_frames: of the many-video rows. largest: seeds with all cameras at once.
+        matching: random pairs for the table of matchers.
     """
 
     pairs: int = 24
@@ -60,6 +65,7 @@ class Protocol:
     graph_seeds: int = 3
     graph_frames: int = 120
     largest: int = 1
+    matching: int = 24
     seed: int = 9000
 
 
@@ -84,9 +90,13 @@ def run(
             rows.append(row)
             details += detail
             tell(table([row], list(row)))
+        matched = matching_table(material, protocol, pool.map) if protocol.matching else []
     about = {"note": NOTE, "published": PUBLISHED, "protocol": vars(protocol), "cameras": list(opened.names)}
     write_rows(out, "panoptic", rows, about)
     write_rows(out, "panoptic_pairs", details, about)
+    if matched:
+        write_rows(out, "panoptic_matching", matched, about)
+        tell(f"Precision within {NEAR:g} m at the true time, by angle between the cameras:\n{table(matched)}")
     _plot(out / "panoptic.svg", details)
     tell(f"published: pairs by band 6.44 / 8.57 / 9.87, many videos 9.689, after photometric refinement .260\n{NOTE}")
     if json:
@@ -203,6 +213,60 @@ def measure(
     for n in range(protocol.largest):
         whole += _graph(material, solve, lifted, protocol, rng, V, f"all {n}", route)
     return _row(route, details, graph, whole, seconds / len(jobs)), details + graph + whole
+
+
+def matching_table(material: Material, protocol: Protocol, map: MapLike) -> list[dict[str, Any]]:
+    """Share of matches whose tracks are within :data:`NEAR` at the true time (median over common frames), by angle."""
+    V = len(material.scene.videos)
+    rng = np.random.default_rng(protocol.seed + 1)
+    pairs = list(itertools.combinations(range(V), 2))
+    rng.shuffle(pairs)
+    target = common_target([v.camera for v in material.scene.videos])
+    both = (Cosine(weight=COLOUR, center=False), CurveDistance())
+
+    def best(matcher: Any, n: int | None) -> Callable[[TrackSet, TrackSet], Matches]:
+        return lambda a, b: matcher(a, b) if n is None else matcher(a, b).best(n)
+
+    place = (Cosine(weight=COLOUR, center=False), MedianPosition())
+    matchers: dict[str, Callable[[TrackSet, TrackSet], Matches]] = {
+        "EMD on features, best 100": best(OptimalTransport(), 100),
+        "FGW (paper), best 100": best(FusedGromovWasserstein(), 100),
+        "EMD on features + median position, best 100": best(OptimalTransport(costs=place), 100),
+        "EMD on features + curve, best 100": best(OptimalTransport(costs=both), 100),
+        "FGW with curve (alpha 5), best 100": best(FusedGromovWasserstein(alpha=5.0, costs=both), 100),
+        "partial FGW (mass .65) with curve (alpha 5), best 100": best(PartialFGW(alpha=5.0, costs=both), 100),
+        "two partners, features + curve, best 200": best(Candidates(2, 200, both), None),
+        "the same again at synchronised times": best(Candidates(2, 200, both).at(0.0), None),
+    }
+    found: dict[str, list[tuple[float, float, int]]] = {name: [] for name in matchers}
+
+    def pair(item: tuple[int, int]) -> dict[str, tuple[float, float, int]]:
+        a, b = (material.clip(int(v), 0, material.frames, 1, True) for v in item)
+        angle = view_angle(a.camera, b.camera, target)  # type: ignore[arg-type]
+        return {name: (angle, *_precision(a, b, matcher(a, b))) for name, matcher in matchers.items()}
+
+    for answer in map(pair, pairs[: protocol.matching]):
+        for name, value in answer.items():
+            found[name].append(value)
+    rows = []
+    for name, values in found.items():
+        angle, precision, count = np.array(values).T
+        row: dict[str, Any] = {"matching": name, "matches": round(float(count.mean()), 1)}
+        for low, high in ((0, 55), (55, 95), (95, 120), (120, 181)):
+            inside = (angle >= low) & (angle < high)
+            row[f"<{high}"] = round(float(precision[inside].mean()), 3) if inside.any() else None
+        rows.append(row | {"all": round(float(precision.mean()), 3)})
+    return rows
+
+
+def _precision(a: TrackSet, b: TrackSet, matches: Matches) -> tuple[float, int]:
+    """For clips that start together: (share of near matches among those seen together in five frames, matches)."""
+    i, j = matches.pairs.T
+    distance = np.linalg.norm(a.positions()[i] - b.positions()[j], axis=2)
+    together = np.isfinite(distance).sum(1) >= 5
+    if not together.any():
+        return 0.0, len(matches)
+    return float((np.nanmedian(distance[together], axis=1) < NEAR).mean()), len(matches)
 
 
 def _solver(route: str, stages: Stages) -> Callable[[list[TrackSet]], Offsets]:
