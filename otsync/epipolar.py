@@ -47,8 +47,8 @@ class EpipolarScan:
     min_overlap: float = MIN_OVERLAP
     min_seen: float = 12 / 30
     max_lag: float | None = None
-    weak: float = 1.1
-    ambiguous: float = 0.15
+    weak: float = 1.2
+    ambiguous: float = 0.2
 
     needs_xyz = False
 

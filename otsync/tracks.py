@@ -67,6 +67,19 @@ def pixel_tracks(
     )
 
 
+class PackedMasks(Sequence[np.ndarray]):
+    """Masks of one bit a pixel, unpacked when a frame is asked for: 29 kB for 640 x 360."""
+
+    def __init__(self, bits: np.ndarray, width: int):
+        self.bits, self.width = bits, width
+
+    def __len__(self) -> int:
+        return len(self.bits)
+
+    def __getitem__(self, k: int) -> Bool[np.ndarray, "h w"]:  # type: ignore[override]
+        return np.unpackbits(self.bits[k], axis=-1, count=self.width).astype(bool)
+
+
 @dataclass(frozen=True)
 class Tracking:
     """Masks, point tracks and descriptors of one video: the stage that reads its pixels.
@@ -108,8 +121,8 @@ class Tracking:
 
     def masks(
         self, video: Video, given: Sequence[np.ndarray] | None = None, cache: Cache | None = None
-    ) -> Bool[np.ndarray, "T h w"]:
-        """Foreground at working resolution."""
+    ) -> Sequence[np.ndarray]:
+        """Foreground at working resolution, (h,w) bool per frame."""
         cache = cache or Cache()
         frames = WorkingFrames(video.frames, (video.camera.width, video.camera.height), self.width)
         masker = self.masker
@@ -123,7 +136,7 @@ class Tracking:
             return {"bits": np.packbits(found, axis=2), "width": np.array(found.shape[2])}
 
         kept = cache.arrays("masks", (self.key(video, given), told, self.width), compute)
-        return np.unpackbits(kept["bits"], axis=2, count=int(kept["width"])).astype(bool)
+        return PackedMasks(kept["bits"], int(kept["width"]))
 
     def key(self, video: Video, masks: Sequence[np.ndarray] | None) -> str:
         """What the pixels and poses of a video are, for the cache."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import os
 import threading
+from abc import abstractmethod
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -27,16 +28,13 @@ KEPT = 8
 class LazyFrames(Sequence[np.ndarray]):
     """A sequence that decodes frame k when it is asked for; slices stay lazy."""
 
-    def __len__(self) -> int:
-        raise NotImplementedError  # pragma: no cover - an interface
-
+    @abstractmethod
     def frame(self, k: int) -> np.ndarray:
         """Decode frame ``k``, 0 <= k < len."""
-        raise NotImplementedError  # pragma: no cover - an interface
 
+    @abstractmethod
     def digest(self) -> str:
         """A hash of the content, for caches."""
-        raise NotImplementedError  # pragma: no cover - an interface
 
     @overload
     def __getitem__(self, k: int) -> np.ndarray: ...

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -15,7 +16,7 @@ class Describer(Protocol):
     """The ``features`` slot."""
 
     def __call__(
-        self, frames: WorkingFrames, masks: Bool[np.ndarray, "T h w"], uv: Float[np.ndarray, "N T 2"], fps: float
+        self, frames: WorkingFrames, masks: Sequence[np.ndarray], uv: Float[np.ndarray, "N T 2"], fps: float
     ) -> Float[np.ndarray, "N D"]: ...
 
 
@@ -35,7 +36,7 @@ class LabHistogram:
     bins: int = 4
 
     def __call__(
-        self, frames: WorkingFrames, masks: Bool[np.ndarray, "T h w"], uv: Float[np.ndarray, "N T 2"], fps: float
+        self, frames: WorkingFrames, masks: Sequence[np.ndarray], uv: Float[np.ndarray, "N T 2"], fps: float
     ) -> Float[np.ndarray, "N D"]:
         from .working import bilinear
 

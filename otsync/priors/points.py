@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from .flow import DISFlow
 from .working import WorkingFrames, bilinear
@@ -24,7 +25,8 @@ class ChainedFlow:
         grid: spacing of seeds in pixels; a seed closer than half of it to a living track is left out.
         every: frames between seedings. phase: the first one.
         agree: largest distance of the way there and back, in pixels, plus ``agree_share`` of the step's length.
-        min_life: frames below which a track is dropped.
+        min_life: frames below which a track is dropped. most: tracks that are returned, the longest-lived (32 kB each
+            per 4000 frames: memory stays bounded on long videos).
         max_gap, join: tracks that end are joined to ones that begin up to ``max_gap`` frames later within ``join``
             pixels of where constant velocity leads; 0 frames: no joining.
     """
@@ -35,30 +37,25 @@ class ChainedFlow:
     agree: float = 1.0
     agree_share: float = 0.05
     min_life: int = 8
+    most: int = 4000
     max_gap: int = 0
     join: float = 4.0
     flow: DISFlow = field(default_factory=DISFlow)
 
-    def __call__(
-        self, frames: WorkingFrames, masks: Bool[np.ndarray, "T h w"], fps: float
-    ) -> Float[np.ndarray, "N T 2"]:
+    def __call__(self, frames: WorkingFrames, masks: Sequence[np.ndarray], fps: float) -> Float[np.ndarray, "N T 2"]:
         """Working pixel indices of every track, nan where it is not followed."""
         T, (w, h) = len(frames), frames.size
         half = (max(2, h // 2), max(2, w // 2))
         with tempfile.TemporaryFile() as file:
             flows = np.memmap(file, np.float16, "w+", shape=(max(T - 1, 1), 2, *half, 2))
             steps, seeds = self._forwards(frames, masks, flows, fps)
-            seed_frames = np.concatenate([np.full(len(s), t) for t, s in seeds]) if seeds else np.zeros(0, int)
-            uv = np.full((len(seed_frames), T, 2), np.nan, np.float32)
-            for t, (ids, x) in enumerate(steps):
-                uv[ids, t] = x
-            self._backwards(uv, seed_frames, masks, flows, frames)
+            steps += self._backwards(seeds, masks, flows, frames)
             del flows
-        uv = uv[np.isfinite(uv[..., 0]).sum(1) >= min(self.min_life, T)]
+        uv = self._dense(steps, T)
         return join_gaps(uv, self.max_gap, self.join * frames.unit) if self.max_gap else uv
 
     def _forwards(self, frames, masks, flows, fps):
-        """Positions (ids, x) per frame of the tracks alive there, and the seeds (frame, points)."""
+        """Positions (frame, ids, x) of the tracks alive in every frame, and the seeds (frame, points)."""
         import cv2
 
         T, (w, h) = len(frames), frames.size
@@ -80,7 +77,7 @@ class ChainedFlow:
                 seeds.append((t, new))
                 x, ids = np.concatenate([x, new]), np.concatenate([ids, count + np.arange(len(new))])
                 count += len(new)
-            steps.append((ids, x))
+            steps.append((t, ids, x))
             if t + 1 < T:
                 after = frames.gray(t + 1)
                 there, back = self.flow.pair(gray, after)
@@ -92,14 +89,32 @@ class ChainedFlow:
                 gray = after
         return steps, seeds
 
-    def _backwards(self, uv, seed_frames, masks, flows, frames) -> None:
-        """Extend every track from its seed to earlier frames, in place."""
-        ids = np.zeros(0, int)
+    def _backwards(self, seeds, masks, flows, frames):
+        """The same from every seed to earlier frames."""
+        first = np.cumsum([0, *(len(s) for _, s in seeds)])
+        begun = {t: (first[n] + np.arange(len(s)), s) for n, (t, s) in enumerate(seeds)}
+        ids, x = np.zeros(0, int), np.zeros((0, 2), np.float32)
+        steps = []
         for t in range(len(frames) - 1, 0, -1):
-            ids = np.concatenate([ids, np.flatnonzero(seed_frames == t)])
-            x, alive = self._step(uv[ids, t], flows[t - 1, 1], flows[t - 1, 0], masks[t - 1], frames)
-            ids = ids[alive]
-            uv[ids, t - 1] = x[alive]
+            if t in begun:
+                ids, x = np.concatenate([ids, begun[t][0]]), np.concatenate([x, begun[t][1]])
+            x, alive = self._step(x, flows[t - 1, 1], flows[t - 1, 0], masks[t - 1], frames)
+            x, ids = x[alive], ids[alive]
+            steps.append((t - 1, ids, x))
+        return steps
+
+    def _dense(self, steps, T):
+        """(N,T,2) of the tracks that live long enough, at most the ``most`` longest-lived, in order of their seeds."""
+        life = np.bincount(np.concatenate([ids for _, ids, _ in steps]))
+        keep = np.flatnonzero(life >= min(self.min_life, T))
+        keep = np.sort(keep[np.argsort(-life[keep], kind="stable")[: self.most]])
+        row = np.full(len(life), -1)
+        row[keep] = np.arange(len(keep))
+        uv = np.full((len(keep), T, 2), np.nan, np.float32)
+        for t, ids, x in steps:
+            kept = row[ids] >= 0
+            uv[row[ids[kept]], t] = x[kept]
+        return uv
 
     def _step(self, x, there, back, mask, frames):
         """Points after one step, and which of them to believe."""

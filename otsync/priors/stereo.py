@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from ..geometry import common_target
 from ..types import Camera, Video
@@ -29,13 +29,17 @@ class Rig:
     """
 
     frames: tuple[WorkingFrames, ...]
-    masks: tuple[Bool[np.ndarray, "T h w"], ...]
+    masks: tuple[Sequence[np.ndarray], ...]
     cameras: tuple[Camera, ...]
     index: Int[np.ndarray, "S V"]
 
     @classmethod
     def at(
-        cls, videos: Sequence[Video], masks: Sequence[np.ndarray], offsets: Float[np.ndarray, " V"], width: int = 640
+        cls,
+        videos: Sequence[Video],
+        masks: Sequence[Sequence[np.ndarray]],
+        offsets: Float[np.ndarray, " V"],
+        width: int = 640,
     ) -> Rig:
         """Frames that show the same moment under ``offsets`` (seconds), on the clock of the longest video's fps."""
         frames = tuple(WorkingFrames(v.frames, (v.camera.width, v.camera.height), width) for v in videos)
