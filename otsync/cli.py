@@ -187,7 +187,7 @@ class Sync:
         return report(offsets, tracks, truth, self.out, "Synchronisation report")
 
 
-SUITES = {"core": "otsync.bench.core"}
+SUITES = {"core": "otsync.bench.core", "raster": "recon.bench_raster"}
 
 
 @dataclass
@@ -197,7 +197,7 @@ class Bench:
     Examples: otsync bench core --out bench/out --gate; otsync bench panoptic recording/ --json
     """
 
-    suite: tyro.conf.Positional[Literal["core", "panoptic", "all"]]
+    suite: tyro.conf.Positional[Literal["core", "raster", "panoptic", "all"]]
     scene: tyro.conf.Positional[Path | None] = None
     """For panoptic: a truly synchronised recording (its folder or scene.json). "all" leaves it out."""
     out: Path = Path("bench/out")

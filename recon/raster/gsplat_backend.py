@@ -1,0 +1,90 @@
+"""The CUDA back end: gsplat's own kernels behind :func:`recon.raster.render`. A leaf: imported only when asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from recon.raster.rendering import QUAT_NORM2_MIN, Rendering, Settings
+
+RENDER_MODES = {None: "RGB", "accumulated": "RGB+D", "expected": "RGB+ED"}
+
+
+def render(
+    gaussians: tuple[Tensor, Tensor, Tensor, Tensor, Tensor],
+    viewmats: Tensor,
+    Ks: Tensor,
+    size: tuple[int, int],
+    backgrounds: Tensor | None,
+    options: Settings,
+) -> Rendering:
+    """Render (means, quats, scales, opacities, colors), checked and finite, with `gsplat.rasterization`.
+
+    gsplat computes in float32 only; float64 tensors are converted and the result is given back as float64.
+    """
+    try:
+        import gsplat
+    except ImportError as error:
+        raise ValueError("backend='gsplat' needs gsplat: pip install 'otsync[cuda]', or use backend='cpu'") from error
+    if not gaussians[0].is_cuda:
+        raise ValueError("backend='gsplat' needs CUDA tensors, got CPU tensors: move them with .cuda(), or use 'cpu'")
+    return rasterize(gsplat.rasterization, gaussians, viewmats, Ks, size, backgrounds, options)
+
+
+def rasterize(
+    rasterization: Callable[..., tuple[Tensor, Tensor, dict[str, Any]]],
+    gaussians: tuple[Tensor, Tensor, Tensor, Tensor, Tensor],
+    viewmats: Tensor,
+    Ks: Tensor,
+    size: tuple[int, int],
+    backgrounds: Tensor | None,
+    options: Settings,
+) -> Rendering:
+    """Translate to and from `rasterization`, a function with the signature of gsplat's."""
+    means, quats, scales, opacities, colors = gaussians
+    dtype, n, c = means.dtype, len(means), len(viewmats)
+    width, height = size
+    if n == 0:  # gsplat launches no kernel and leaves its outputs unset
+        return _empty(
+            means, viewmats, size, 3 if options.sh_degree is not None else colors.shape[-1], backgrounds, options
+        )
+    # gsplat normalises by 1/|q|; a quaternion that is no rotation must not reach it
+    rotates = (quats * quats).sum(-1) >= QUAT_NORM2_MIN
+    quats = torch.where(rotates[:, None], quats, torch.ones_like(quats))
+    opacities = torch.where(rotates, opacities, 0.0)
+    tensors = [t.float() for t in (means, quats, scales, opacities, colors, viewmats, Ks)]
+    image, alphas, meta = rasterization(
+        *tensors,
+        width,
+        height,
+        near_plane=options.near_plane,
+        far_plane=options.far_plane,
+        radius_clip=options.radius_clip,
+        eps2d=options.eps2d,
+        sh_degree=options.sh_degree,
+        packed=False,  # so that means2d and radii are [C,N,2] whatever is visible
+        backgrounds=None if backgrounds is None else backgrounds.float(),
+        render_mode=RENDER_MODES[options.depth],
+        rasterize_mode=options.rasterize_mode,
+    )
+    depths = None
+    if options.depth is not None:
+        image, depths = image[..., :-1], image[..., -1:].to(dtype)
+    radii = meta["radii"].reshape(c, n, 2).to(torch.int32)
+    return Rendering(image.to(dtype), alphas.to(dtype), depths, meta["means2d"], radii, "gsplat")
+
+
+def _empty(
+    means: Tensor, viewmats: Tensor, size: tuple[int, int], d: int, backgrounds: Tensor | None, options: Settings
+) -> Rendering:
+    shape = (len(viewmats), size[1], size[0])
+    image = means.new_zeros(*shape, d)
+    if backgrounds is not None:
+        image = image + backgrounds[:, None, None, :]
+    alphas = means.new_zeros(*shape, 1)
+    depths = None if options.depth is None else means.new_zeros(*shape, 1)
+    splats = means.new_zeros(len(viewmats), 0, 2)
+    return Rendering(image, alphas, depths, splats, splats.to(torch.int32), "gsplat")

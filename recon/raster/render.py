@@ -1,0 +1,221 @@
+"""The one signature of the renderer: check the arguments, choose a back end, project, rasterize."""
+
+from __future__ import annotations
+
+import importlib.util
+import logging
+from types import ModuleType
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from recon.raster import sh
+from recon.raster.rendering import Rendering, Settings
+
+logger = logging.getLogger("recon.raster")
+BackendName = Literal["auto", "torch", "cpu", "gsplat"]
+_announced: set[str] = set()
+
+
+def render(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    *,
+    backgrounds: Tensor | None = None,
+    backend: BackendName = "auto",
+    **settings: Any,
+) -> Rendering:
+    """Render N Gaussians into C cameras of one image size; conventions and names are those of gsplat's `rasterization`.
+
+    means: [N,3] world units. quats: [N,4] wxyz, any length. scales: [N,3] standard deviations. opacities: [N] in 0..1.
+    colors: [N,D] or per camera [C,N,D], D channels of any kind; with `sh_degree` spherical-harmonics coefficients
+        [N,K,3] or [C,N,K,3], K >= (sh_degree + 1)^2, and D = 3.
+    viewmats: [C,4,4] world-to-camera, OpenCV axes (x right, y down, z forward). Ks: [C,3,3] pixels, not differentiable.
+    backgrounds: [C,D], seen through what the Gaussians leave; black when None.
+    backend: "torch" (any float type; the oracle), "cpu" (numba; computes in float32), "gsplat" (CUDA), or "auto": gsplat
+        for CUDA tensors, else cpu when numba is installed, else torch.
+    settings: fields of :class:`Settings`: near_plane, far_plane, radius_clip, eps2d, rasterize_mode, sh_degree, depth.
+
+    Differentiable in means, quats, scales, opacities, colors, viewmats and backgrounds. A Gaussian with a NaN or an
+    infinity anywhere is not drawn and gets zero gradients; one in `viewmats`, `Ks` or `backgrounds` is a ValueError.
+
+    >>> out = render(means, quats, scales, opacities, colors, viewmats, Ks, 128, 96)
+    >>> (out.colors - target).abs().mean().backward()
+    """
+    options = Settings(**settings)
+    _check_shapes(means, quats, scales, opacities, colors, viewmats, Ks, width, height, backgrounds, options)
+    name = _choose(backend, means)
+    means, quats, scales, opacities, colors = _drop_nonfinite(
+        (means, quats, scales, opacities, colors), options.sh_degree
+    )
+    if name == "gsplat":
+        from recon.raster import gsplat_backend
+
+        return gsplat_backend.render(
+            (means, quats, scales, opacities, colors), viewmats, Ks, (width, height), backgrounds, options
+        )
+    engine = _engine(name)
+    splats = engine.project(means, quats, scales, opacities, viewmats, Ks, width, height, options)
+    features = colors
+    if options.sh_degree is not None:
+        features = sh.view_colors(options.sh_degree, means, colors, viewmats)
+    image, depths, alphas = engine.rasterize(splats, features, width, height, options.depth)
+    if backgrounds is not None:
+        image = image + (1 - alphas) * backgrounds[:, None, None, :]
+    return Rendering(image, alphas, depths, splats.means2d, splats.radii, name)
+
+
+def warmup() -> None:
+    """Compile the CPU back end now, or load its compiled code; without numba there is nothing to do."""
+    if _has_numba():
+        _engine("cpu").warmup()
+
+
+def set_threads(n: int) -> None:
+    """Let the CPU back end use `n` threads, the caller's included; results do not depend on it, to the last bit."""
+    from recon.raster.cpu import threads
+
+    threads.set_threads(n)
+
+
+def _engine(name: str) -> ModuleType:
+    if name == "torch":
+        from recon.raster import torch_backend
+
+        return torch_backend
+    from recon.raster.cpu import backend as cpu_backend
+
+    return cpu_backend
+
+
+def _choose(backend: str, means: Tensor) -> str:
+    """The back end that will run, announced once when it was chosen here."""
+    if backend not in ("auto", "torch", "cpu", "gsplat"):
+        raise ValueError(f"backend: expected 'auto', 'torch', 'cpu' or 'gsplat', got {backend!r}")
+    if backend != "auto":
+        if backend == "cpu" and not _has_numba():
+            raise ValueError("backend='cpu' needs numba: pip install numba, or use backend='torch' (15-40x slower)")
+        if backend in ("cpu", "torch") and means.is_cuda:
+            raise ValueError(f"backend={backend!r} works on CPU tensors, got {means.device}: move them with .cpu()")
+        return backend
+    if means.is_cuda:
+        name, reason = "gsplat", "the tensors are on a CUDA device"
+    elif _has_numba():
+        name, reason = "cpu", "numba kernels; pass CUDA tensors to use gsplat"
+    else:
+        name, reason = "torch", "numba is not installed: expect 15-40 times the time of backend 'cpu'"
+    if name not in _announced:
+        _announced.add(name)
+        logger.warning("recon.raster renders with backend '%s' (%s)", name, reason)
+    return name
+
+
+def _has_numba() -> bool:
+    return importlib.util.find_spec("numba") is not None
+
+
+def _drop_nonfinite(gaussians: tuple[Tensor, ...], sh_degree: int | None) -> tuple[Tensor, ...]:
+    """Replace Gaussians that hold a NaN or an infinity by ones that are not drawn; the rest pass untouched.
+
+    The sum over a tensor is finite when all its entries are (save for sums beyond the largest float, which only cost
+    the slower exact test), and takes a small fraction of the time of a rendering.
+    """
+    with torch.no_grad():
+        if all(_finite_sum(t) for t in gaussians):
+            return gaussians
+        means, colors = gaussians[0], gaussians[4]
+        per_camera = colors.ndim == 4 or (colors.ndim == 3 and (sh_degree is None))
+        good = torch.ones(len(means), dtype=torch.bool, device=means.device)
+        for t in (*gaussians[:4], colors.movedim(0, 1) if per_camera else colors):
+            good &= t.isfinite().reshape(len(means), -1).all(-1)
+
+    def keep(t: Tensor, axis: int = 0) -> Tensor:
+        return torch.where(good.reshape(-1, *[1] * (t.ndim - 1 - axis)), t, 0.0)
+
+    return *(keep(t) for t in gaussians[:4]), keep(colors, int(per_camera))
+
+
+def _finite_sum(t: Tensor) -> bool:
+    if t.is_cuda:
+        return bool(t.sum().isfinite())
+    with np.errstate(all="ignore"):
+        return bool(
+            np.isfinite(t.detach().numpy().sum())
+        )  # torch would wake its own pool, which then competes with ours
+
+
+def _check_shapes(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    backgrounds: Tensor | None,
+    options: Settings,
+) -> None:
+    """Raise ValueError for arguments whose shapes, types or cameras do not fit together."""
+    n, c = len(means), len(viewmats)
+
+    def expect(name: str, tensor: Tensor, *shapes: tuple[int | str, ...]) -> None:
+        for shape in shapes:
+            if tensor.ndim == len(shape) and all(
+                isinstance(want, str) or want == got for want, got in zip(shape, tensor.shape, strict=True)
+            ):
+                break
+        else:
+            wanted = " or ".join("[" + ",".join(map(str, s)) + "]" for s in shapes)
+            raise ValueError(
+                f"{name}: expected {wanted} (N = {n} from means, C = {c} from viewmats), got {list(tensor.shape)}"
+            )
+        if tensor.dtype != means.dtype or not tensor.is_floating_point() or tensor.device != means.device:
+            raise ValueError(
+                f"{name}: expected {means.dtype} on {means.device} like means (a float type), "
+                f"got {tensor.dtype} on {tensor.device}: convert with .to(means)"
+            )
+
+    expect("means", means, ("N", 3))
+    expect("quats", quats, (n, 4))
+    expect("scales", scales, (n, 3))
+    expect("opacities", opacities, (n,))
+    expect("viewmats", viewmats, ("C", 4, 4))
+    expect("Ks", Ks, (c, 3, 3))
+    d = 3 if options.sh_degree is not None else colors.shape[-1]
+    if options.sh_degree is None:
+        expect("colors", colors, (n, "D"), (c, n, "D"))
+        if d == 0:
+            raise ValueError(
+                "colors: expected at least one channel, got none: pass ones [N,1] to render the alpha only"
+            )
+    else:
+        expect("colors", colors, (n, "K", 3), (c, n, "K", 3))
+        if colors.shape[-2] < (options.sh_degree + 1) ** 2:
+            raise ValueError(
+                f"colors: sh_degree {options.sh_degree} needs {(options.sh_degree + 1) ** 2} coefficients, "
+                f"got {colors.shape[-2]}"
+            )
+    if width < 1 or height < 1:
+        raise ValueError(f"width, height: expected at least one pixel, got {width} x {height}")
+    if c < 1:
+        raise ValueError("viewmats: expected at least one camera, got none")
+    cameras = {"viewmats": viewmats, "Ks": Ks}
+    if backgrounds is not None:
+        expect("backgrounds", backgrounds, (c, d))
+        cameras["backgrounds"] = backgrounds
+    for name, tensor in cameras.items():
+        if not _finite_sum(tensor):
+            raise ValueError(
+                f"{name}: expected finite entries, got NaN or infinity: a camera or colour of the caller has diverged"
+            )
