@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -13,6 +14,8 @@ from .priors.cache import Cache, digest_of
 from .settle import Answer
 from .sync import Job, MapLike
 from .types import Alignment, Matches, Status, TrackSet
+
+log = logging.getLogger("otsync")
 
 
 @dataclass(frozen=True)
@@ -32,7 +35,11 @@ class KeptPairs:
             # two threads may ask for the digest of one set at a time: it is cheap beside a pair
             key = (digest(item.a), digest(item.b), item.matcher, item.aligner, item.refiner)
             arrays = self.cache.arrays("pair", key, lambda: pack(function(item)))
-            return unpack(item.pair, arrays)
+            try:
+                return unpack(item.pair, arrays)
+            except (KeyError, ValueError, TypeError) as error:
+                log.warning("pair %s: what was kept does not read (%s); computing it again", item.pair, error)
+                return function(item)
 
         return list(self.map(kept, items))
 

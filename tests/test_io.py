@@ -237,6 +237,21 @@ def test_video_frames_keep_the_containers_clock(tmp_path):
         assert abs(float(video[k].mean()) - (4 * k + 20)) < 2.5, k
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "ffconcat version 1.0\nfile whole.mp4\n",
+        "#EXTM3U\n#EXT-X-TARGETDURATION:5\n#EXTINF:5,\nwhole.mp4\n#EXT-X-ENDLIST\n",
+    ],
+)
+def test_a_playlist_that_calls_itself_a_video_reads_no_other_file(tmp_path, text):
+    write_video(tmp_path / "whole.mp4", [3000 * k for k in range(20)])
+    for name in ("list.mp4", "list.m3u8", "list.txt"):
+        (tmp_path / name).write_text(text)
+        with pytest.raises(ValueError, match="list"):
+            VideoFrames(tmp_path / name)
+
+
 @GUARD
 @given(data=st.data())
 def test_damaged_videos_are_clean_errors(tmp_path, data):

@@ -21,6 +21,9 @@ from jaxtyping import Float
 from ..files import existing
 from .images import read_image, read_npy
 
+CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,flv,mxf,ogg"
+"""Containers that hold their own frames. FFmpeg also knows playlists, which would have it read other files."""
+
 KEPT = 8
 """Decoded frames that a video file keeps, so that a step back does not seek."""
 
@@ -140,7 +143,7 @@ class VideoFrames(LazyFrames):
     def _open(self) -> Any:
         import av
 
-        return av.open(str(self.path))
+        return av.open(f"file:{self.path.resolve()}", options={"format_whitelist": CONTAINERS})
 
     def _errors(self) -> _Errors:
         return _Errors(self.path)
