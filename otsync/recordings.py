@@ -5,6 +5,10 @@ Routes::
     tracks    depth is given          tracks -> lift -> match, scan, refine -> graph
     epipolar  cameras only            tracks -> epipolar scan -> graph
     stereo    a static rig            the epipolar route, then hull and stereo at its offsets, then the tracks route
+
+Measured on basketball, 8 cameras of 120 frames of 640 x 360, two cores: the epipolar route 45 s cold, 3 s warm, 0.42 GB
+at most; the stereo route 25 s more, 0.79 GB. Longer clips take about 30 kB a frame and video for masks, and as much as
+the 4000 longest tracks of a video take (32 kB a frame) while it is tracked.
 """
 
 from __future__ import annotations

@@ -25,8 +25,8 @@ class ChainedFlow:
         grid: spacing of seeds in pixels; a seed closer than half of it to a living track is left out.
         every: frames between seedings. phase: the first one.
         agree: largest distance of the way there and back, in pixels, plus ``agree_share`` of the step's length.
-        min_life: frames below which a track is dropped. most: tracks that are returned, the longest-lived (32 kB each
-            per 4000 frames: memory stays bounded on long videos).
+        min_life: frames below which a track is dropped. most: tracks that are returned, the longest-lived: 32 kB a frame,
+            so that memory stays bounded on long videos.
         max_gap, join: tracks that end are joined to ones that begin up to ``max_gap`` frames later within ``join``
             pixels of where constant velocity leads; 0 frames: no joining.
     """
