@@ -96,57 +96,56 @@ def _trimmed(values, n, share):
 
 
 @_jit()
-def curve_distances(A, B, share):
-    """A (Na,S,3), B (Nb,R,3), nan unseen: trimmed mean distance to the nearest sample, both ways averaged; (Na,Nb)."""
-    Na, Nb = len(A), len(B)
+def curve_distances(A, B, pairs_a, pairs_b, share):
+    """A (Na,S,3), B (Nb,R,3), nan unseen: trimmed mean distance to the nearest sample, both ways averaged; (P,)."""
     S, R = A.shape[1], B.shape[1]
-    out = np.full((Na, Nb), np.nan)
+    out = np.full(len(pairs_a), np.nan)
     to_b, to_a = np.empty(S), np.empty(R)
-    for i in range(Na):
-        for j in range(Nb):
+    for p in range(len(pairs_a)):
+        i, j = pairs_a[p], pairs_b[p]
+        for r in range(R):
+            to_a[r] = np.inf
+        n = 0
+        for s in range(S):
+            if np.isnan(A[i, s, 0]):
+                continue
+            best = np.inf
             for r in range(R):
-                to_a[r] = np.inf
-            n = 0
-            for s in range(S):
-                if np.isnan(A[i, s, 0]):
+                if np.isnan(B[j, r, 0]):
                     continue
-                best = np.inf
-                for r in range(R):
-                    if np.isnan(B[j, r, 0]):
-                        continue
-                    d = (A[i, s, 0] - B[j, r, 0]) ** 2 + (A[i, s, 1] - B[j, r, 1]) ** 2 + (A[i, s, 2] - B[j, r, 2]) ** 2
-                    if d < best:
-                        best = d
-                    if d < to_a[r]:
-                        to_a[r] = d
-                if best < np.inf:
-                    to_b[n] = np.sqrt(best)
-                    n += 1
-            m = 0
-            for r in range(R):
-                if to_a[r] < np.inf:
-                    to_a[m] = np.sqrt(to_a[r])
-                    m += 1
-            if n and m:
-                out[i, j] = 0.5 * (_trimmed(to_b, n, share) + _trimmed(to_a, m, share))
+                d = (A[i, s, 0] - B[j, r, 0]) ** 2 + (A[i, s, 1] - B[j, r, 1]) ** 2 + (A[i, s, 2] - B[j, r, 2]) ** 2
+                if d < best:
+                    best = d
+                if d < to_a[r]:
+                    to_a[r] = d
+            if best < np.inf:
+                to_b[n] = np.sqrt(best)
+                n += 1
+        m = 0
+        for r in range(R):
+            if to_a[r] < np.inf:
+                to_a[m] = np.sqrt(to_a[r])
+                m += 1
+        if n and m:
+            out[p] = 0.5 * (_trimmed(to_b, n, share) + _trimmed(to_a, m, share))
     return out
 
 
 @_jit()
-def synchronous_distances(A, B, at, least):
+def synchronous_distances(A, B, pairs_a, pairs_b, at, least):
     """Mean distance of A[i,t] and B[j,at[t]] (at -1: none) over frames that both see; nan below ``least`` of them."""
-    out = np.full((len(A), len(B)), np.nan)
-    for i in range(len(A)):
-        for j in range(len(B)):
-            total, n = 0.0, 0
-            for t in range(A.shape[1]):
-                u = at[t]
-                if u < 0 or np.isnan(A[i, t, 0]) or np.isnan(B[j, u, 0]):
-                    continue
-                total += np.sqrt(
-                    (A[i, t, 0] - B[j, u, 0]) ** 2 + (A[i, t, 1] - B[j, u, 1]) ** 2 + (A[i, t, 2] - B[j, u, 2]) ** 2
-                )
-                n += 1
-            if n >= least:
-                out[i, j] = total / n
+    out = np.full(len(pairs_a), np.nan)
+    for p in range(len(pairs_a)):
+        i, j = pairs_a[p], pairs_b[p]
+        total, n = 0.0, 0
+        for t in range(A.shape[1]):
+            u = at[t]
+            if u < 0 or np.isnan(A[i, t, 0]) or np.isnan(B[j, u, 0]):
+                continue
+            total += np.sqrt(
+                (A[i, t, 0] - B[j, u, 0]) ** 2 + (A[i, t, 1] - B[j, u, 1]) ** 2 + (A[i, t, 2] - B[j, u, 2]) ** 2
+            )
+            n += 1
+        if n >= least:
+            out[p] = total / n
     return out

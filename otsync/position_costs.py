@@ -8,9 +8,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
+from .costs import Cost
 from .types import TrackSet
+
+SCALE_SAMPLES = 2000
+"""Tracks that the size of the scene is measured on; all pairs of 50,000 would take gigabytes."""
 
 
 @dataclass(frozen=True)
@@ -34,10 +38,15 @@ class CurveDistance:
     samples: int = 50
 
     def matrix(self, a: TrackSet, b: TrackSet) -> Float[np.ndarray, "Na Nb"]:
+        return all_pairs(self, a, b)
+
+    def pairs(
+        self, a: TrackSet, b: TrackSet, i: Int[np.ndarray, " P"], j: Int[np.ndarray, " P"]
+    ) -> Float[np.ndarray, " P"]:
         from .kernels_tracks import curve_distances
 
         xa, xb = positions_in_common_frame(a, b)
-        distance = curve_distances(_thinned(xa, self.samples), _thinned(xb, self.samples), self.share)
+        distance = curve_distances(_thinned(xa, self.samples), _thinned(xb, self.samples), i, j, self.share)
         unit = self.scale * scene_scale(xa, xb)
         return np.where(np.isfinite(distance), np.minimum(distance / unit, self.cap), self.cap)
 
@@ -51,10 +60,13 @@ class MedianPosition:
     cap: float = 3.0
 
     def matrix(self, a: TrackSet, b: TrackSet) -> Float[np.ndarray, "Na Nb"]:
-        from scipy.spatial.distance import cdist
+        return all_pairs(self, a, b)
 
+    def pairs(
+        self, a: TrackSet, b: TrackSet, i: Int[np.ndarray, " P"], j: Int[np.ndarray, " P"]
+    ) -> Float[np.ndarray, " P"]:
         xa, xb = positions_in_common_frame(a, b)
-        distance = cdist(_medians(xa), _medians(xb))
+        distance = np.linalg.norm(_medians(xa)[i] - _medians(xb)[j], axis=1)
         unit = self.scale * scene_scale(xa, xb)
         return np.where(np.isfinite(distance), np.minimum(distance / unit, self.cap), self.cap)
 
@@ -76,6 +88,11 @@ class SynchronousDistance:
     rate: float = 1.0
 
     def matrix(self, a: TrackSet, b: TrackSet) -> Float[np.ndarray, "Na Nb"]:
+        return all_pairs(self, a, b)
+
+    def pairs(
+        self, a: TrackSet, b: TrackSet, i: Int[np.ndarray, " P"], j: Int[np.ndarray, " P"]
+    ) -> Float[np.ndarray, " P"]:
         from .kernels_tracks import synchronous_distances
 
         xa, xb = positions_in_common_frame(a, b)
@@ -86,9 +103,15 @@ class SynchronousDistance:
             np.abs(tb[at] - ta) <= 0.51 * max(step, float(np.median(np.diff(tb))) if len(tb) > 1 else 0), at, -1
         )
         least = max(2, round(self.min_overlap / step))
-        distance = synchronous_distances(xa, xb, at, least)
+        distance = synchronous_distances(xa, xb, i, j, at, least)
         unit = self.scale * scene_scale(xa, xb)
         return np.where(np.isfinite(distance), np.minimum(distance / unit, self.cap), self.cap)
+
+
+def all_pairs(cost: Cost, a: TrackSet, b: TrackSet) -> Float[np.ndarray, "Na Nb"]:
+    """The matrix of a cost that is written for pairs."""
+    i, j = np.indices((len(a), len(b))).reshape(2, -1)
+    return cost.pairs(a, b, i, j).reshape(len(a), len(b))
 
 
 def positions_in_common_frame(a: TrackSet, b: TrackSet) -> tuple[np.ndarray, np.ndarray]:
@@ -109,6 +132,7 @@ def scene_scale(xa: Float[np.ndarray, "Na T 3"], xb: Float[np.ndarray, "Nb T 3"]
 
     medians = np.concatenate([_medians(xa), _medians(xb)])
     medians = medians[np.isfinite(medians[:, 0])]
+    medians = medians[:: max(1, len(medians) // SCALE_SAMPLES)]
     distance = pdist(medians) if len(medians) > 1 else np.zeros(0)
     return float(np.median(distance)) if distance.size and np.median(distance) > 0 else 1.0
 

@@ -14,7 +14,7 @@ from otsync.epipolar import EpipolarScan, mixture, separate_peaks
 from otsync.epipolar_fit import EpipolarRefine, detrended
 from otsync.geometry import common_target, fundamental, fundamentals, sampson, undistort, view_angle
 from otsync.partners import Candidates
-from otsync.position_costs import CurveDistance, MedianPosition, scene_scale
+from otsync.position_costs import CurveDistance, MedianPosition, SynchronousDistance, scene_scale
 from otsync.types import Camera
 
 from .recording_world import paths, ring
@@ -245,6 +245,15 @@ def test_positions_are_compared_only_in_one_declared_frame():
             with pytest.raises(ValueError, match="frame"):
                 cost.matrix(a, TrackSet(x, fps=FPS, frame=frame))
     np.testing.assert_allclose(np.diag(MedianPosition().matrix(a, a)), 0, atol=1e-12)
+
+
+@pytest.mark.parametrize("cost", [CurveDistance(), MedianPosition(), SynchronousDistance(0.1)], ids=repr)
+def test_costs_of_pairs_are_entries_of_the_matrix(cost):
+    """AnchoredFGW reads costs at candidates, never as a matrix of all pairs."""
+    t = np.arange(60) / FPS
+    a, b = lifted(paths(t, 7, 3)), lifted(paths(t + 0.1, 5, 3))
+    i, j = np.array([0, 6, 3, 3]), np.array([4, 0, 2, 1])
+    np.testing.assert_array_equal(cost.pairs(a, b, i, j), cost.matrix(a, b)[i, j])
 
 
 def test_candidates_hold_both_sides_best_and_the_cheapest_first():

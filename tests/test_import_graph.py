@@ -40,7 +40,7 @@ ALLOWED = {
     "priors": {"types", "files", "geometry"},
     "lift": {"types"},
     "tracks": {"types", "geometry", "priors", "kernels_tracks"},
-    "position_costs": {"types", "kernels_tracks"},
+    "position_costs": {"types", "costs", "kernels_tracks"},
     "partners": {"types", "costs", "match", "position_costs"},
     "epipolar": {"types", "clock", "splines", "align", "geometry", "kernels_tracks"},
     "epipolar_fit": {"types", "clock", "splines", "epipolar", "geometry", "trust"},
