@@ -125,7 +125,9 @@ def fit_clock(
     sides = Side.of(a, b, window, True), Side.of(b, a, window, False)
     clock = start
     centre = _centre(a, b, start)
-    for n in range(1, iterations + 1):
+    n = 0
+    while True:
+        n += 1
         system = _linearise(sides, clock, centre, fit_rate)
         if system is None:
             return None
@@ -134,7 +136,7 @@ def fit_clock(
         turn = float(np.clip(step[1], -LONGEST_RATE_STEP, LONGEST_RATE_STEP)) if fit_rate else 0.0
         rate = clock.rate + turn
         clock = Clock(clock.offset + shift - turn * centre, rate)
-        if abs(shift) < CONVERGED and abs(turn) < CONVERGED / 30 and n > 3:
+        if n >= iterations or (abs(shift) < CONVERGED and abs(turn) < CONVERGED / 30 and n > 3):
             break
     covariance = system.covariance()
     if fit_rate:

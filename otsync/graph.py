@@ -144,7 +144,7 @@ def _cauchy(r: np.ndarray) -> np.ndarray:
     return 1 / (1 + (r / CAUCHY) ** 2)
 
 
-def _reweighted(A, d, s, x, weight, iterations: int = 60) -> tuple[np.ndarray, np.ndarray]:  # type: ignore[no-untyped-def]
+def _reweighted(A, d, s, x, weight, iterations: int = 60) -> tuple[np.ndarray, np.ndarray]:
     """Iteratively reweighted least squares of A x = d with sigmas s; the answer and its normal matrix."""
     for _ in range(iterations):
         w = weight((A @ x - d) / s) / s**2

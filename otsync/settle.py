@@ -324,7 +324,7 @@ def _trusted(
             ]  # fmt: skip
             joined = any(edges[k].trusted for k in near)
             if not joined and graph.curves and len(near) >= max(2, degree[v] / 2):
-                joined = undoubted(CurveSum(n, [edges[k] for k in near], FRAME), v, x, trust)
+                joined = undoubted(CurveSum(n, [edges[k] for k in near], FRAME), int(v), x, trust)
             if joined:
                 trusted[v] = growing = True
     return trusted

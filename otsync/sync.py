@@ -61,13 +61,13 @@ def synchronize(
 
     A pair that fails gets a status and nan; the others live. Wrong input raises ValueError before any work.
     """
-    reference = check_tracks(tracks, reference, xyz=getattr(aligner, "needs_xyz", True))
+    chosen = check_tracks(tracks, reference, xyz=getattr(aligner, "needs_xyz", True))
     if rate not in ("fixed", "fit"):
         raise ValueError(f"rate: expected 'fixed' or 'fit'; found {rate!r}.")
     started = time.perf_counter()
     graph = graph or Graph()
     refiner = with_rate(refiner, rate)
-    centre = most_seen(tracks) if reference is None else reference
+    centre = most_seen(tracks) if chosen is None else chosen
     pairs = given_pairs(matches, tracks) if matches is not None else graph.pairs(len(tracks), centre)
     jobs = [
         Job(pair, tracks[pair[0]], tracks[pair[1]], matcher, aligner, refiner, matches[pair] if matches else None)
@@ -79,7 +79,7 @@ def synchronize(
         return list(map(run_refit, [Refit.of(*task, tracks, refiner) for task in tasks])) if tasks else []
 
     def settled(answers: Sequence[Answer]) -> Settled:
-        return settle(len(tracks), answers, reference, centre, graph, trust, refit)
+        return settle(len(tracks), answers, chosen, centre, graph, trust, refit)
 
     found = settled(list(map(run, jobs)))
     for _ in range(rematch if matches is None else 0):
@@ -169,7 +169,7 @@ def with_rate(refiner: Refiner | None, rate: Literal["fixed", "fit"]) -> Refiner
     """The refiner (or the default) told how to treat rates, where it can be told."""
     refiner = SplineRefine() if refiner is None else refiner
     if dataclasses.is_dataclass(refiner) and hasattr(refiner, "rate"):
-        return dataclasses.replace(refiner, rate=rate)  # type: ignore[type-var]
+        return dataclasses.replace(refiner, rate=rate)
     return refiner
 
 

@@ -43,5 +43,5 @@ class Trust:
     spread: float = 0.5 / 30
     correlation: float = 0.55
     blur: float = 5.6 / 30
-    rate_sigmas: float = 4.0
+    rate_sigmas: float = 6.0
     rate_gain: float = 1.3

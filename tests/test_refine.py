@@ -47,7 +47,7 @@ def test_exact_tracks_give_exact_offsets(offset, fps_b):
 
 def test_the_step_is_the_gradient_of_the_residual():
     """The Jacobian in the normal equations is the finite difference of the detrended residual."""
-    a, b, _m = films(noise=0.01)
+    a, b, _ = films(noise=0.01)
     curves = TrackSplines(a.times, a.positions()), TrackSplines(b.times, b.positions())
     h, clock = 1e-5, Clock(0.31)
     for forward in (True, False):
@@ -207,7 +207,7 @@ def test_no_answer_stays_no_answer_and_unrefined_changes_nothing():
 
 
 def test_fit_without_common_samples_is_none():
-    a, b, _m = films()
+    a, b, _ = films()
     curves = TrackSplines(a.times, a.positions()), TrackSplines(b.times, b.positions())
     assert fit_clock(*curves, Clock(50.0), 14 / 30) is None
 

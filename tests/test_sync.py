@@ -77,7 +77,7 @@ def test_units_and_rigid_motion_change_nothing(four):
 
 def test_a_wrong_pair_is_outvoted_and_fitted_anew(four):
     """One pair's matches come from elsewhere; a given answer far off is contradicted by the cycles."""
-    tracks, _truth, given, found = four
+    tracks, _, given, found = four
 
     class Misled:
         """The default scan, led astray on one pair."""
@@ -178,7 +178,7 @@ def test_synchronous_distances_against_numpy():
 
 
 def test_the_star_of_the_paper_and_no_refinement(four):
-    tracks, _truth, given, _ = four
+    tracks, _, given, _ = four
     found = synchronize(
         tracks, matches={k: m for k, m in given.items() if k[0] == 0}, aligner=DTW(), refiner=Unrefined()
     )

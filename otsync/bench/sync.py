@@ -112,7 +112,7 @@ def method_rows(seeds: Sequence[int]) -> list[Row]:
 
 def summarise(rows: Sequence[Row]) -> list[Row]:
     """By method and preset: mean, median, p90, mean by band, share wrong and flagged, CPU-seconds."""
-    summary = []
+    summary: list[Row] = []
     for name in METHODS:
         for preset in PRESETS:
             own = [r for r in rows if r["method"] == name and r["preset"] == preset]
@@ -140,7 +140,7 @@ def summarise(rows: Sequence[Row]) -> list[Row]:
 
 def by_class(rows: Sequence[Row]) -> list[Row]:
     """Errors, trust and worst trusted answer by preset, class and band."""
-    found = []
+    found: list[Row] = []
     for preset in dict.fromkeys(r["preset"] for r in rows):
         for key in ("class", "band"):
             for value in dict.fromkeys(r[key] for r in rows):
@@ -162,7 +162,7 @@ def by_class(rows: Sequence[Row]) -> list[Row]:
 
 
 def graph_rows(seeds: Sequence[int], videos: int = 8) -> list[Row]:
-    rows = []
+    rows: list[Row] = []
     for preset in PRESETS:
         worlds = [many(motion, preset, videos, seed) for motion in motions() for seed in list(seeds)[:1]]
         for name, graph in GRAPHS.items():

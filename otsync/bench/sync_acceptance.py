@@ -51,7 +51,7 @@ def answer(case: Case, refiner: SplineRefine | None = None) -> Alignment:
 
 def pair_rows(seeds: Sequence[int], presets: Sequence[str] = ("mid", "hard", "brutal")) -> list[Row]:
     """Every pair's error, sigma (frames), trust and CPU-seconds with the defaults."""
-    rows = []
+    rows: list[Row] = []
     for case in pair_cases(presets, seeds):
         started = time.process_time()
         found = answer(case)
@@ -162,10 +162,10 @@ def odd_cases(seeds: Sequence[int]) -> Iterator[tuple[str, Alignment, float]]:
                     ("overlap 50", 100.0, 150),
                     ("40 frames", 6.0, 40),
                 ):
-                    tracks, truth = simulate(
+                    (a, b), truth = simulate(
                         motion, preset=preset, frames=frames, offsets=[0, offset / FPS], seed=int(rng.integers(2**31))
                     )
-                    case = Case(name, preset, 0, seed, *tracks, truth.matches(0, 1), truth, offset)
+                    case = Case(name, preset, 0, seed, a, b, truth.matches(0, 1), truth, offset)
                     yield kind, (found := answer(case)), abs(found.offset * FPS - offset)
                 other = motions()[(motions().index(motion) + 1 + seed) % len(motions())]
                 a, b = (
@@ -193,8 +193,8 @@ def flags(rows: Sequence[Row], seeds: Sequence[int]) -> Iterator[Check]:
             wrong += 1
             caught += flagged
     always = {"static", "unrelated", "no overlap", "1 matches", "2 matches", "3 matches", "4 matches"}
-    for kind, flagged in sorted(by_kind.items()):
-        share = float(np.mean(flagged))
+    for kind, marks in sorted(by_kind.items()):
+        share = float(np.mean(marks))
         yield at_least(f"flagged: {kind}", share, 1.0) if kind in always else Check(f"flagged: {kind}", share, "", True)
     usual = [r for r in rows if r["preset"] in ("mid", "hard")]
     wrong += sum(r["error"] > WRONG for r in usual)
@@ -212,13 +212,13 @@ def clocks(seeds: Sequence[int]) -> Iterator[Check]:
             for frames, rate in ((900, 30 / 29.97), (150, 30 / 29.97), (900, 1.0)):
                 offset = float(np.random.default_rng([seed, frames]).uniform(-30, 30))
                 world = seed * 7 + frames
-                tracks, truth = simulate(
+                (a, b), truth = simulate(
                     motion, preset="mid", frames=frames, rates=[1, rate], offsets=[0, offset / FPS], seed=world
                 )
                 m = truth.matches(0, 1)
-                start = align(*tracks, m, throw=False)
+                start = align(a, b, m, throw=False)
                 for kind in ("fixed", "fit") if (frames, rate > 1) == (900, True) else ("fit",):
-                    found = refine(*tracks, m, start, SplineRefine(rate=kind), throw=False)
+                    found = refine(a, b, m, start, SplineRefine(rate=kind), throw=False)
                     if frames == 900 and rate > 1:
                         e[kind].append(abs(found.offset * FPS - offset))
                     elif kind == "fit":
@@ -233,7 +233,9 @@ def clocks(seeds: Sequence[int]) -> Iterator[Check]:
         whole.append(abs(answer(case).offset * FPS - case.offset))
         dropped.append(abs(answer(dataclasses.replace(case, b=frames_of(case.b, keep))).offset * FPS - case.offset))
     yield at_most(
-        "20 % of frames dropped, timestamps kept: mean error over that without", np.mean(dropped) / np.mean(whole), 1.2
+        "20 % of frames dropped, timestamps kept: mean error over that without",
+        float(np.mean(dropped) / np.mean(whole)),
+        1.2,
     )
 
 
@@ -255,7 +257,9 @@ def baseline(seeds: Sequence[int]) -> Iterator[Check]:
                 found = align(case.a, case.b, case.matches, DTW(), throw=False)
                 paper.append(abs(found.offset * FPS - case.offset))
         yield at_least(
-            f"{preset}, 30-50: mean error of the paper's DTW over the default's", np.mean(paper) / np.mean(ours), 3
+            f"{preset}, 30-50: mean error of the paper's DTW over the default's",
+            float(np.mean(paper) / np.mean(ours)),
+            3,
         )
 
 
