@@ -38,8 +38,9 @@ def align(
         aligner: the algorithm; default :class:`LikelihoodScan`; the paper's is :class:`DTW`.
         throw: raise :class:`otsync.Refused` when the answer is flagged, instead of returning it.
     """
-    a.check("a")
-    b.check("b")
+    needs_xyz = getattr(aligner, "needs_xyz", True)  # the epipolar scan reads pixels
+    a.check("a", xyz=needs_xyz)
+    b.check("b", xyz=needs_xyz)
     matches.check("matches", len(a), len(b))
     started = time.perf_counter()
     found = (aligner or LikelihoodScan())(a, b, matches)

@@ -1,4 +1,4 @@
-"""The command line: ``otsync demo | simulate | match | sync | bench``, over the same dataclasses as the library.
+"""The command line: ``otsync demo | simulate | match | init | check | sync | bench``, over the same dataclasses as the library.
 
 Exit codes: 0 done; 1 an answer was refused (its status is printed); 2 bad arguments or files; 130 interrupted.
 """
@@ -15,6 +15,7 @@ import tyro
 
 from . import __version__
 from .align import DTW, ConstantShift, LikelihoodScan
+from .commands_recordings import Check, Init, RecordingOptions, sync_recording
 from .graph import Graph
 from .match import (
     EntropicFGW,
@@ -137,16 +138,18 @@ class Match:
 
 @dataclass
 class Sync:
-    """Synchronise videos from their track sets.
+    """Synchronise a recording (scene.json or its folder), or videos from their track sets.
 
-    Example: otsync sync world/*.npz --out result
+    Examples: otsync sync recording/ --out result; otsync sync world/*.npz --out result
     The paper's method: otsync sync world/*.npz --rematch 0 --graph.extra 0 aligner:dtw refiner:unrefined
+    A recording's route brings its own matcher, aligner and refiner; --recording.route chooses another.
     """
 
     tracks: tyro.conf.Positional[tuple[Path, ...]]
-    """Track sets (.npz written by otsync), one per video, in one world frame."""
+    """A scene.json or a folder with one (also in Panoptic layout); or track sets (.npz written by otsync), one per
+    video, in one world frame."""
     out: Path = Path("sync")
-    """Folder for offsets.json and report.html."""
+    """Folder for offsets.json and report.html, and the stages of a recording, from which a killed run continues."""
     reference: str | None = None
     """Name of the reference video, or "auto" for the one with the surest pairs; default: the first."""
     truth: Path | None = None
@@ -161,8 +164,11 @@ class Sync:
     matcher: Matcher = field(default_factory=FusedGromovWasserstein)
     aligner: Aligner = field(default_factory=LikelihoodScan)
     refiner: Refiner = field(default_factory=SplineRefine)
+    recording: RecordingOptions = field(default_factory=RecordingOptions)
 
     def run(self) -> int:
+        if len(self.tracks) == 1 and self.tracks[0].suffix != ".npz":
+            return sync_recording(self.tracks[0], self.out, self.recording, reference=self.reference, truth=self.truth)
         if len(self.tracks) < 2:
             raise ValueError(f"tracks: expected at least two .npz files; found {len(self.tracks)}.")
         tracks = [TrackSet.load(path) for path in self.tracks]
@@ -188,20 +194,32 @@ SUITES = {"core": "otsync.bench.core", "raster": "recon.bench_raster"}
 class Bench:
     """What accuracy costs in time: tables, CSV, JSON and plots, with machine and versions.
 
-    Example: otsync bench core --out bench/out --gate
+    Examples: otsync bench core --out bench/out --gate; otsync bench panoptic recording/ --json
     """
 
-    suite: tyro.conf.Positional[Literal["core", "raster", "all"]]
+    suite: tyro.conf.Positional[Literal["core", "raster", "panoptic", "all"]]
+    scene: tyro.conf.Positional[Path | None] = None
+    """For panoptic: a truly synchronised recording (its folder or scene.json). "all" leaves it out."""
     out: Path = Path("bench/out")
     """Folder for CSV, JSON and plots."""
     gate: bool = False
     """Compare with the committed baseline; exit code 1 when something got worse."""
     rebase: bool = False
     """Make the figures of this run the baseline that --gate compares with."""
+    json: bool = False
+    """For panoptic: one line of JSON on standard output instead of tables."""
+    cache: Path | None = None
+    """For panoptic: where tracks and depth are kept; default: stages in --out."""
 
     def run(self) -> int:
         import importlib
 
+        if self.suite == "panoptic":
+            if self.scene is None:
+                raise ValueError("scene: expected a recording: otsync bench panoptic SCENE.")
+            return importlib.import_module("otsync.bench.panoptic").run(
+                self.scene, self.out, json=self.json, cache=self.cache
+            )
         suites = SUITES.values() if self.suite == "all" else [SUITES[self.suite]]
         return max(importlib.import_module(name).run(self.out, gate=self.gate, rebase=self.rebase) for name in suites)
 
@@ -210,6 +228,8 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "demo": Demo,
     "simulate": Simulate,
     "match": Match,
+    "init": Init,
+    "check": Check,
     "sync": Sync,
     "bench": Bench,
 }

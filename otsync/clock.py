@@ -55,6 +55,16 @@ def common_clock(a: TrackSet, b: TrackSet, matches: Matches) -> CommonClock:
     return CommonClock(_on_grid(a.take(i), fps), _on_grid(b.take(j), fps), fps, float(a.times[0] - b.times[0]))
 
 
+def strongest(matches: Matches, limit: int) -> Matches:
+    """At most ``limit`` matches, the best by score in their given order; ties are drawn by a fixed shuffle."""
+    if len(matches) <= limit:
+        return matches
+    assert matches.score is not None
+    shuffled = np.random.default_rng(0).permutation(len(matches))
+    chosen = np.sort(shuffled[np.argsort(-matches.score[shuffled], kind="stable")[:limit]])
+    return Matches(matches.pairs[chosen], matches.score[chosen])
+
+
 def nominal_fps(tracks: TrackSet) -> float:
     """Frames per second, from the timestamps' median step where there are any."""
     assert tracks.fps is not None or tracks.n_frames == 1

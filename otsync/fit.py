@@ -33,6 +33,12 @@ CONVERGED = 1e-4 / 30
 CLUSTER = 1.0
 """Seconds of the blocks within which errors are taken as dependent."""
 
+GROUPS = 10
+"""Neighbourhoods into which matches are put: the errors of tracks on one limb are not independent."""
+
+MOST_LEVERAGE = 0.9
+"""Share of the information that one cluster may be said to hold."""
+
 
 @dataclass(frozen=True, eq=False)
 class Clock:
@@ -88,14 +94,16 @@ class Fit:
     """Where the iteration ended.
 
     Args:
-        clock: the answer. covariance: (P,P) of offset (and rate), clustered by match and by time, the two added.
+        clock: the answer. covariance: (P,P) of offset (and rate), jackknifed over matches or over time, the larger.
         weights: (M,) of the matches. iterations: done.
+        blur: rms residual over rms speed, s: how far off a single sample of a typical match tells the time.
     """
 
     clock: Clock
     covariance: Float[np.ndarray, "P P"]
     weights: Float[np.ndarray, " M"]
     iterations: int
+    blur: float
 
     @property
     def effective_matches(self) -> float:
@@ -133,7 +141,7 @@ def fit_clock(
         # from the offset at the centre of the overlap to that at b's time zero
         move = np.array([[1.0, -centre], [0.0, 1.0]])
         covariance = move @ covariance @ move.T
-    return Fit(clock, covariance, system.match_weights, n)
+    return Fit(clock, covariance, system.match_weights, n, system.blur)
 
 
 def _centre(a: TrackSplines, b: TrackSplines, clock: Clock) -> float:
@@ -144,36 +152,41 @@ def _centre(a: TrackSplines, b: TrackSplines, clock: Clock) -> float:
 
 @dataclass(frozen=True, eq=False)
 class System:
-    """Weighted normal equations, and what their covariance needs.
+    """Weighted normal equations, by match and by block of time.
 
     Args:
-        H: (P,P). gradients: (P,M,T) per match and frame, of both sides. blocks: (T,) the time block of each frame.
-        match_weights: (M,).
+        H, g: (P,P), (P,) the whole. by_match: (G,P,P), (G,P) and by_time: (B,P,P), (B,P) its parts.
+        match_weights: (M,). blur: see :class:`Fit`.
     """
 
     H: Float[np.ndarray, "P P"]
-    gradients: tuple[Float[np.ndarray, "P M T"], ...]
-    blocks: tuple[Int[np.ndarray, " T"], ...]
+    g: Float[np.ndarray, " P"]
+    by_match: tuple[np.ndarray, np.ndarray]
+    by_time: tuple[np.ndarray, np.ndarray]
     match_weights: Float[np.ndarray, " M"]
+    blur: float
 
     def step(self) -> Float[np.ndarray, " P"]:
-        total = sum(g.sum((1, 2)) for g in self.gradients)
-        return -np.linalg.solve(self._regular(), total)
+        return -np.linalg.solve(_regular(self.H), self.g)
 
     def covariance(self) -> Float[np.ndarray, "P P"]:
-        """Sandwich estimates, clustered by match and by block of time, added (Liang and Zeger 1986)."""
-        P = len(self.H)
-        by_match = sum(g.sum(2) for g in self.gradients)
-        count = max(int(b.max(initial=0)) for b in self.blocks) + 1
-        by_time = np.zeros((P, count))
-        for g, block in zip(self.gradients, self.blocks, strict=True):
-            for p in range(P):
-                by_time[p] += np.bincount(block, g[p].sum(0), count)
-        inverse = np.linalg.inv(self._regular())
-        return inverse @ (by_match @ by_match.T + by_time @ by_time.T) @ inverse
+        """The larger of two jackknives, over groups of matches and over blocks of time (Bell and McCaffrey 2002).
 
-    def _regular(self) -> np.ndarray:
-        return self.H + np.diag(1e-12 * np.diag(self.H) + 1e-300)
+        Leaving a cluster out moves the answer by (H - H_c)⁻¹ g_c: a block that holds most of the motion, a single
+        swing, cannot pass for many independent ones.
+        """
+        found = []
+        for Hc, gc in (self.by_match, self.by_time):
+            leverage = np.einsum("pq,cqp->c", np.linalg.inv(_regular(self.H)), Hc) / len(self.H)
+            shrink = np.minimum(1.0, MOST_LEVERAGE / np.maximum(leverage, 1e-12))
+            rest = self.H - shrink[:, None, None] * Hc
+            moved = np.linalg.solve(rest + 1e-12 * np.trace(self.H) * np.eye(len(self.H)), gc[..., None])[..., 0]
+            found.append(moved.T @ moved)
+        return max(found, key=lambda c: float(c[0, 0]))
+
+
+def _regular(H: np.ndarray) -> np.ndarray:
+    return H + np.diag(1e-12 * np.diag(H) + 1e-300)
 
 
 def _linearise(sides: tuple[Side, Side], clock: Clock, centre: float, fit_rate: bool) -> System | None:
@@ -206,16 +219,43 @@ def _linearise(sides: tuple[Side, Side], clock: Clock, centre: float, fit_rate: 
     rms = np.sqrt(sum(p[0].sum(1) for p in parts) / np.maximum(seen, 1))
     typical = float(np.median(rms[seen > 0]))
     weight = np.where(seen > 0, 1 / (1 + (rms / max(OUTLYING * typical, 1e-300)) ** 2) ** 2, 0.0)
-    H = np.zeros((P, P))
-    gradients, blocks = [], []
     start = max(sides[0].own.times[0], float(clock.a(sides[1].own.times[0])))
-    for side, (rr, g, h, used), s in zip(sides, parts, size, strict=True):
+    H_match, g_match = np.zeros((M, P, P)), np.zeros((M, P))
+    blocks = []
+    for side, (_, g, h, used), s in zip(sides, parts, size, strict=True):
         w = np.where(used, weight[:, None] / (1 + (s / max(ROBUST * noise, 1e-300)) ** 2), 0.0)
-        H += (h * w).sum((2, 3))
-        gradients.append(g * w)
+        H_match += np.einsum("pqmt,mt->mpq", h, w)
+        g_match += np.einsum("pmt,mt->mp", g, w)
         t_a = side.own.times if side.forward else clock.a(side.own.times)
-        blocks.append(np.maximum(np.floor((t_a - start) / CLUSTER + 1e-9), 0).astype(np.int64))
-    return System(H, tuple(gradients), tuple(blocks), weight)
+        block = np.maximum(np.floor((t_a - start) / CLUSTER + 1e-9), 0).astype(np.int64)
+        blocks.append((block, np.einsum("pqmt,mt->tpq", h, w), np.einsum("pmt,mt->tp", g, w)))
+    count = max(int(b.max(initial=0)) for b, _, _ in blocks) + 1
+    H_time, g_time = np.zeros((count, P, P)), np.zeros((count, P))
+    for block, by_frame_H, by_frame_g in blocks:
+        np.add.at(H_time, block, by_frame_H)
+        np.add.at(g_time, block, by_frame_g)
+    H_group, g_group = np.zeros((GROUPS, P, P)), np.zeros((GROUPS, P))
+    group = neighbours(sides[0].own.mean + sides[1].own.mean, GROUPS)
+    np.add.at(H_group, group, H_match)
+    np.add.at(g_group, group, g_match)
+    noise_power, speed = (
+        sum(float(weight @ x.sum(1)) for x in xs) for xs in ((p[0] for p in parts), (p[2][0, 0] for p in parts))
+    )
+    blur = np.sqrt(noise_power / speed) if speed > 0 else np.inf
+    return System(H_match.sum(0), g_match.sum(0), (H_group, g_group), (H_time, g_time), weight, float(blur))
+
+
+def neighbours(x: Float[np.ndarray, "M 3"], groups: int) -> Int[np.ndarray, " M"]:
+    """Group of each point: nearest of ``groups`` points far from each other (farthest-point sampling from the middle)."""
+    distance = np.linalg.norm(x - np.median(x, 0), axis=1)
+    nearest = np.zeros(len(x), np.int64)
+    closest = np.full(len(x), np.inf)
+    for k in range(min(groups, len(x))):
+        seed = int(np.argmin(distance) if k == 0 else np.argmax(closest))
+        d = np.linalg.norm(x - x[seed], axis=1)
+        nearest[d < closest] = k
+        closest = np.minimum(closest, d)
+    return nearest
 
 
 def velocity_correlation(a: TrackSplines, b: TrackSplines, fit: Fit, window: float) -> float:

@@ -49,11 +49,11 @@ class Graph:
         if self.extra and n <= self.complete:
             return [(i, j) for i in range(n) for j in range(i + 1, n)]
         found = {(min(centre, v), max(centre, v)) for v in range(n) if v != centre}
-        ring = np.random.default_rng(self.seed).permutation(n)
+        ring = np.random.default_rng(self.seed).permutation([v for v in range(n) if v != centre])
         for s in range(1, (self.extra + 1) // 2 + 1):
             # strides 1, 4, 9, ...: neighbours of neighbours are far apart, cycles are long and short
-            for i in range(n):
-                a, b = int(ring[i]), int(ring[(i + s * s) % n])
+            for i in range(n - 1):
+                a, b = int(ring[i]), int(ring[(i + s * s) % (n - 1)])
                 if a != b:
                     found.add((min(a, b), max(a, b)))
         return sorted(found)
@@ -197,6 +197,15 @@ class CurveSum:
             score += np.interp(offset, *c, left=0.0, right=0.0)
         return candidates, score
 
+    def standing(self, v: int, x: Float[np.ndarray, " V"]) -> tuple[float, float]:
+        """What x[v] scores with the others held, and the best local maximum more than four steps away from it."""
+        candidates, score = self.of_video(v, x)
+        here = int(np.argmin(np.abs(candidates - x[v])))
+        near = slice(max(here - 1, 0), here + 2)
+        padded = np.pad(score, 1, constant_values=-np.inf)
+        top = (score >= padded[:-2]) & (score >= padded[2:]) & (np.abs(candidates - x[v]) > 4.5 * self.step)
+        return float(score[near].max()), float(score[top].max(initial=0.0))
+
     def ascend(self, x: Float[np.ndarray, " V"], fixed: int, sweeps: int = 20) -> Float[np.ndarray, " V"]:
         """Coordinate ascent from x; the video ``fixed`` stays."""
         x = x.copy()
@@ -267,7 +276,7 @@ def cycle_errors(edges: Sequence[Edge]) -> Float[np.ndarray, " C"]:
     return np.array(sums)
 
 
-def agreeing(edges: Sequence[Edge], solution: Solution, least: float) -> Bool[np.ndarray, " E"]:
+def agreeing(edges: Sequence[Edge], residual: Float[np.ndarray, " E"], least: float) -> Bool[np.ndarray, " E"]:
     """Edges within four sigmas, or ``least`` seconds, of the solution."""
     sigma = np.array([e.sigma for e in edges])
-    return np.abs(solution.residual) <= np.maximum(least, 4 * sigma)
+    return np.abs(residual) <= np.maximum(least, 4 * sigma)

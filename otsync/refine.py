@@ -12,15 +12,19 @@ from typing import Literal, Protocol
 
 import numpy as np
 
-from .clock import nominal_fps
+from .clock import nominal_fps, strongest
 from .costs import binary_scale
 from .fit import Clock, Fit, fit_clock, overlap_seconds, velocity_correlation
 from .splines import SMOOTHING, TrackSplines
 from .trust import Trust
 from .types import Alignment, Matches, Refused, Status, TrackSet, gravest, in_order
 
-LEAST_SIGMA = 0.02 / 30
+LEAST_SIGMA = 0.012 / 30
 """Seconds; no sigma is reported below this."""
+
+COMMON_ERRORS = 4.0
+"""Seconds; blur²/COMMON_ERRORS joins sigma: errors that whole videos share (drifting depth, limbs, smoothing) grow with
+the square of the noise, and neither residuals nor other windows show them."""
 
 LONG = 600 / 30
 """Seconds of overlap from which a rate can be told from an offset."""
@@ -52,8 +56,9 @@ def refine(
         refiner: the algorithm; default :class:`SplineRefine`. :class:`Unrefined` leaves the alignment as it is.
         throw: raise :class:`otsync.Refused` when the answer is flagged, instead of returning it.
     """
-    a.check("a")
-    b.check("b")
+    needs_xyz = getattr(refiner, "needs_xyz", True)  # the epipolar fit reads pixels
+    a.check("a", xyz=needs_xyz)
+    b.check("b", xyz=needs_xyz)
     matches.check("matches", len(a), len(b))
     started = time.perf_counter()
     found = (refiner or SplineRefine())(a, b, matches, alignment)
@@ -66,6 +71,8 @@ def refine(
 @dataclass(frozen=True)
 class Unrefined:
     """Takes the aligner's answer as it is."""
+
+    needs_xyz = False
 
     def __call__(self, a: TrackSet, b: TrackSet, matches: Matches, alignment: Alignment) -> Alignment:
         return alignment
@@ -86,17 +93,20 @@ class SplineRefine:
         smoothing: of the splines, see :class:`otsync.splines.TrackSplines`.
         rate: ``fixed`` takes the clocks as declared; ``fit`` frees the rate for overlaps of 20 s and more and keeps it
             when it is significant. With ``fixed`` a significant rate on such clips raises RATE_MISMATCH.
+        limit: of more matches only so many are used, the best by score.
         trust: limits behind the flags.
     """
 
-    windows: tuple[float, ...] = (20 / 30, 10 / 30, 40 / 30)
+    windows: tuple[float, ...] = (14 / 30, 10 / 30, 28 / 30)
     smoothing: float = SMOOTHING
     rate: Literal["fixed", "fit"] = "fixed"
+    limit: int = 500
     trust: Trust = field(default_factory=Trust)
 
     def __call__(self, a: TrackSet, b: TrackSet, matches: Matches, alignment: Alignment) -> Alignment:
         if not math.isfinite(alignment.offset):
             return alignment
+        matches = strongest(matches, self.limit)
         curves = self.splines(a, b, matches)
         start = Clock(alignment.offset, alignment.rate)
         fit = fit_clock(*curves, start, self.windows[0])
@@ -113,6 +123,7 @@ class SplineRefine:
             "effective_matches": fit.effective_matches,
             "moved": abs(fit.clock.offset - alignment.offset),
             "spread": spread,
+            "blur": fit.blur,
             "correlation": velocity_correlation(*curves, fit, VELOCITY),
             "overlap": overlap_seconds(*curves, fit.clock),
             "iterations": float(fit.iterations),
@@ -122,7 +133,7 @@ class SplineRefine:
             alignment,
             offset=fit.clock.offset,
             rate=fit.clock.rate,
-            sigma=math.sqrt(variance + spread**2 + LEAST_SIGMA**2),
+            sigma=math.sqrt(variance + spread**2 + (fit.blur**2 / COMMON_ERRORS) ** 2 + LEAST_SIGMA**2),
             fps=fps,
             status=gravest(flags),
             flags=flags,
@@ -161,6 +172,7 @@ class SplineRefine:
     def _flags(self, stats: dict[str, float]) -> tuple[Status, ...]:
         t = self.trust
         found = {
+            Status.WEAK: stats["blur"] > t.blur,
             Status.MOVED: stats["moved"] > t.moved,
             Status.SPREAD: stats["spread"] > t.spread,
             Status.SHORT_OVERLAP: stats["overlap"] < t.overlap - 1e-9,

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float, Int
 
-from .clock import CommonClock, common_clock
+from .clock import CommonClock, common_clock, strongest
 from .costs import binary_scale, velocity
 from .splines import TrackSplines
 from .trust import Trust
@@ -52,15 +52,18 @@ class LikelihoodScan:
         max_lag: largest |offset| in seconds; None: whatever leaves ``min_overlap`` seconds in common.
         min_overlap: seconds.
         peaks: how many competing offsets to keep as ``hypotheses``.
+        limit: of more matches only so many are read, the best by score; time is proportional to them.
         trust: limits behind the flags.
     """
 
     max_lag: float | None = None
     min_overlap: float = MIN_OVERLAP
     peaks: int = 5
+    limit: int = 500
     trust: Trust = field(default_factory=Trust)
 
     def __call__(self, a: TrackSet, b: TrackSet, matches: Matches) -> Alignment:
+        matches = strongest(matches, self.limit)
         pair, scale = normalised(common_clock(a, b, matches))
         lags = pair.lags(max(1, round(self.min_overlap * pair.fps)), self.max_lag)
         if len(matches) == 0 or len(lags) == 0:
@@ -72,7 +75,7 @@ class LikelihoodScan:
         tops = local_peaks(lags, score, round(APART * pair.fps), self.peaks)
         offset = float(pair.seconds(vertex(lags, score, tops[0])))
         stats = self._stats(pair, lags, curves, tops) | {"matches": float(len(matches))}
-        stats["other_rate"], stats["other_rate_gain"] = other_rate(a, b, pair, lags, matches, scale)
+        stats["other_rate"], stats["other_rate_gain"] = other_rate(a, b, pair, matches, scale, self.max_lag)
         flags = self._flags(stats)
         return Alignment(
             offset,
@@ -92,13 +95,15 @@ class LikelihoodScan:
         finite = np.flatnonzero(np.isfinite(score))
         base = float(np.median(score[finite]))
         rise = float(score[best] - base)
-        second = float(score[tops[1]] - base) if len(tops) > 1 else 0.0
-        others = [int(np.argmax(c)) for c in (curves.slow, curves.windows)]
         overlap = pair.overlap(lags)
+        # per common frame as well: a period later, exact repetition has the same rate of evidence over fewer frames
+        rivals = [max(r, r * overlap[best] / overlap[i]) for i in tops[1:] if (r := float(score[i] - base)) > 0]
+        second = max(rivals, default=0.0)
+        others = [int(np.argmax(c)) for c in (curves.slow, curves.windows)]
         rate = np.where(np.isfinite(score), (score - min(base, 0.0)) / overlap, -np.inf)
         return {
             "evidence": rise,
-            "margin": (rise - max(second, 0.0)) / rise if rise > 0 else 0.0,
+            "margin": (rise - second) / rise if rise > 0 else 0.0,
             "disagreement": max(abs(int(lags[i] - lags[best])) for i in others) / pair.fps,
             "alias": abs(int(lags[int(np.argmax(rate))] - lags[best])) / pair.fps,
             "overlap": float(overlap[best]) / pair.fps,
@@ -222,7 +227,7 @@ def velocity_score(pair: CommonClock, lags: Int[np.ndarray, " K"], half: int, le
 
 
 def other_rate(
-    a: TrackSet, b: TrackSet, pair: CommonClock, lags: Int[np.ndarray, " K"], matches: Matches, scale: float
+    a: TrackSet, b: TrackSet, pair: CommonClock, matches: Matches, scale: float, max_lag: float | None
 ) -> tuple[float, float]:
     """Which of :data:`COMMON_RATES` suits the slow velocities best, and how many times better than the declared clocks.
 
@@ -231,7 +236,10 @@ def other_rate(
     some = np.unique(np.linspace(0, len(matches) - 1, RATE_MATCHES).astype(int))
     half, least = max(1, round(SLOW * pair.fps)), max(1, round(MIN_FRAMES * pair.fps))
 
-    def rise(p: CommonClock, k: np.ndarray) -> float:
+    def rise(p: CommonClock) -> float:
+        k = p.lags(max(1, round(MIN_OVERLAP * pair.fps)), max_lag)
+        if not len(k):
+            return 0.0
         score = velocity_score(p, k, half, least)
         finite = score[np.isfinite(score)]
         return float(finite.max() - np.median(finite)) if len(finite) else 0.0
@@ -243,10 +251,9 @@ def other_rate(
         n = int(np.floor((b.times[-1] - b.times[0]) * rate * pair.fps + 1e-6)) + 1
         t = b.times[0] + np.arange(n) / (rate * pair.fps)
         other = CommonClock(declared.a, curves.sample(t), pair.fps, float(a.times[0] - rate * b.times[0]))
-        k = other.lags(max(1, round(MIN_OVERLAP * pair.fps)), None)
-        rises[rate] = rise(other, k) if len(k) else 0.0
+        rises[rate] = rise(other)
     best = max(rises, key=rises.__getitem__)
-    now = rise(declared, lags)
+    now = rise(declared)
     return best, rises[best] / now if now > 0 else 0.0
 
 

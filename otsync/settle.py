@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 
-from .graph import CurveSum, Edge, Graph, Pair, Solution, agreeing, components, cycle_errors, solve, spanning_trees
+from .graph import CurveSum, Edge, Graph, Pair, agreeing, components, cycle_errors, solve, spanning_trees
 from .trust import Trust
 from .types import Alignment, Matches, Stats, Status, in_order
 
@@ -26,7 +26,7 @@ MOVED = 1.5 * FRAME
 """A video that the summed curves put further than this from the robust solution has moved."""
 
 ASTRAY = 1.0 * FRAME
-"""A pair further than this, and than four sigmas, from the solution is fitted anew from there."""
+"""A pair further than this from the solution, and than four sigmas or CAPTURED, is fitted anew from there."""
 
 CONFIRMED = 1.5 * FRAME
 """Doubtful pairs this close to the solution by themselves confirm it."""
@@ -39,7 +39,7 @@ INFLATION = 1.5
 
 ROUNDS = 2
 
-NO_LINK = frozenset(
+NOTHING_COMMON = frozenset(
     {
         Status.POOR_FIT,
         Status.STATIC,
@@ -50,7 +50,7 @@ NO_LINK = frozenset(
         Status.FAILED,
     }
 )
-"""A pair with one of these links no videos by itself."""
+"""A pair with one of these shows no common motion: it makes no video trusted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,33 +104,45 @@ def settle(
         linked = _relocate(linked, x, rates, refit)
         x = _by_component(n, linked, rates, anchor, x)[0]
     by_pair = {a.pair: a for a in answers} | {a.pair: a for a in linked}
-    links = linked if lone else _links(n, linked, x, rates)
+    links = linked if lone else _links(n, linked, x, rates, anchor, trust)
     chosen = _best_tied(n, links, rates) if reference is None else reference
     x, sigma, component = _by_component(n, links, rates, chosen, None if chosen != anchor else x)
     final = tuple(by_pair[a.pair] for a in answers)
     return _judge(n, final, links, x, sigma, rates, component, chosen, graph, trust)
 
 
-def _links(n: int, answers: list[Answer], x: np.ndarray, rates: np.ndarray) -> list[Answer]:
-    """The pairs that link videos: sound ones, and doubtful ones that confirm each other.
+def _links(n: int, answers: list[Answer], x: np.ndarray, rates: np.ndarray, anchor: int, trust: Trust) -> list[Answer]:
+    """The pairs that link videos: those that vouch for themselves, and flagged ones between videos that stand out.
 
-    A doubtful fit alone links nothing. But when most pairs, and at least three, between two groups of videos agree with
-    one solution by themselves, chance did not make them.
+    A flagged pair must agree with the solution. A video stands out when the sum of all its pairs' curves peaks at its place as an undoubted pair's curve would. That
+    keeps an estimate for videos that no pair vouches for, on the clock of the anchor's group. Groups held together by
+    pairs that vouch are never joined by flagged ones: the curves of strangers with the views of one scene add up too.
     """
-    sound = [a for a in answers if not NO_LINK & set(a.refined.flags)]
-    group = components(n, [a.pair for a in sound])
-    between: dict[Pair, list[tuple[Answer, bool]]] = {}
-    for a in answers:
-        i, j = sorted((int(group[a.pair[0]]), int(group[a.pair[1]])))
-        if i != j:
-            e = as_edge(a, rates)
-            agrees = "relocated" not in a.refined.stats and abs(x[e.b] - x[e.a] - e.offset) <= CONFIRMED
-            between.setdefault((i, j), []).append((a, agrees))
-    for doubtful in between.values():
-        confirmed = [a for a, agrees in doubtful if agrees]
-        if len(confirmed) >= max(3, len(doubtful) / 2):
-            sound += confirmed
-    return sorted(sound, key=lambda a: a.pair)
+    edges = [as_edge(a, rates) for a in answers]
+    curves = CurveSum(n, edges, FRAME)
+    stands = np.array([undoubted(curves, v, x, trust) for v in range(n)])
+    sound = np.array([e.trusted for e in edges], bool)
+    group = components(n, [a.pair for a, ok in zip(answers, sound, strict=True) if ok])
+    size = np.bincount(group, minlength=n)[group]
+    main = group[anchor] if size[anchor] > 1 else group[int(np.argmax(size))]
+    welcome = stands & ((size == 1) | (group == main))
+    residual = np.array([x[e.b] - x[e.a] - e.offset for e in edges])
+    agrees = agreeing(edges, residual, CONFIRMED)
+    kept = zip(answers, edges, sound, agrees, strict=True)
+    return [a for a, e, good, ok in kept if good or (ok and welcome[e.a] and welcome[e.b])]
+
+
+def is_sound(answer: Answer) -> bool:
+    """Whether the fit shows a common motion at all, whatever else is flagged."""
+    return not NOTHING_COMMON & set(answer.refined.flags)
+
+
+def undoubted(curves: CurveSum, v: int, x: np.ndarray, trust: Trust) -> bool:
+    """Whether the summed curves of v's pairs peak at x[v], high enough and without a rival."""
+    if not curves.around[v]:
+        return True  # aligners without curves: nothing to doubt by
+    here, rival = curves.standing(v, x)
+    return here >= trust.evidence and (here - rival) >= trust.margin * here
 
 
 def as_edge(answer: Answer, rates: np.ndarray) -> Edge:
@@ -174,7 +186,7 @@ def _first_guess(n: int, answers: list[Answer], anchor: int, rates: np.ndarray, 
         inside = [edges[k] for k in own]
         members = int((component == root).sum())
         residual = np.array([x[e.b] - x[e.a] - e.offset for e in inside])
-        settled = agreeing(inside, Solution(x, x, residual), ASTRAY) & np.array([e.trusted for e in inside], bool)
+        settled = agreeing(inside, residual, ASTRAY) & np.array([e.trusted for e in inside], bool)
         if len(inside) < members or settled.all():
             continue
         weight = [
@@ -199,7 +211,7 @@ def _relocate(answers: list[Answer], x: np.ndarray, rates: np.ndarray, refit: Re
     for answer in answers:
         e = as_edge(answer, rates)
         predicted = x[e.b] - x[e.a]
-        if abs(predicted - e.offset) <= max(ASTRAY, 4 * e.sigma):
+        if abs(predicted - e.offset) <= max(ASTRAY, min(4 * e.sigma, CAPTURED)):
             kept.append(answer)
         else:
             tasks.append((answer, predicted / rates[e.a], rates[e.b] / rates[e.a]))
@@ -260,8 +272,9 @@ def _judge(
     """Flags of every video, residuals of every pair."""
     edges = [as_edge(a, rates) for a in links]
     residual = np.array([x[e.b] - x[e.a] - e.offset for e in edges])
-    agrees = agreeing(edges, Solution(x, sigma, residual), ASTRAY) if edges else np.zeros(0, bool)
-    trusted = _trusted(n, edges, agrees, x, component, graph, trust)
+    agrees = agreeing(edges, residual, ASTRAY) if edges else np.zeros(0, bool)
+    sound = agrees & np.array([is_sound(a) for a in links], bool)
+    trusted = _trusted(n, edges, sound, x, component, graph, trust)
     x = x.copy()
     alone = np.bincount(component, minlength=n)[component] == 1
     x[alone & (np.arange(n) != reference)] = sigma[alone & (np.arange(n) != reference)] = np.nan
@@ -293,11 +306,14 @@ def _trusted(
 ) -> np.ndarray:
     """Videos that hang on their reference by pairs that vouch, or by summed curves that leave no doubt.
 
-    Trust grows from the reference: a video joins by one agreeing pair that vouches for itself, or by two agreeing
-    pairs with trusted videos whose summed curves pass the limits for evidence and ambiguity.
+    Trust grows from the reference: a video joins by one agreeing pair that vouches for itself, or by two sound agreeing
+    pairs, at least half of all its pairs, with trusted videos, whose summed curves pass the limits for evidence and
+    ambiguity.
     """
+    degree = np.zeros(n, int)
+    for e in edges:
+        degree[[e.a, e.b]] += 1
     trusted = component == np.arange(n)
-    curves = CurveSum(n, edges, FRAME) if graph.curves else None
     growing = True
     while growing:
         growing = False
@@ -306,20 +322,12 @@ def _trusted(
                 k for k, e in enumerate(edges)
                 if agrees[k] and ((e.a == v and trusted[e.b]) or (e.b == v and trusted[e.a]))
             ]  # fmt: skip
-            vouched = any(edges[k].trusted for k in near)
-            if vouched or (curves is not None and len(near) >= 2 and _undoubted(v, near, edges, x, trust)):
+            joined = any(edges[k].trusted for k in near)
+            if not joined and graph.curves and len(near) >= max(2, degree[v] / 2):
+                joined = undoubted(CurveSum(n, [edges[k] for k in near], FRAME), v, x, trust)
+            if joined:
                 trusted[v] = growing = True
     return trusted
-
-
-def _undoubted(v: int, near: list[int], edges: list[Edge], x: np.ndarray, trust: Trust) -> bool:
-    """Whether the sum of these pairs' curves peaks at x[v], high enough and without a rival."""
-    own = [edges[k] for k in near]
-    candidates, score = CurveSum(len(x), own, FRAME).of_video(v, x)
-    here = float(np.interp(x[v], candidates, score))
-    far = np.abs(candidates - x[v]) > 4 * FRAME
-    rival = float(score[far].max(initial=0.0))
-    return here >= trust.evidence and (here - rival) / here >= trust.margin
 
 
 def _flags(

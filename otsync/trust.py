@@ -12,9 +12,13 @@ from dataclasses import dataclass
 class Trust:
     """Limits beyond which an alignment is flagged.
 
+    Calibrated on simulated pairs of the moving classes, mid to brutal, and on the odd cases (static, unrelated, without
+    overlap), seeds 1000-1999; ``python -m otsync.bench.sync --acceptance`` tests them from seed 5000 on.
+
     Args:
         evidence: WEAK below this rise of the score's peak over its median, in nats a match.
-        margin: AMBIGUOUS when the second peak comes this close to the first, as a share of the first's rise.
+        margin: AMBIGUOUS when another peak comes this close to the first, as a share of the first's rise, altogether
+            or per common frame.
         disagreement: DISAGREE when slow velocities or windowed positions peak further away than this, s.
         alias: ALIAS when the score divided by the overlap peaks further away than this, s.
         overlap: SHORT_OVERLAP below this many seconds in common.
@@ -23,12 +27,13 @@ class Trust:
         moved: MOVED when the sub-frame fit ends further from the scan's peak than this, s.
         spread: SPREAD when fits with other detrending windows differ by more than this, s.
         correlation: POOR_FIT below this pooled correlation of the matched velocities at the answer.
+        blur: WEAK when the rms residual of the fit is more than this many seconds of rms motion.
         rate_gain: RATE_MISMATCH when another common ratio of frame rates raises the score's peak by this factor.
         rate_sigmas: a fitted rate counts when it differs from the declared one by more than this many sigmas.
     """
 
-    evidence: float = 10.0
-    margin: float = 0.1
+    evidence: float = 25.0
+    margin: float = 0.15
     disagreement: float = 3 / 30
     alias: float = 3 / 30
     overlap: float = 40 / 30
@@ -36,6 +41,7 @@ class Trust:
     motion: float = 0.02
     moved: float = 2 / 30
     spread: float = 0.5 / 30
-    correlation: float = 0.45
+    correlation: float = 0.55
+    blur: float = 5.6 / 30
     rate_sigmas: float = 4.0
     rate_gain: float = 1.3

@@ -35,6 +35,16 @@ ALLOWED = {
     "settle": {"types", "graph", "trust"},
     "metrics": {"types", "simulate"},
     "simulate": {"types", "files"},
+    "io": {"types", "files"},
+    "geometry": {"types"},
+    "priors": {"types", "files", "geometry"},
+    "lift": {"types"},
+    "tracks": {"types", "geometry", "priors", "kernels_tracks"},
+    "position_costs": {"types", "costs", "kernels_tracks"},
+    "partners": {"types", "costs", "match", "position_costs"},
+    "epipolar": {"types", "clock", "splines", "align", "geometry", "kernels_tracks"},
+    "epipolar_fit": {"types", "clock", "splines", "epipolar", "geometry", "trust"},
+    "check": {"types", "geometry", "io"},
 }
 
 

@@ -32,6 +32,7 @@ def write_report(
     *,
     truth: Sequence[float] | None = None,
     title: str = "Synchronisation report",
+    extra: str = "",
 ) -> None:
     """Write the report page, atomically.
 
@@ -39,6 +40,7 @@ def write_report(
         offsets: from :func:`otsync.synchronize`.
         tracks: what they were made from; with it the page shows cost maps and DTW paths.
         truth: true offsets in seconds on the reference's clock, for simulated worlds.
+        extra: further sections as HTML, after the graph (a recording's pictures).
     """
     page = [
         f"<h1>{escape(title)}</h1>",
@@ -51,6 +53,7 @@ def write_report(
         figures.clock_bars(offsets, _durations(offsets, tracks)),
         _remedies(offsets),
         _graph(offsets),
+        extra,
         "<h2>Pairs</h2>",
         _pair_table(offsets, truth),
         *_pair_details(offsets, tracks, truth),

@@ -1,0 +1,37 @@
+"""Where the world makes it true: likelihood over DTW, refined over frames, graph over star."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from otsync import DTW, ConstantShift, LikelihoodScan, align, refine
+from otsync.bench.sync_worlds import FPS, MOVING, pair_case
+
+SEEDS = (5100, 5101)
+
+
+def errors(band: int, preset: str, aligner, refined: bool = False) -> np.ndarray:
+    found = []
+    for motion in MOVING:
+        for seed in SEEDS:
+            case = pair_case(motion, preset, band, seed)
+            answer = align(case.a, case.b, case.matches, aligner, throw=False)
+            if refined:
+                answer = refine(case.a, case.b, case.matches, answer, throw=False)
+            found.append(abs(answer.offset * FPS - case.offset))
+    return np.array(found)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("preset", ["mid", "hard"])
+def test_the_papers_dtw_is_three_times_worse_in_the_widest_band(preset):
+    ours = errors(2, preset, LikelihoodScan(), refined=True)
+    assert errors(2, preset, DTW()).mean() >= 3 * ours.mean()
+    assert errors(2, preset, ConstantShift()).mean() >= 3 * ours.mean()
+
+
+def test_refinement_goes_below_the_frame():
+    scanned, refined = (errors(1, "mid", LikelihoodScan(), r) for r in (False, True))
+    assert refined.mean() < 0.6 * scanned.mean()
+    assert refined.mean() < 0.06
