@@ -55,10 +55,10 @@ def cloud(n: int, frames: int, seed: int = 0, scale: float = 1.0) -> np.ndarray:
     return scale * (spot + 0.15 * waves)
 
 
-def pair(n: int = 80, frames: int = 40, seed: int = 0, noise: float = 0.3) -> tuple[TrackSet, TrackSet]:
+def pair(n: int = 80, frames: int = 40, seed: int = 0, noise: float = 0.3, dims: int = 24) -> tuple[TrackSet, TrackSet]:
     """Two videos of one cloud in different rigid frames; track k of a is track k of b."""
     rng = np.random.default_rng(seed + 1000)
-    xyz, features = cloud(n, frames, seed), rng.normal(size=(n, 24))
+    xyz, features = cloud(n, frames, seed), rng.normal(size=(n, dims))
     turn = np.array([[0.6, -0.8, 0], [0.8, 0.6, 0], [0, 0, 1.0]])
 
     def seen(x: np.ndarray) -> TrackSet:

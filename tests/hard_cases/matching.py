@@ -84,7 +84,7 @@ def huge() -> tuple[TrackSet, TrackSet]:
 
 
 def unrelated() -> tuple[TrackSet, TrackSet]:
-    return pair(120, seed=1)[0], pair(120, seed=2)[1]
+    return pair(120, seed=1, dims=128)[0], pair(120, seed=2, dims=128)[1]
 
 
 def sized(n_a: int, n_b: int):
@@ -222,8 +222,8 @@ CASES: tuple[Case, ...] = (
     Case("unrelated videos", "there is always a cheapest plan", "as confident as ever", "features of the better half hardly beat chance: no match",
          unrelated, (FLAGGED,), limits={"GromovWasserstein": "structure alone cannot tell"}),
     Case("noise for features", "only structure can tell", "EMD: random matches", "features that do not beat chance: flagged, or structure decides",
-         lambda: tuple(replace(x, features=np.random.default_rng(k).normal(size=(120, 24))) for k, x in enumerate(pair(120))), (FLAGGED, RIGHT), check=identity),
-    Case("a third outliers in b", "marginals force them onto something", "a third of the matches wrong", "scores rank them last", outliers(0.33), (RIGHT,), check=identity, limits={"FusedGromovWasserstein": "balanced: outliers are forced onto something", "GromovWasserstein": "no features"}),
+         lambda: tuple(replace(x, features=np.random.default_rng(k).normal(size=(120, 128))) for k, x in enumerate(pair(120))), (FLAGGED, RIGHT), check=identity),
+    Case("a third outliers in b", "marginals force them onto something", "a third of the matches wrong", "scores rank them last", outliers(0.33), (RIGHT,), check=identity, limits={"FusedGromovWasserstein": "balanced: outliers are forced onto something", "EntropicFGW": "balanced: outliers are forced onto something", "GromovWasserstein": "no features"}),
     Case("two thirds outliers in b", "most of the mass is wrong", "most matches wrong", "the better half is right, or flagged", outliers(0.66), (RIGHT, FLAGGED), check=lambda m: float((m.best(25).pairs[:, 0] == m.best(25).pairs[:, 1]).mean()) > 0.8, limits={"GromovWasserstein": "no features", "FusedGromovWasserstein": "balanced", "EntropicFGW": "balanced", "PartialFGW": "mass .65 is more than there is"}),
     # solver parameters
     *(
