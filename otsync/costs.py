@@ -63,8 +63,18 @@ def track_distance(
     from . import kernels
 
     same = other is None
-    if other is None or other_visible is None:
+    if other is None:
         other, other_visible = xyz, visible
+    elif other_visible is None:
+        other_visible = np.ones(other.shape[:2], bool)
+    for name, x, seen in (("xyz", xyz, visible), ("other", other, other_visible)):
+        if x.ndim != 3 or x.shape[2] != 3 or seen.shape != x.shape[:2] or x.shape[1] != xyz.shape[1]:
+            raise ValueError(
+                f"{name}: expected (N,{xyz.shape[1]},3) positions with visibility (N,{xyz.shape[1]}); found {x.shape} "
+                f"and {seen.shape}."
+            )
+        if not np.isfinite(x[seen]).all():
+            raise ValueError(f"{name}: expected finite positions in visible samples; found nan or infinity.")
     dtype = np.dtype(np.float32 if xyz.dtype == other.dtype == np.float32 else np.float64)
     gaps = not (visible.all() and other_visible.all())
     scale = dtype.type(max(binary_scale(xyz[visible]), binary_scale(other[other_visible])))
@@ -268,5 +278,7 @@ def total_cost(costs: tuple[Cost, ...], a: TrackSet, b: TrackSet) -> Float[np.nd
     """Weighted sum of the cost objects' matrices; zeros for an empty tuple."""
     total = np.zeros((len(a), len(b)))
     for cost in costs:
+        if not (np.isfinite(cost.weight) and cost.weight >= 0):
+            raise ValueError(f"costs: expected weights >= 0; found {cost}.")
         total += cost.weight * cost.matrix(a, b)
     return total

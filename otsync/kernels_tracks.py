@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from functools import partial
-
-import numba as nb
 import numpy as np
 
-_jit = partial(nb.njit, nogil=True, cache=True, error_model="numpy")
+from .jit import kernel
 
 
-@_jit()
+@kernel()
 def keep_apart(uv, apart, count):
     """Greedy choice in the given order: skip a track that stays within ``apart`` of a kept one over >= 5 frames.
 
@@ -42,7 +39,7 @@ def keep_apart(uv, apart, count):
     return kept[:n]
 
 
-@_jit()
+@kernel()
 def epipolar_evidence(A, B, F, pairs, k0, k1, min_frames, window, min_window, mean, count):
     """Epipolar residuals of candidate pairs at every lag.
 
@@ -87,7 +84,7 @@ def epipolar_evidence(A, B, F, pairs, k0, k1, min_frames, window, min_window, me
                 count[1, m, k - k0] = n_raw
 
 
-@_jit()
+@kernel()
 def _trimmed(values, n, share):
     """Mean of the smallest ``share`` of the first ``n`` values."""
     ordered = np.sort(values[:n])
@@ -95,7 +92,7 @@ def _trimmed(values, n, share):
     return ordered[:m].mean()
 
 
-@_jit()
+@kernel()
 def curve_distances(A, B, pairs_a, pairs_b, share):
     """A (Na,S,3), B (Nb,R,3), nan unseen: trimmed mean distance to the nearest sample, both ways averaged; (P,)."""
     S, R = A.shape[1], B.shape[1]
@@ -131,7 +128,7 @@ def curve_distances(A, B, pairs_a, pairs_b, share):
     return out
 
 
-@_jit()
+@kernel()
 def synchronous_distances(A, B, pairs_a, pairs_b, at, least):
     """Mean distance of A[i,t] and B[j,at[t]] (at -1: none) over frames that both see; nan below ``least`` of them."""
     out = np.full(len(pairs_a), np.nan)

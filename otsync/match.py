@@ -117,7 +117,7 @@ class OptimalTransport:
 
     Args:
         reg: 0 for the exact plan (network simplex); else Sinkhorn with ε = reg times the spread of the cost.
-        center, costs: as elsewhere.
+        costs: what is summed, a tuple of cost objects.
     """
 
     reg: float = 0.0
@@ -165,6 +165,8 @@ class FusedGromovWasserstein:
 
     def __post_init__(self) -> None:
         positive("FusedGromovWasserstein.alpha", self.alpha, zero=True)
+        positive("FusedGromovWasserstein.max_iter", self.max_iter)
+        positive("FusedGromovWasserstein.tol", self.tol)
 
     def __call__(self, a: TrackSet, b: TrackSet) -> Matches:
         import ot
@@ -177,7 +179,9 @@ class FusedGromovWasserstein:
             *arrays, "square_loss", symmetric=True, alpha=problem.pot_weight, log=True, max_iter=self.max_iter,
             tol_rel=self.tol, tol_abs=self.tol * 1e-3, numItermaxEmd=LP_PIVOTS,
         )  # fmt: skip
-        return problem.matches(plan if self.device is None else plan.cpu().numpy(), len(log["loss"]) - 1)
+        iterations = len(log["loss"]) - 1
+        done = iterations < self.max_iter
+        return problem.matches(plan if self.device is None else plan.cpu().numpy(), iterations, converged=done)
 
 
 @dataclass(frozen=True)
@@ -212,23 +216,26 @@ class EntropicFGW:
     def __post_init__(self) -> None:
         positive("EntropicFGW.reg", self.reg)
         positive("EntropicFGW.alpha", self.alpha, zero=True)
+        positive("EntropicFGW.max_iter", self.max_iter)
+        positive("EntropicFGW.tol", self.tol)
 
     def __call__(self, a: TrackSet, b: TrackSet) -> Matches:
         problem = Problem.of(a, b, self.costs, self.alpha)
         if problem.flat:
             return no_information(problem.M)
         plan = np.outer(problem.p, problem.q)
-        reg, failed, iterations = max(0.1, self.reg), False, 0
+        reg, failed, converged, iterations = max(0.1, self.reg), False, False, 0
         while iterations < self.max_iter:
             iterations += 1
             cost = problem.gradient(plan)
             after, _, failed = sinkhorn(problem.p, problem.q, cost, reg * max(float(np.ptp(cost)), FLAT))
             change = float(np.abs(after - plan).sum())
             plan = after
-            if reg == self.reg and (change < self.tol or failed):
+            converged = reg == self.reg and change < self.tol
+            if converged or (reg == self.reg and failed):
                 break
             reg = max(self.reg, 0.7 * reg)
-        return problem.matches(plan, iterations, failed=failed)
+        return problem.matches(plan, iterations, failed=failed, converged=converged)
 
 
 @dataclass(frozen=True)
@@ -250,6 +257,7 @@ class PartialFGW:
         if not 0 < self.mass <= 1:
             raise ValueError(f"PartialFGW.mass: expected a share in (0, 1]; found {self.mass}.")
         positive("PartialFGW.alpha", self.alpha, zero=True)
+        positive("PartialFGW.tol", self.tol)
 
     def __call__(self, a: TrackSet, b: TrackSet) -> Matches:
         import ot
@@ -261,8 +269,9 @@ class PartialFGW:
         # fixed mass a constant added to M changes no minimiser: make it dominate the largest possible gradient.
         largest = 2 * max(problem.Ca.max(), problem.Cb.max()) ** 2
         lift = largest / (1 - problem.pot_weight) if problem.pot_weight < 1 else 0.0
+        mass = min(self.mass, float(problem.p.sum()), float(problem.q.sum()))  # 49 times 1/49 is not quite 1
         plan, log = ot.gromov.partial_fused_gromov_wasserstein(
-            problem.M + lift, problem.Ca, problem.Cb, problem.p, problem.q, self.mass, "square_loss",
+            problem.M + lift, problem.Ca, problem.Cb, problem.p, problem.q, mass, "square_loss",
             alpha=problem.pot_weight, log=True, symmetric=True, tol=self.tol, warn=False,
             numItermax=LP_PIVOTS,  # POT hands its outer limit on as the LP's pivots
         )  # fmt: skip
@@ -299,10 +308,8 @@ class Problem:
     @property
     def flat(self) -> bool:
         """Whether neither features nor structure distinguish the tracks."""
-        return (
-            (self.alpha == 0 or is_flat(self.M))
-            and is_flat(self.Ca, diagonal=False)
-            and is_flat(self.Cb, diagonal=False)
+        return (self.alpha == 0 or is_flat(self.M)) and (
+            is_flat(self.Ca, diagonal=False) or is_flat(self.Cb, diagonal=False)
         )
 
     def structure(self, plan: Float[np.ndarray, "Na Nb"]) -> Float[np.ndarray, "Na Nb"]:
@@ -318,12 +325,16 @@ class Problem:
         """F of the paper's Eq. 1."""
         return float((self.structure(plan) * plan).sum() + self.alpha / 2 * (self.M * plan).sum())
 
-    def matches(self, plan: np.ndarray, iterations: int, *, mass: float = 1.0, failed: bool = False) -> Matches:
+    def matches(
+        self, plan: np.ndarray, iterations: int, *, mass: float = 1.0, failed: bool = False, converged: bool = True
+    ) -> Matches:
+        """Discrete matches of a plan; ``stats["converged"]`` is 0 when the solver stopped at its limit."""
         objective = self.objective(plan)
         stats = {
             "objective": objective,
             "objective_pot": objective / (1 + self.alpha / 2),
             "iterations": float(iterations),
+            "converged": float(converged),
         }
         return from_plan(plan, self.gradient(plan), self.p, self.q, mass, stats, failed)
 

@@ -17,7 +17,7 @@ from .costs import binary_scale
 from .fit import Clock, Fit, fit_clock, overlap_seconds, velocity_correlation
 from .splines import SMOOTHING, TrackSplines
 from .trust import Trust
-from .types import Alignment, Matches, Refused, Status, TrackSet, gravest, in_order
+from .types import Alignment, Matches, Refused, Status, TrackSet, check_same_world, gravest, in_order
 
 LEAST_SIGMA = 0.012 / 30
 """Seconds; no sigma is reported below this."""
@@ -59,6 +59,7 @@ def refine(
     needs_xyz = getattr(refiner, "needs_xyz", True)  # the epipolar fit reads pixels
     a.check("a", xyz=needs_xyz)
     b.check("b", xyz=needs_xyz)
+    check_same_world(a, b)
     matches.check("matches", len(a), len(b))
     started = time.perf_counter()
     found = (refiner or SplineRefine())(a, b, matches, alignment)

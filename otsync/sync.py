@@ -62,6 +62,10 @@ def synchronize(
     A pair that fails gets a status and nan; the others live. Wrong input raises ValueError before any work.
     """
     chosen = check_tracks(tracks, reference, xyz=getattr(aligner, "needs_xyz", True))
+    costs = (Cosine(),) if matcher is None else getattr(matcher, "costs", ())
+    if matches is None and any(isinstance(cost, Cosine) for cost in costs):
+        for v, t in enumerate(tracks):
+            t.check(f"tracks[{v}]", xyz=False, features=True)
     if rate not in ("fixed", "fit"):
         raise ValueError(f"rate: expected 'fixed' or 'fit'; found {rate!r}.")
     started = time.perf_counter()

@@ -159,6 +159,26 @@ def test_one_far_track_does_not_wipe_out_the_structure(pair):
     assert abs(found.stats["mass"] - 0.9) < 1e-9
 
 
+def test_any_number_of_tracks_may_keep_all_its_mass():
+    rng = np.random.default_rng(0)
+    for n in (3, 10, 49):
+        t = TrackSet(rng.normal(size=(n, 5, 3)), features=rng.normal(size=(n, 8)), fps=30)
+        assert abs(PartialFGW(mass=1.0)(t, t).stats["mass"] - 1) < 1e-9
+
+
+def test_structure_of_one_side_alone_is_no_information():
+    rng = np.random.default_rng(0)
+    flat = TrackSet(np.ones((5, 4, 3)), features=np.ones((5, 3)), fps=30)
+    b = TrackSet(rng.normal(size=(5, 4, 3)), features=np.ones((5, 3)), fps=30)
+    assert match(flat, b, FusedGromovWasserstein(), throw=False).status is Status.NO_INFORMATION
+
+
+def test_a_solver_that_stopped_at_its_limit_says_so(pair):
+    a, b, _ = pair
+    assert FusedGromovWasserstein()(a, b).stats["converged"] == 1
+    assert FusedGromovWasserstein(max_iter=1)(a, b).stats["converged"] == 0
+
+
 @pytest.mark.parametrize("matcher", STRUCTURED, ids=name)
 def test_gaps_are_no_positions(pair, matcher):
     a, b, where = pair

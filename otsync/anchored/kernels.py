@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..kernels import _jit
+from ..jit import kernel
 
-_fast = _jit(fastmath={"contract", "reassoc", "nsz"})
+_fast = kernel(fastmath={"contract", "reassoc", "nsz"})
 
 
-@_jit()
+@kernel()
 def visible_means(xyz, seen, mean, i0, i1):
     """Mean visible position of tracks i0:i1 in float64, nan for one never seen; xyz (N,T,3), seen (N,T), mean (N,3)."""
     for i in range(i0, i1):
@@ -27,7 +27,7 @@ def visible_means(xyz, seen, mean, i0, i1):
         mean[i, 0], mean[i, 1], mean[i, 2] = x / n, y / n, z / n
 
 
-@_jit()
+@kernel()
 def to_columns(xyz, seen, index, origin, unit, far, columns, weight, i0, i1):
     """``(xyz - origin) / unit`` of tracks ``index[i0:i1]``, clipped to ±far, time-major; 0, weight 0 where unseen.
 
@@ -46,7 +46,7 @@ def to_columns(xyz, seen, index, origin, unit, far, columns, weight, i0, i1):
                 weight[t, i] = 0.0
 
 
-@_jit()
+@kernel()
 def poses(columns, weight, frames, out, i0, i1):
     """Positions at some frames, of each track at the nearest frame where it is seen (the earlier of two).
 
@@ -88,7 +88,7 @@ def nearest(points, centers, label, i0, i1):
         label[i] = best
 
 
-@_jit()
+@kernel()
 def group_means(columns, weight, label, out, count, t0, t1):
     """Mean position of every group at frames t0:t1, over its members seen there; out (3,T,M), count (T,M)."""
     N, M = columns.shape[2], out.shape[2]
@@ -105,7 +105,7 @@ def group_means(columns, weight, label, out, count, t0, t1):
                     out[c, t, g] /= count[t, g]
 
 
-@_jit()
+@kernel()
 def spread_out(points, n, first):
     """``n`` indices by farthest-point sampling of points (N,D), beginning with ``first``."""
     N, D = points.shape
@@ -164,7 +164,7 @@ def shortlist(sa, sb, ua, ub, tau2, feature, offset, group, candidates, start, m
                     best[at], where[at] = total, j
 
 
-@_jit()
+@kernel()
 def one_to_one(i, j, n_a, n_b):
     """Positions of the pairs that greedy one-to-one matching keeps, the pairs given cheapest first."""
     used_a, used_b = np.zeros(n_a, np.bool_), np.zeros(n_b, np.bool_)

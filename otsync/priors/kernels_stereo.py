@@ -5,16 +5,14 @@
 
 from __future__ import annotations
 
-from functools import partial
-
-import numba as nb
 import numpy as np
 
-_jit = partial(nb.njit, nogil=True, cache=True, error_model="numpy")
+from ..jit import kernel
+
 _fast = {"contract", "reassoc", "nsz", "arcp"}
 
 
-@_jit(fastmath=_fast)
+@kernel(fastmath=_fast)
 def _votes(x, y, z, P, masks, near):
     """(views that see the point inside their image, views whose mask holds it)."""
     inside, held = 0, 0
@@ -33,7 +31,7 @@ def _votes(x, y, z, P, masks, near):
     return inside, held
 
 
-@_jit(fastmath=_fast)
+@kernel(fastmath=_fast)
 def carve(masks, coarse_masks, P, low, voxel, dims, block, min_views, misses, near):
     """Occupied voxels of the visual hull, uint8 (dims).
 
@@ -73,7 +71,7 @@ def carve(masks, coarse_masks, P, low, voxel, dims, block, min_views, misses, ne
     return grid
 
 
-@_jit(fastmath=_fast)
+@kernel(fastmath=_fast)
 def first_hit(grid, low, voxel, center, rays, step, near, far):
     """Depth at which each ray ``center + z ray`` (rays have unit z in the camera) enters the hull; 0: never."""
     out = np.zeros(len(rays))
@@ -90,7 +88,7 @@ def first_hit(grid, low, voxel, center, rays, step, near, far):
     return out
 
 
-@_jit(fastmath=_fast)
+@kernel(fastmath=_fast)
 def _bilinear(image, u, v):
     i, j = int(u), int(v)
     a, b = u - i, v - j
@@ -99,7 +97,7 @@ def _bilinear(image, u, v):
     )
 
 
-@_jit(fastmath=_fast)
+@kernel(fastmath=_fast)
 def sweep(points, start, depths, image, others, P, R, center, inverse_K, half, noise):
     """Normalised cross-correlation of patches around ``points`` with other views, over depths behind ``start``.
 
@@ -178,7 +176,7 @@ def sweep(points, start, depths, image, others, P, R, center, inverse_K, half, n
     return out
 
 
-@_jit(fastmath=_fast)
+@kernel(fastmath=_fast)
 def choose_depth(scores, start, first, step, near, prior):
     """Depth per group of sub-points, their scores added up at the same absolute depth.
 
