@@ -218,3 +218,14 @@ def test_neighbourhoods_do_not_depend_on_order():
     np.testing.assert_array_equal(neighbours(x, 6)[order], neighbours(x[order], 6))
     assert len(np.unique(neighbours(x, 6))) == 6
     assert len(np.unique(neighbours(x[:3], 6))) == 3
+
+
+def test_blur_is_the_residual_over_the_speed():
+    a, b, _ = films(n=40, noise=0.06)
+    curves = TrackSplines(a.times, a.positions()), TrackSplines(b.times, b.positions())
+    fit = fit_clock(*curves, Clock(0.3), 14 / 30)
+    t = np.arange(20, 90) / 30
+    residual = curves[0].value(t) - curves[1].value(t - 0.3)
+    residual -= residual.mean(1, keepdims=True)
+    speed = curves[1].velocity(t - 0.3)
+    assert fit.blur == pytest.approx(np.sqrt((residual**2).sum() / (speed**2).sum()), rel=0.25)

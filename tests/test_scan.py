@@ -182,3 +182,18 @@ def test_peaks_are_apart_and_ordered():
     score[[3, 5, 10, 17]] = 4, 5, 5, 3
     assert local_peaks(lags, score, 4, 3) == [10, 5, 17]
     assert vertex(lags, -((lags - 1.3) ** 2), 11) == pytest.approx(1.3)
+
+
+def test_curves_that_peak_elsewhere_disagree_and_short_overlaps_alias():
+    a, b = moving_pair(9, noise=0.05)
+    pair = common_clock(a, b, ALL)
+    lags = pair.lags(24, None)
+    curves, scan = evidence(pair, lags), LikelihoodScan()
+    top = int(np.argmax(curves.total))
+    assert scan._stats(pair, lags, curves, [top])["disagreement"] <= 1 / 30
+    for part in ("slow", "windows"):
+        moved = dataclasses.replace(curves, **{part: np.roll(getattr(curves, part), 8)})
+        assert scan._stats(pair, lags, moved, [top])["disagreement"] >= 7 / 30
+    end = curves.total.copy()
+    end[2] = end[top] * 0.9
+    assert scan._stats(pair, lags, dataclasses.replace(curves, total=end), [top])["alias"] > 1.0

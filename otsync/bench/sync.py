@@ -89,6 +89,16 @@ def run(
 def method_rows(seeds: Sequence[int]) -> list[Row]:
     """Every method on every pair; errors in frames, CPU-seconds."""
     rows: list[Row] = []
+    warm = next(pair_cases(PRESETS, seeds))
+    for aligner, refiner in METHODS.values():  # imports and compilation are no method's time
+        refine(
+            warm.a,
+            warm.b,
+            warm.matches,
+            align(warm.a, warm.b, warm.matches, aligner, throw=False),
+            refiner,
+            throw=False,
+        )
     for case in pair_cases(PRESETS, seeds):
         for name, (aligner, refiner) in METHODS.items():
             started = time.process_time()
@@ -196,15 +206,12 @@ def figures_of(summary: Sequence[Row], graphs: Sequence[Row]) -> dict[str, float
     figures |= {f"pair {p} flagged": ours[p]["flagged"] for p in PRESETS}
     figures |= {f"graph {r['preset']} median": r["median"] for r in graphs if r["graph"] == "graph, summed curves"}
     last = f"mean {BANDS[-1][0]}-{BANDS[-1][1]}"
-    figures["time against the paper's DTW"] = ours["mid"]["cpu_s"] / paper["mid"]["cpu_s"]
     figures["error against the paper's DTW, hard, 30-50"] = ours["hard"][last] / paper["hard"][last]
     return figures
 
 
 def worse(key: str, measured: float, baseline: float) -> bool:
-    """Accuracy on the same seeds hardly moves; shares and ratios of times do."""
-    if "time" in key:
-        return measured > 2 * baseline
+    """Accuracy on the same seeds hardly moves; shares of a few dozen pairs do."""
     if "flagged" in key:
         return measured > baseline + 0.05
     return measured > 1.15 * baseline + 0.005
