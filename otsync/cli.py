@@ -197,7 +197,6 @@ class Sync:
         if len(self.tracks) < 2:
             raise ValueError(f"tracks: expected at least two .npz files; found {len(self.tracks)}.")
         tracks = [TrackSet.load(path) for path in self.tracks]
-        self.out.mkdir(parents=True, exist_ok=True)  # before the work, not after it
         names = unique_names(tracks)
         reference: int | str = 0
         if self.reference is not None:
@@ -205,6 +204,7 @@ class Sync:
                 raise ValueError(f"--reference: expected auto or one of {', '.join(names)}; found {self.reference!r}.")
             reference = "auto" if self.reference == "auto" else names.index(self.reference)
         known = None if self.truth is None else true_offsets(self.truth, names)
+        self.out.mkdir(parents=True, exist_ok=True)  # before the work, not after it
         offsets = with_progress(
             tracks, "synchronising", self.workers, reference=reference, matcher=self.matcher, aligner=self.aligner,
             refiner=self.refiner, graph=self.graph, rematch=self.rematch, rate=self.rate,
