@@ -55,7 +55,13 @@ class Gaussians:
 
     @classmethod
     def from_colors(cls, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor) -> Gaussians:
-        """From activated values: scales > 0 [N,3], opacities in (0, 1) [N], colours [N,3] seen alike from everywhere."""
+        """From activated values: scales >= 0 [N,3], opacities in 0..1 [N], colours [N,3] seen alike from everywhere.
+
+        Scales below 1e-12 and opacities within 1e-6 of 0 and 1 become these limits, whose logarithms are finite.
+        """
+        if (scales < 0).any() or (opacities < 0).any() or (opacities > 1).any():
+            raise ValueError("scales, opacities: expected scales >= 0 and opacities in 0..1, got values beyond")
+        scales, opacities = scales.clamp_min(1e-12), opacities.clamp(1e-6, 1 - 1e-6)
         return cls(means, quats, scales.log(), opacities.logit(), ((colors - 0.5) / sh.C0)[:, None])
 
     def __len__(self) -> int:
@@ -103,6 +109,15 @@ class Gaussians:
         """The same Gaussians without their graph, on the CPU in float32: what files hold."""
         return Gaussians(*(getattr(self, f.name).detach().float().cpu() for f in fields(self)))
 
+    def finite(self) -> Gaussians:
+        """These Gaussians; ValueError when a parameter is NaN or infinite, which no file should hold."""
+        for f in fields(self):
+            if not getattr(self, f.name).isfinite().all():
+                raise ValueError(
+                    f"gaussians.{f.name}: expected finite values, got NaN or infinity: the fit has diverged"
+                )
+        return self
+
 
 def ply_fields(k: int) -> list[str]:
     """Names of the vertex properties of a 3DGS .ply with K coefficients, in their standard order."""
@@ -123,7 +138,7 @@ def save_ply(gaussians: Gaussians, path: str | os.PathLike[str]) -> None:
     """
     from plyfile import PlyData, PlyElement
 
-    g = gaussians.detach()
+    g = gaussians.detach().finite()
     names = ply_fields(g.sh.shape[1])
     rest = g.sh[:, 1:].transpose(1, 2).flatten(1)
     parts = [g.means, torch.zeros_like(g.means), g.sh[:, 0], rest, g.opacity_logits[:, None], g.log_scales, g.quats]
@@ -231,7 +246,7 @@ def save_splat(gaussians: Gaussians, path: str | os.PathLike[str]) -> None:
     float32 position [3], float32 scales [3], uint8 rgb and opacity, uint8 quaternion wxyz as 128 + 128 q. Only the
     constant part of the colour is kept.
     """
-    g = gaussians.detach()
+    g = gaussians.detach().finite()
     record = np.zeros(len(g), dtype=[("xyz", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("wxyz", "u1", 4)])
     record["xyz"], record["scales"] = g.means.numpy(), g.scales.numpy()
     rgba = torch.cat([sh.C0 * g.sh[:, 0] + 0.5, g.opacities[:, None]], 1)

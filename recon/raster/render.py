@@ -52,6 +52,7 @@ def render(
     >>> (out.colors - target).abs().mean().backward()
     """
     options = Settings(**settings)
+    Ks = Ks.detach() if isinstance(Ks, Tensor) else Ks
     _check_shapes(means, quats, scales, opacities, colors, viewmats, Ks, width, height, backgrounds, options)
     name = _choose(backend, means)
     means, quats, scales, opacities, colors = _drop_nonfinite(
@@ -69,6 +70,8 @@ def render(
     if options.sh_degree is not None:
         features = sh.view_colors(options.sh_degree, means, colors, viewmats)
     image, depths, alphas = engine.rasterize(splats, features, width, height, options.depth)
+    if len(means) == 0:  # nothing was drawn, and yet a loss on the image has gradients: zeros
+        image = image + 0 * sum(t.sum() for t in (means, quats, scales, opacities, colors, viewmats))
     if backgrounds is not None:
         image = image + (1 - alphas) * backgrounds[:, None, None, :]
     return Rendering(image, alphas, depths, splats.means2d, splats.radii, name)
@@ -167,9 +170,20 @@ def _check_shapes(
     options: Settings,
 ) -> None:
     """Raise ValueError for arguments whose shapes, types or cameras do not fit together."""
+    for name, tensor in {"means": means, "viewmats": viewmats}.items():
+        if not isinstance(tensor, Tensor):
+            raise ValueError(
+                f"{name}: expected a torch tensor, got {type(tensor).__name__}: convert with torch.as_tensor"
+            )
+    if means.dtype not in (torch.float16, torch.float32, torch.float64):
+        raise ValueError(f"means: expected float16, float32 or float64, got {means.dtype}: convert with .float()")
     n, c = len(means), len(viewmats)
 
     def expect(name: str, tensor: Tensor, *shapes: tuple[int | str, ...]) -> None:
+        if not isinstance(tensor, Tensor):
+            raise ValueError(
+                f"{name}: expected a torch tensor, got {type(tensor).__name__}: convert with torch.as_tensor"
+            )
         for shape in shapes:
             if tensor.ndim == len(shape) and all(
                 isinstance(want, str) or want == got for want, got in zip(shape, tensor.shape, strict=True)
@@ -206,8 +220,8 @@ def _check_shapes(
                 f"colors: sh_degree {options.sh_degree} needs {(options.sh_degree + 1) ** 2} coefficients, "
                 f"got {colors.shape[-2]}"
             )
-    if width < 1 or height < 1:
-        raise ValueError(f"width, height: expected at least one pixel, got {width} x {height}")
+    if not (isinstance(width, int) and isinstance(height, int)) or width < 1 or height < 1:
+        raise ValueError(f"width, height: expected whole numbers of at least one pixel, got {width} x {height}")
     if c < 1:
         raise ValueError("viewmats: expected at least one camera, got none")
     cameras = {"viewmats": viewmats, "Ks": Ks}
@@ -219,3 +233,9 @@ def _check_shapes(
             raise ValueError(
                 f"{name}: expected finite entries, got NaN or infinity: a camera or colour of the caller has diverged"
             )
+    if not ((Ks[:, 0, 0] > 0) & (Ks[:, 1, 1] > 0)).all():
+        raise ValueError(
+            "Ks: expected positive focal lengths, got zero or negative ones: flip the image, not the camera"
+        )
+    if (Ks[:, 0, 1] != 0).any():
+        raise ValueError("Ks: expected no skew (K[0,1] = 0), got some: it is not modelled; rectify the images")

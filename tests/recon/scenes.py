@@ -169,8 +169,7 @@ def run(scene: Scene, backend: str, dtype: torch.dtype = torch.float32):
         out = replace(scene, settings={"depth": "accumulated", **scene.settings}).render(backend, **leaves)
         outputs = (out.colors, out.alphas, out.depths)
     loss = weighted(outputs)
-    if loss.requires_grad:
-        loss.backward()
+    loss.backward()
     gradients = {k: t.grad if t.grad is not None else torch.zeros_like(t) for k, t in leaves.items()}
     return tuple(t.detach() for t in outputs), gradients
 

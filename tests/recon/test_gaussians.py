@@ -178,3 +178,23 @@ def test_an_empty_scene_and_foreign_types_are_read(tmp_path):
     assert g.means.tolist() == [[0, 1, 2]] and g.means.dtype == torch.float32
     text = " ".join(str(v) for v in range(17)) + "\n"
     assert torch.equal(load_ply(written(tmp_path / "c.ply", header(form="ascii"), text.encode())).sh, g.sh)
+
+
+def test_the_ends_of_opacity_and_scale_survive_a_file(tmp_path):
+    n = 3
+    ends = torch.tensor([0.0, 0.5, 1.0])
+    g = Gaussians.from_colors(torch.zeros(n, 3), torch.ones(n, 4), ends[:, None].expand(n, 3), ends, torch.ones(n, 3))
+    save_ply(g, tmp_path / "g.ply")
+    torch.testing.assert_close(load_ply(tmp_path / "g.ply").opacities, ends, atol=2e-6, rtol=0)
+    with pytest.raises(ValueError, match=r"opacities in 0\.\.1"):
+        Gaussians.from_colors(torch.zeros(n, 3), torch.ones(n, 4), torch.ones(n, 3), 2 * ends, torch.ones(n, 3))
+
+
+@pytest.mark.parametrize("save", [save_ply, save_splat])
+def test_diverged_gaussians_are_not_written(save, tmp_path):
+    g = Gaussians.from_colors(
+        torch.full((1, 3), float("nan")), torch.ones(1, 4), torch.ones(1, 3), torch.ones(1) / 2, torch.ones(1, 3)
+    )
+    with pytest.raises(ValueError, match=r"gaussians\.means: expected finite"):
+        save(g, tmp_path / "g.bin")
+    assert not list(tmp_path.iterdir())
