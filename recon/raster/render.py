@@ -70,8 +70,11 @@ def render(
     if options.sh_degree is not None:
         features = sh.view_colors(options.sh_degree, means, colors, viewmats)
     image, depths, alphas = engine.rasterize(splats, features, width, height, options.depth)
-    if len(means) == 0:  # nothing was drawn, and yet a loss on the image has gradients: zeros
-        image = image + 0 * sum(t.sum() for t in (means, quats, scales, opacities, colors, viewmats))
+    inputs = (means, quats, scales, opacities, colors, viewmats)
+    if torch.is_grad_enabled() and not image.requires_grad and any(t.requires_grad for t in inputs):
+        image = image + 0 * sum(
+            t.nan_to_num().sum() for t in inputs
+        )  # nothing is in view: gradients are zeros, not absent
     if backgrounds is not None:
         image = image + (1 - alphas) * backgrounds[:, None, None, :]
     return Rendering(image, alphas, depths, splats.means2d, splats.radii, name)

@@ -359,7 +359,6 @@ def test_repeated_calls_do_not_grow_memory(backend):
         ({"width": 10.5}, "width, height: expected whole numbers"),
         ({"Ks": torch.diag(torch.tensor([-50.0, 50, 1]))[None]}, "Ks: expected positive focal lengths"),
         ({"Ks": torch.tensor([[50.0, 1, 20], [0, 50, 20], [0, 0, 1]])[None]}, "Ks: expected no skew"),
-        ({"means": torch.zeros(40, 3).numpy()}, "means: expected a torch tensor, got ndarray"),
         ({"means": torch.zeros(40, 3, dtype=torch.bfloat16)}, "means: expected float16, float32 or float64"),
         ({"settings": {"eps2d": -1.0}}, "eps2d"),
         ({"settings": {"depth": "median"}}, "depth"),
@@ -371,6 +370,14 @@ def test_repeated_calls_do_not_grow_memory(backend):
 def test_bad_arguments_are_named(change, message):
     with pytest.raises(ValueError, match=message.replace("[", r"\[")):
         replace(BASE, **change).render("torch")
+
+
+def test_numpy_arrays_are_named():
+    arguments = [torch.zeros(4, 3), torch.ones(4, 4), torch.ones(4, 3), torch.ones(4), torch.ones(4, 3)]
+    for i, name in enumerate(("means", "quats", "scales", "opacities", "colors")):
+        mixed = [t.numpy() if k == i else t for k, t in enumerate(arguments)]
+        with pytest.raises(ValueError, match=f"{name}: expected a torch tensor, got ndarray"):
+            render(*mixed, torch.eye(4)[None], torch.eye(3)[None], 8, 8)
 
 
 def test_unknown_back_ends_and_settings_are_refused():
