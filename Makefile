@@ -5,7 +5,7 @@ BIN    := $(VENV)/bin
 PIP    := $(BIN)/pip --disable-pip-version-check install --quiet -c constraints.txt
 WORKERS ?= 2
 
-.PHONY: demo test test-all bench lint format clean
+.PHONY: demo test test-all bench stability lint format clean
 .DELETE_ON_ERROR:
 
 $(VENV)/.core: pyproject.toml constraints.txt
@@ -33,6 +33,9 @@ lint: $(VENV)/.test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+stability: $(VENV)/.test  ## docs/stability.md, from the catalogue of hard cases
+	$(BIN)/python -m tests.hard_cases.stability
 
 format: $(VENV)/.test
 	$(BIN)/ruff check --fix .

@@ -13,7 +13,8 @@ Nouns are frozen dataclasses of arrays, verbs validate and report a status, algo
 """
 
 from .align import DTW, ConstantShift, LikelihoodScan, align
-from .costs import Cosine, track_distance
+from .anchored import AnchoredFGW
+from .costs import Cosine, Labels, track_distance
 from .graph import Graph
 from .match import (
     EntropicFGW,
@@ -23,6 +24,7 @@ from .match import (
     OptimalTransport,
     PartialFGW,
     match,
+    matcher_for,
 )
 from .refine import SplineRefine, Unrefined, refine
 from .sync import synchronize
@@ -34,6 +36,7 @@ __version__ = "0.1.0"
 __all__ = [
     "DTW",
     "Alignment",
+    "AnchoredFGW",
     "Camera",
     "ConstantShift",
     "Cosine",
@@ -41,6 +44,7 @@ __all__ = [
     "FusedGromovWasserstein",
     "Graph",
     "GromovWasserstein",
+    "Labels",
     "LikelihoodScan",
     "Matches",
     "NearestNeighbor",
@@ -56,6 +60,7 @@ __all__ = [
     "Video",
     "align",
     "match",
+    "matcher_for",
     "refine",
     "synchronize",
     "track_distance",

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from .clock import CommonClock, common_clock
 from .costs import frame_cost, velocity
 from .scan import MIN_OVERLAP, LikelihoodScan, unanswered, vertex
-from .types import Alignment, Matches, Refused, TrackSet
+from .types import Alignment, Matches, Refused, Status, TrackSet, check_same_world
 
 VELOCITY_HALF = 3
 """Half window, in frames at 30 fps, of the velocities of the velocity cost."""
@@ -38,8 +38,10 @@ def align(
         aligner: the algorithm; default :class:`LikelihoodScan`; the paper's is :class:`DTW`.
         throw: raise :class:`otsync.Refused` when the answer is flagged, instead of returning it.
     """
-    a.check("a")
-    b.check("b")
+    needs_xyz = getattr(aligner, "needs_xyz", True)  # the epipolar scan reads pixels
+    a.check("a", xyz=needs_xyz)
+    b.check("b", xyz=needs_xyz)
+    check_same_world(a, b)
     matches.check("matches", len(a), len(b))
     started = time.perf_counter()
     found = (aligner or LikelihoodScan())(a, b, matches)
@@ -69,8 +71,10 @@ class DTW:
         pair = common_clock(a, b, matches)
         cost = geometric_cost(pair, self.cost)
         known = np.isfinite(cost)
-        if not known.any():
-            return unanswered(pair, matches)
+        if not known.any() or min(cost.shape) < round(MIN_OVERLAP * pair.fps):
+            return unanswered(pair, matches, cost)
+        if is_constant(cost[known]):
+            return unanswered(pair, matches, cost, Status.STATIC)
         filled = np.where(known, cost, np.median(cost[known]))
         path = self._path(filled)
         lag = most_frequent(path[:, 0] - path[:, 1])
@@ -123,6 +127,8 @@ class ConstantShift:
                 score[n] = -diagonal[known].mean()
         if not np.isfinite(score).any():
             return unanswered(pair, matches, cost)
+        if is_constant(score[np.isfinite(score)]):
+            return unanswered(pair, matches, cost, Status.STATIC)
         lag = peak(lags, score)
         return Alignment(
             float(pair.seconds(lag)),
@@ -142,6 +148,11 @@ def geometric_cost(pair: CommonClock, kind: Literal["position", "velocity"]) -> 
         raise ValueError(f"cost: expected 'position' or 'velocity'; found {kind!r}.")
     half = max(1, round(VELOCITY_HALF * pair.fps / 30))
     return frame_cost(velocity(pair.a, half), velocity(pair.b, half))[0]
+
+
+def is_constant(values: np.ndarray) -> bool:
+    """Whether values differ by no more than rounding: costs of things at rest, which tell no time."""
+    return float(np.ptp(values)) <= 1e-9 * float(np.abs(values).max(initial=0.0))
 
 
 def most_frequent(offsets: Int[np.ndarray, " P"]) -> float:

@@ -1,4 +1,4 @@
-"""The command line: ``otsync demo | simulate | match | sync | bench``, over the same dataclasses as the library.
+"""The command line: ``otsync demo | simulate | match | init | check | sync | bench``, over the same dataclasses as the library.
 
 Exit codes: 0 done; 1 an answer was refused (its status is printed); 2 bad arguments or files; 130 interrupted.
 """
@@ -15,6 +15,8 @@ import tyro
 
 from . import __version__
 from .align import DTW, ConstantShift, LikelihoodScan
+from .anchored import AnchoredFGW
+from .commands_recordings import Check, Init, RecordingOptions, sync_recording
 from .graph import Graph
 from .match import (
     EntropicFGW,
@@ -34,7 +36,16 @@ if TYPE_CHECKING:
 
 Motion = Literal["boxes", "juggle", "softball", "tennis", "basketball", "football", "static"]
 Preset = Literal["clean", "mid", "hard", "brutal"]
-Matcher = FusedGromovWasserstein | PartialFGW | EntropicFGW | GromovWasserstein | OptimalTransport | NearestNeighbor
+Matcher = (
+    AnchoredFGW
+    | FusedGromovWasserstein
+    | PartialFGW
+    | EntropicFGW
+    | GromovWasserstein
+    | OptimalTransport
+    | NearestNeighbor
+    | None
+)
 Aligner = LikelihoodScan | DTW | ConstantShift
 Refiner = SplineRefine | Unrefined
 
@@ -56,6 +67,7 @@ class Demo:
     def run(self) -> int:
         from .simulate import simulate
 
+        self.out.mkdir(parents=True, exist_ok=True)
         tracks, truth = simulate(self.motion, preset=self.preset, videos=self.videos, seed=self.seed)
         print(
             f"{self.videos} videos of a simulated scene ({self.motion}, {self.preset}), filmed without a common clock."
@@ -92,6 +104,11 @@ class Simulate:
             self.motion, preset=self.preset, videos=self.videos, frames=self.frames, fps=self.fps,
             max_offset=self.max_offset, seed=self.seed,
         )  # fmt: skip
+        stale = sorted({p.name for p in self.out.glob("*.npz")} - {f"{t.name}.npz" for t in tracks})
+        if stale:
+            raise ValueError(
+                f"{self.out}: expected a folder without track sets of another world; it holds {stale[0]}. Choose another."
+            )
         for t in tracks:
             t.save(self.out / f"{t.name}.npz")
         known = np.zeros(len(tracks))
@@ -115,13 +132,16 @@ class Match:
     b: tyro.conf.Positional[Path]
     out: Path | None = None
     """CSV file for the pairs (index in a, index in b, score)."""
-    matcher: Matcher = field(default_factory=FusedGromovWasserstein)
+    budget: float | None = None
+    """Seconds: takes the most accurate matcher that is predicted to fit."""
+    matcher: Matcher = None
+    """Default: by size, fused Gromov-Wasserstein below 200 tracks and its anchored form above."""
 
     def run(self) -> int:
         a, b = TrackSet.load(self.a), TrackSet.load(self.b)
         if sys.stderr.isatty():  # one solve has no steps to count
             print(f"matching {len(a)} x {len(b)} tracks ...", file=sys.stderr)
-        found = match(a, b, self.matcher, throw=False)
+        found = match(a, b, self.matcher, budget=self.budget, throw=False)
         print(f"{len(found)} matches between {len(a)} and {len(b)} tracks")
         print("  ".join(f"{name} {value:.6g}" for name, value in found.stats.items()))
         if self.out is not None:
@@ -137,16 +157,23 @@ class Match:
 
 @dataclass
 class Sync:
-    """Synchronise videos from their track sets.
+    """Synchronise a recording (scene.json or its folder), or videos from their track sets.
 
     Example: otsync sync world/*.npz --out result
-    The paper's method: otsync sync world/*.npz --rematch 0 --graph.extra 0 aligner:dtw refiner:unrefined
+
+    A recording: otsync sync recording/ --out result
+
+    The paper's method: otsync sync world/*.npz --rematch 0 --graph.extra 0 matcher:fused-gromov-wasserstein aligner:dtw
+    refiner:unrefined
+
+    A recording's route brings its own matcher, aligner and refiner; --recording.route chooses another.
     """
 
     tracks: tyro.conf.Positional[tuple[Path, ...]]
-    """Track sets (.npz written by otsync), one per video, in one world frame."""
+    """A scene.json or a folder with one (also in Panoptic layout); or track sets (.npz written by otsync), one per
+    video, in one world frame."""
     out: Path = Path("sync")
-    """Folder for offsets.json and report.html."""
+    """Folder for offsets.json and report.html, and the stages of a recording, from which a killed run continues."""
     reference: str | None = None
     """Name of the reference video, or "auto" for the one with the surest pairs; default: the first."""
     truth: Path | None = None
@@ -158,11 +185,15 @@ class Sync:
     workers: int = 1
     """Processes that pairs are spread over; results do not depend on it."""
     graph: Graph = field(default_factory=Graph)
-    matcher: Matcher = field(default_factory=FusedGromovWasserstein)
+    matcher: Matcher = None
+    """Default: by size, fused Gromov-Wasserstein below 200 tracks and its anchored form above."""
     aligner: Aligner = field(default_factory=LikelihoodScan)
     refiner: Refiner = field(default_factory=SplineRefine)
+    recording: RecordingOptions = field(default_factory=RecordingOptions)
 
     def run(self) -> int:
+        if len(self.tracks) == 1 and self.tracks[0].suffix != ".npz":
+            return sync_recording(self.tracks[0], self.out, self.recording, reference=self.reference, truth=self.truth)
         if len(self.tracks) < 2:
             raise ValueError(f"tracks: expected at least two .npz files; found {len(self.tracks)}.")
         tracks = [TrackSet.load(path) for path in self.tracks]
@@ -173,6 +204,7 @@ class Sync:
                 raise ValueError(f"--reference: expected auto or one of {', '.join(names)}; found {self.reference!r}.")
             reference = "auto" if self.reference == "auto" else names.index(self.reference)
         known = None if self.truth is None else true_offsets(self.truth, names)
+        self.out.mkdir(parents=True, exist_ok=True)  # before the work, not after it
         offsets = with_progress(
             tracks, "synchronising", self.workers, reference=reference, matcher=self.matcher, aligner=self.aligner,
             refiner=self.refiner, graph=self.graph, rematch=self.rematch, rate=self.rate,
@@ -181,35 +213,73 @@ class Sync:
         return report(offsets, tracks, truth, self.out, "Synchronisation report")
 
 
-SUITES = {"core": "otsync.bench.core", "raster": "recon.bench_raster"}
+SUITES = {
+    "core": "otsync.bench.core",
+    "match": "otsync.bench.match",
+    "sync": "otsync.bench.sync",
+    "raster": "recon.bench_raster",
+}
 
 
 @dataclass
 class Bench:
     """What accuracy costs in time: tables, CSV, JSON and plots, with machine and versions.
 
-    Example: otsync bench core --out bench/out --gate
+    Example: otsync bench sync --out bench/out --gate
+
+    On a truly synchronised recording: otsync bench panoptic recording/ --json
     """
 
-    suite: tyro.conf.Positional[Literal["core", "raster", "all"]]
+    suite: tyro.conf.Positional[Literal["core", "match", "sync", "raster", "panoptic", "all"]]
+    scene: tyro.conf.Positional[Path | None] = None
+    """For panoptic: a truly synchronised recording (its folder or scene.json). "all" leaves it out."""
     out: Path = Path("bench/out")
     """Folder for CSV, JSON and plots."""
     gate: bool = False
     """Compare with the committed baseline; exit code 1 when something got worse."""
     rebase: bool = False
     """Make the figures of this run the baseline that --gate compares with."""
+    promises: bool = False
+    """For sync and match: measure what is promised, on fresh seeds, instead of the tables."""
+    json: bool = False
+    """For panoptic: one line of JSON on standard output instead of tables."""
+    cache: Path | None = None
+    """For panoptic: where tracks and depth are kept; default: stages in --out."""
 
     def run(self) -> int:
         import importlib
 
+        if self.gate and self.rebase:
+            raise ValueError("--gate, --rebase: expected one of them; a run is no judge of itself.")
+        if self.suite == "panoptic":
+            if self.scene is None:
+                raise ValueError("scene: expected a recording: otsync bench panoptic SCENE.")
+            from .bench import panoptic
+
+            return panoptic.run(self.scene, self.out, json=self.json, cache=self.cache)
+        if self.promises:
+            from .bench import match_limits
+            from .bench import sync as sync_bench
+
+            if self.suite not in ("match", "sync"):
+                raise ValueError(f"--promises: expected suite match or sync; found {self.suite}.")
+            return match_limits.run(self.out) if self.suite == "match" else sync_bench.run(self.out, promises=True)
         suites = SUITES.values() if self.suite == "all" else [SUITES[self.suite]]
-        return max(importlib.import_module(name).run(self.out, gate=self.gate, rebase=self.rebase) for name in suites)
+        try:
+            modules = [importlib.import_module(name) for name in suites]
+        except ModuleNotFoundError as error:
+            raise ValueError(
+                f"bench {self.suite}: needs {error.name}. Install it: pip install 'otsync[recon]'."
+            ) from None
+        return max(module.run(self.out, gate=self.gate, rebase=self.rebase) for module in modules)
 
 
 COMMANDS: dict[str, Callable[..., Any]] = {
     "demo": Demo,
     "simulate": Simulate,
     "match": Match,
+    "init": Init,
+    "check": Check,
     "sync": Sync,
     "bench": Bench,
 }
@@ -277,7 +347,7 @@ def table(offsets: Offsets, truth: Any = None) -> str:
     for v, name in enumerate(offsets.names):
         values = (offsets.frames[v], offsets.sigma[v] * fps[v], true[v], offsets.frames[v] - true[v])
         cells = [f"{x:{w}.3f}" if np.isfinite(x) else "–".rjust(w) for x, w in zip(values, (9, 8, 9, 8), strict=True)]
-        status = offsets.status[v].code if v != offsets.component[v] else "reference"
+        status = "reference" if v == offsets.reference else offsets.status[v].code
         lines.append(f"{name:{width}}  {' '.join(cells)}  {status}")
     return "\n".join(lines)
 

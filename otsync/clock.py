@@ -66,7 +66,7 @@ def strongest(matches: Matches, limit: int) -> Matches:
 
 
 def nominal_fps(tracks: TrackSet) -> float:
-    """Frames per second, from the timestamps' median step where there are any."""
+    """Frames per second as declared, else from the timestamps' median step."""
     assert tracks.fps is not None or tracks.n_frames == 1
     return tracks.fps or 30.0
 

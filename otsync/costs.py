@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -28,14 +28,16 @@ def unit_features(features: Float[np.ndarray, "N D"], *, center: bool = False) -
     Rows are brought to order one first: squares of 1e±200 neither overflow nor vanish. A row that centring makes
     zero (it equals the mean) stays zero: at cosine distance 1 from everything, it carries no information.
     """
-    f = np.asarray(features, float)
-    f = f / np.maximum(np.abs(f).max(1, keepdims=True, initial=0.0), np.finfo(float).tiny)
-    f = f / np.maximum(np.linalg.norm(f, axis=1, keepdims=True), np.finfo(float).tiny)
+    tiny = np.finfo(float).tiny
+    f = np.array(features, float)
+    top = np.maximum(f.max(1, initial=0.0), -f.min(1, initial=0.0))
+    f /= np.maximum(top, tiny)[:, None]
+    f /= np.maximum(np.sqrt(np.einsum("nd,nd->n", f, f)), tiny)[:, None]
     if center:
-        f = f - f.mean(0)
-        norm = np.linalg.norm(f, axis=1, keepdims=True)
+        f -= f.mean(0)
+        norm = np.sqrt(np.einsum("nd,nd->n", f, f))
         # what is left of a set of equal rows is rounding; blown up to unit norm it would look like information
-        f = np.where(norm > 1e-7, f / np.maximum(norm, 1e-7), 0.0)
+        f *= np.where(norm > 1e-7, 1 / np.maximum(norm, 1e-7), 0.0)[:, None]
     return f
 
 
@@ -61,8 +63,18 @@ def track_distance(
     from . import kernels
 
     same = other is None
-    if other is None or other_visible is None:
+    if other is None:
         other, other_visible = xyz, visible
+    elif other_visible is None:
+        other_visible = np.ones(other.shape[:2], bool)
+    for name, x, seen in (("xyz", xyz, visible), ("other", other, other_visible)):
+        if x.ndim != 3 or x.shape[2] != 3 or seen.shape != x.shape[:2] or x.shape[1] != xyz.shape[1]:
+            raise ValueError(
+                f"{name}: expected (N,{xyz.shape[1]},3) positions with visibility (N,{xyz.shape[1]}); found {x.shape} "
+                f"and {seen.shape}."
+            )
+        if not np.isfinite(x[seen]).all():
+            raise ValueError(f"{name}: expected finite positions in visible samples; found nan or infinity.")
     dtype = np.dtype(np.float32 if xyz.dtype == other.dtype == np.float32 else np.float64)
     gaps = not (visible.all() and other_visible.all())
     scale = dtype.type(max(binary_scale(xyz[visible]), binary_scale(other[other_visible])))
@@ -140,7 +152,11 @@ def velocity(x: Float[np.ndarray, "M T 3"], half: int) -> Float[np.ndarray, "M T
 
 
 class Cost(Protocol):
-    """One linear term of the matching objective: an item of the ``costs`` tuple."""
+    """One linear term of the matching objective: an item of the ``costs`` tuple.
+
+    The dense solvers read ``matrix``; :class:`otsync.AnchoredFGW`, which never looks at all pairs, reads the matrix of
+    a few means of groups and ``pairs`` of the candidates.
+    """
 
     @property
     def weight(self) -> float: ...
@@ -148,6 +164,19 @@ class Cost(Protocol):
     def matrix(self, a: TrackSet, b: TrackSet) -> Float[np.ndarray, "Na Nb"]:
         """Cost of matching every track of a to every track of b, of order one."""
         ...
+
+    def pairs(
+        self, a: TrackSet, b: TrackSet, i: Int[np.ndarray, " P"], j: Int[np.ndarray, " P"]
+    ) -> Float[np.ndarray, " P"]:
+        """``matrix(a, b)[i, j]`` without the matrix."""
+        ...
+
+
+@runtime_checkable
+class Factored(Protocol):
+    """A cost whose matrix is ``1 - U Vᵀ`` with few columns: compiled loops evaluate it wherever they like."""
+
+    def factors(self, a: TrackSet, b: TrackSet) -> tuple[Float[np.ndarray, "Na D"], Float[np.ndarray, "Nb D"]]: ...
 
 
 @dataclass(frozen=True)
@@ -163,6 +192,13 @@ class Cosine:
     center: bool = True
 
     def matrix(self, a: TrackSet, b: TrackSet) -> Float[np.ndarray, "Na Nb"]:
+        return cosine_distance(*self.factors(a, b))
+
+    def pairs(self, a: TrackSet, b: TrackSet, i: np.ndarray, j: np.ndarray) -> Float[np.ndarray, " P"]:
+        return factored_pairs(*self.factors(a, b), i, j)
+
+    def factors(self, a: TrackSet, b: TrackSet) -> tuple[Float[np.ndarray, "Na D"], Float[np.ndarray, "Nb D"]]:
+        """Unit features, after checks."""
         a.check("a", xyz=False, features=True)
         b.check("b", xyz=False, features=True)
         assert a.features is not None and b.features is not None
@@ -171,14 +207,78 @@ class Cosine:
                 f"b.features: expected {a.features.shape[1]} dimensions as a has; found {b.features.shape[1]}. "
                 "Use the same descriptor for both videos."
             )
-        return cosine_distance(
-            unit_features(a.features, center=self.center), unit_features(b.features, center=self.center)
-        )
+        return unit_features(a.features, center=self.center), unit_features(b.features, center=self.center)
+
+
+@dataclass(frozen=True)
+class Labels:
+    """Instance or class labels that both videos share: 0 where they agree, 1 where they differ (the paper's outlook).
+
+    ``1 - Σ_l p_il q_jl`` with the tracks' memberships p, q: the chance that the labels differ. Integer labels are
+    certain, -1 means unlabelled; soft ones are (N,L) weights >= 0 (rows are normalised, zeros mean unlabelled). An
+    unlabelled track costs 1/2 with everything.
+    """
+
+    weight: float = 1.0
+
+    def matrix(self, a: TrackSet, b: TrackSet) -> Float[np.ndarray, "Na Nb"]:
+        return cosine_distance(*self.factors(a, b))
+
+    def pairs(self, a: TrackSet, b: TrackSet, i: np.ndarray, j: np.ndarray) -> Float[np.ndarray, " P"]:
+        return factored_pairs(*self.factors(a, b), i, j)
+
+    def factors(self, a: TrackSet, b: TrackSet) -> tuple[Float[np.ndarray, "Na D"], Float[np.ndarray, "Nb D"]]:
+        """Memberships, and two columns that make the unlabelled neutral."""
+        p, q = memberships(a, b)
+        u, v = (x.sum(1, keepdims=True) == 0 for x in (p, q))
+        return np.hstack([p, 0.5 * u, 0.5 * ~u]), np.hstack([q, np.ones_like(v), v]).astype(float)
+
+
+def memberships(a: TrackSet, b: TrackSet) -> tuple[Float[np.ndarray, "Na L"], Float[np.ndarray, "Nb L"]]:
+    """Labels of both sets as weights over their common classes, rows summing to one, or to zero when unlabelled."""
+    for name, tracks in (("a", a), ("b", b)):
+        if tracks.labels is None:
+            raise ValueError(
+                f"{name}.labels: expected (N,) integers or (N,L) weights; found none. Add them to both sets."
+            )
+        if tracks.labels.ndim == 1 and tracks.labels.dtype.kind == "f":
+            raise ValueError(f"{name}.labels: expected integers, or (N,L) weights; found {tracks.labels.dtype}.")
+    assert a.labels is not None and b.labels is not None
+    if a.labels.ndim != b.labels.ndim or (a.labels.ndim == 2 and a.labels.shape[1] != b.labels.shape[1]):
+        raise ValueError(f"b.labels: expected the classes that a has ({a.labels.shape}); found {b.labels.shape}.")
+    if a.labels.ndim == 1:
+        classes = np.unique(np.concatenate([a.labels, b.labels]))
+        classes = classes[classes >= 0]
+        p, q = ((x[:, None] == classes).astype(float) for x in (a.labels, b.labels))
+        return p, q
+    found = []
+    for name, tracks in (("a", a), ("b", b)):
+        weights = np.asarray(tracks.labels, float)
+        if not np.isfinite(weights).all() or (weights < 0).any():
+            raise ValueError(f"{name}.labels: expected finite weights >= 0; some are not.")
+        top = weights.max(1, keepdims=True, initial=0.0)
+        weights = weights / np.where(top > 0, top, 1.0)
+        total = weights.sum(1, keepdims=True)
+        found.append(weights / np.where(total > 0, total, 1.0))
+    return found[0], found[1]
+
+
+def factored_pairs(
+    u: Float[np.ndarray, "Na D"], v: Float[np.ndarray, "Nb D"], i: Int[np.ndarray, " P"], j: Int[np.ndarray, " P"]
+) -> Float[np.ndarray, " P"]:
+    """``1 - u_i·v_j`` of the pairs, in pieces of a few megabytes."""
+    out = np.empty(len(i))
+    step = max(1, 2**20 // max(1, u.shape[1]))
+    for s in range(0, len(i), step):
+        out[s : s + step] = 1.0 - np.einsum("pd,pd->p", u[i[s : s + step]], v[j[s : s + step]])
+    return out
 
 
 def total_cost(costs: tuple[Cost, ...], a: TrackSet, b: TrackSet) -> Float[np.ndarray, "Na Nb"]:
     """Weighted sum of the cost objects' matrices; zeros for an empty tuple."""
     total = np.zeros((len(a), len(b)))
     for cost in costs:
+        if not (np.isfinite(cost.weight) and cost.weight >= 0):
+            raise ValueError(f"costs: expected weights >= 0; found {cost}.")
         total += cost.weight * cost.matrix(a, b)
     return total

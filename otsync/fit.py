@@ -182,7 +182,9 @@ class System:
             leverage = np.einsum("pq,cqp->c", np.linalg.inv(_regular(self.H)), Hc) / len(self.H)
             shrink = np.minimum(1.0, MOST_LEVERAGE / np.maximum(leverage, 1e-12))
             rest = self.H - shrink[:, None, None] * Hc
-            moved = np.linalg.solve(rest + 1e-12 * np.trace(self.H) * np.eye(len(self.H)), gc[..., None])[..., 0]
+            moved = np.linalg.solve(rest + (1e-12 * np.trace(self.H) + 1e-300) * np.eye(len(self.H)), gc[..., None])[
+                ..., 0
+            ]
             found.append(moved.T @ moved)
         return max(found, key=lambda c: float(c[0, 0]))
 

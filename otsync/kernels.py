@@ -9,13 +9,11 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from typing import Any
 
-import numba as nb
 import numpy as np
 
-_jit = partial(nb.njit, nogil=True, cache=True, error_model="numpy")
+from .jit import kernel
 
 
 def over_blocks(work: Callable[..., Any], blocks: Iterable[Any], threads: int | None = None) -> None:
@@ -30,7 +28,7 @@ def over_blocks(work: Callable[..., Any], blocks: Iterable[Any], threads: int | 
         list(pool.map(work, blocks))
 
 
-@_jit(fastmath={"contract", "reassoc", "nsz"})
+@kernel(fastmath={"contract", "reassoc", "nsz"})
 def max_distance_block(a, b, wa, wb, gaps, i0, i1, j0, j1, out):
     """D_track of rows i0:i1 of ``a`` against columns j0:j1 of ``b``.
 
@@ -64,7 +62,7 @@ def max_distance_block(a, b, wa, wb, gaps, i0, i1, j0, j1, out):
             out[i0 + i, j0 + j] = np.nan if gaps and met[i, j] == 0 else np.sqrt(best[i, j])
 
 
-@_jit()
+@kernel()
 def open_end_path(cost, level):
     """Warping path with free ends: from the first row or column to the last row or column.
 
@@ -111,7 +109,7 @@ def open_end_path(cost, level):
     return path[:length][::-1]
 
 
-@_jit(fastmath={"contract", "reassoc", "nsz"})
+@kernel(fastmath={"contract", "reassoc", "nsz"})
 def lag_statistics(a, wa, qa, b, wb, qb, lags, least, count, power, residual):
     """Variances of every match over its common frames at every lag; the mean over exactly these frames is removed.
 
@@ -150,7 +148,7 @@ def lag_statistics(a, wa, qa, b, wb, qb, lags, least, count, power, residual):
             residual[m, n] = max((sp + SP - 2 * cross - (dx * dx + dy * dy + dz * dz) / c) / c, 0.0)
 
 
-@_jit(fastmath={"contract", "reassoc", "nsz"})
+@kernel(fastmath={"contract", "reassoc", "nsz"})
 def windowed_evidence(a, wa, qa, b, wb, qb, lags, block, least, floor, out):
     """Sum over matches and windows of n/2 log((Var a + Var b + floor) / (Var(a - b) + floor)) at every lag.
 
@@ -202,7 +200,7 @@ def windowed_evidence(a, wa, qa, b, wb, qb, lags, block, least, floor, out):
                 out[n] += 0.25 * c * np.log((power + floor) / (residual + floor))
 
 
-@_jit(fastmath={"contract", "reassoc", "nsz"})
+@kernel(fastmath={"contract", "reassoc", "nsz"})
 def shift_residuals(x, coefficients, mean, first, value, slope, clock, ok, lo, hi, least, rr, g, h):
     """Detrended residual of every match against the other video's spline, and its products with the Jacobian.
 
@@ -267,7 +265,7 @@ def shift_residuals(x, coefficients, mean, first, value, slope, clock, ok, lo, h
                     h[p, q, m, t] = part[i] * part[j] + part[i + 1] * part[j + 1] + part[i + 2] * part[j + 2]
 
 
-@_jit(fastmath={"contract", "reassoc", "nsz"})
+@kernel(fastmath={"contract", "reassoc", "nsz"})
 def synchronous_distances(a, wa, b, wb, farthest, least, i0, i1, place, motion):
     """Distances of rows i0:i1 of a from all of b at common moments.
 

@@ -7,7 +7,10 @@ Measured on synthetic figures (N = 2000): FGW by conditional gradient P50 .67, p
 
 from __future__ import annotations
 
+import logging
+import os
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -15,7 +18,12 @@ import numpy as np
 from jaxtyping import Float
 
 from .costs import Cosine, Cost, fill_unseen, total_cost, track_distance
+from .frontier import ANCHORED_FROM, fitting
+from .sinkhorn import MARGINAL_ERROR, sinkhorn
 from .types import Matches, Refused, Status, TrackSet, in_order
+from .vouch import vouch
+
+log = logging.getLogger("otsync")
 
 LP_PIVOTS = 10_000_000
 """Limit for POT's network simplex. Its default of 1e5 stops short from N = 5000 on, with no more than a warning."""
@@ -24,22 +32,21 @@ FLAT = 1e-9
 """Costs whose spread is below this (of order-one costs) carry no information."""
 
 
-MARGINAL_ERROR = 1e-3
-"""Largest L1 error of a plan's marginals (which sum to one) before the answer is flagged as failed."""
-
-
 class Matcher(Protocol):
     """The ``matcher`` slot."""
 
     def __call__(self, a: TrackSet, b: TrackSet) -> Matches: ...
 
 
-def match(a: TrackSet, b: TrackSet, matcher: Matcher | None = None, *, throw: bool = True) -> Matches:
+def match(
+    a: TrackSet, b: TrackSet, matcher: Matcher | None = None, *, budget: float | None = None, throw: bool = True
+) -> Matches:
     """Correspondences between the tracks of two videos.
 
     Args:
         a, b: track sets; they need no common frame, clock or size.
-        matcher: the algorithm; default :class:`FusedGromovWasserstein`, the paper's.
+        matcher: the algorithm; default: :func:`matcher_for` their sizes.
+        budget: seconds; takes the most accurate matcher that is predicted to fit, and tells the log which.
         throw: raise :class:`otsync.Refused` when the answer is flagged, instead of returning it.
 
     Example:
@@ -49,13 +56,43 @@ def match(a: TrackSet, b: TrackSet, matcher: Matcher | None = None, *, throw: bo
     """
     a.check("a", xyz=False)
     b.check("b", xyz=False)
+    if matcher is not None and budget is not None:
+        raise ValueError("matcher, budget: expected one of them; found both. A budget chooses the matcher.")
+    matcher = matcher or matcher_for(len(a), len(b), budget)
+    if budget is not None:
+        log.info("match: %s fits %g s for %d x %d tracks", matcher, budget, len(a), len(b))
     started = time.perf_counter()
-    found = (matcher or FusedGromovWasserstein())(a, b)
+    found = matcher(a, b)
     found.check("matcher", len(a), len(b))
+    found = vouch(found, a, b, getattr(matcher, "costs", ()))
     found.stats.setdefault("seconds", time.perf_counter() - started)
     if throw and not found.status.ok:
         raise Refused("match", found)
     return found
+
+
+def matcher_for(n_a: int, n_b: int, budget: float | None = None) -> Matcher:
+    """The matcher for so many tracks: the most accurate one, or the most accurate that fits ``budget`` seconds.
+
+    Without a budget the paper's :class:`FusedGromovWasserstein` up to 200 tracks and :class:`AnchoredFGW` above, where
+    it is both faster and more precise than any dense solver. Seconds are those of one thread of the machine that the
+    benchmark was measured on (:mod:`otsync.frontier`).
+    """
+    from .anchored import AnchoredFGW
+
+    known: dict[str, Callable[[], Matcher]] = {
+        "NearestNeighbor": NearestNeighbor,
+        "OptimalTransport": OptimalTransport,
+        "FusedGromovWasserstein": FusedGromovWasserstein,
+        "PartialFGW": PartialFGW,
+        "AnchoredFGW, small": lambda: AnchoredFGW(anchors=100, cells=500, restarts=1),
+        "AnchoredFGW": AnchoredFGW,
+    }
+    n = max(n_a, n_b)
+    if budget is None:
+        return AnchoredFGW() if min(n_a, n_b) >= ANCHORED_FROM else FusedGromovWasserstein()
+    positive("budget", budget)
+    return known[fitting(n, budget)]()
 
 
 @dataclass(frozen=True)
@@ -65,7 +102,7 @@ class NearestNeighbor:
     costs: tuple[Cost, ...] = (Cosine(),)
 
     def __call__(self, a: TrackSet, b: TrackSet) -> Matches:
-        M = total_cost(self.costs, a, b)
+        M = linear_cost(self.costs, a, b)
         if is_flat(M):
             return no_information(M)
         best_b, best_a = M.argmin(1), M.argmin(0)
@@ -80,7 +117,7 @@ class OptimalTransport:
 
     Args:
         reg: 0 for the exact plan (network simplex); else Sinkhorn with ε = reg times the spread of the cost.
-        center, costs: as elsewhere.
+        costs: what is summed, a tuple of cost objects.
     """
 
     reg: float = 0.0
@@ -92,7 +129,7 @@ class OptimalTransport:
     def __call__(self, a: TrackSet, b: TrackSet) -> Matches:
         import ot
 
-        M = total_cost(self.costs, a, b)
+        M = linear_cost(self.costs, a, b)
         if is_flat(M):
             return no_information(M)
         p, q = uniform(len(a)), uniform(len(b))
@@ -114,6 +151,8 @@ class FusedGromovWasserstein:
     Args:
         alpha: the paper's α. POT's weight is a = 2/(2+α) and F = (1 + α/2) F_POT; the optimum is broad (.2 to .5).
         max_iter, tol: of the conditional gradient; ``tol`` is relative to the objective.
+        device: None for numpy, or a torch device ("cuda", "cpu"): POT's torch back end does the products there. The
+            inner transport problem, most of the time, is solved on the CPU all the same.
 
     References: Vayer et al., Optimal Transport for structured data, ICML 2019; paper Eq. 1.
     """
@@ -122,9 +161,12 @@ class FusedGromovWasserstein:
     costs: tuple[Cost, ...] = (Cosine(),)
     max_iter: int = 500
     tol: float = 1e-9
+    device: str | None = None
 
     def __post_init__(self) -> None:
         positive("FusedGromovWasserstein.alpha", self.alpha, zero=True)
+        positive("FusedGromovWasserstein.max_iter", self.max_iter)
+        positive("FusedGromovWasserstein.tol", self.tol)
 
     def __call__(self, a: TrackSet, b: TrackSet) -> Matches:
         import ot
@@ -132,12 +174,14 @@ class FusedGromovWasserstein:
         problem = Problem.of(a, b, self.costs, self.alpha)
         if problem.flat:
             return no_information(problem.M)
+        arrays = on_device(self.device, problem.M, problem.Ca, problem.Cb, problem.p, problem.q)
         plan, log = ot.gromov.fused_gromov_wasserstein(
-            problem.M, problem.Ca, problem.Cb, problem.p, problem.q, "square_loss", symmetric=True,
-            alpha=problem.pot_weight, log=True, max_iter=self.max_iter, tol_rel=self.tol,
-            tol_abs=self.tol * 1e-3, numItermaxEmd=LP_PIVOTS,
+            *arrays, "square_loss", symmetric=True, alpha=problem.pot_weight, log=True, max_iter=self.max_iter,
+            tol_rel=self.tol, tol_abs=self.tol * 1e-3, numItermaxEmd=LP_PIVOTS,
         )  # fmt: skip
-        return problem.matches(plan, len(log["loss"]) - 1)
+        iterations = len(log["loss"]) - 1
+        done = iterations < self.max_iter
+        return problem.matches(plan if self.device is None else plan.cpu().numpy(), iterations, converged=done)
 
 
 @dataclass(frozen=True)
@@ -146,9 +190,10 @@ class GromovWasserstein:
 
     max_iter: int = 500
     tol: float = 1e-9
+    device: str | None = None
 
     def __call__(self, a: TrackSet, b: TrackSet) -> Matches:
-        return FusedGromovWasserstein(alpha=0.0, costs=(), max_iter=self.max_iter, tol=self.tol)(a, b)
+        return FusedGromovWasserstein(0.0, (), self.max_iter, self.tol, self.device)(a, b)
 
 
 @dataclass(frozen=True)
@@ -171,23 +216,26 @@ class EntropicFGW:
     def __post_init__(self) -> None:
         positive("EntropicFGW.reg", self.reg)
         positive("EntropicFGW.alpha", self.alpha, zero=True)
+        positive("EntropicFGW.max_iter", self.max_iter)
+        positive("EntropicFGW.tol", self.tol)
 
     def __call__(self, a: TrackSet, b: TrackSet) -> Matches:
         problem = Problem.of(a, b, self.costs, self.alpha)
         if problem.flat:
             return no_information(problem.M)
         plan = np.outer(problem.p, problem.q)
-        reg, failed, iterations = max(0.1, self.reg), False, 0
+        reg, failed, converged, iterations = max(0.1, self.reg), False, False, 0
         while iterations < self.max_iter:
             iterations += 1
             cost = problem.gradient(plan)
             after, _, failed = sinkhorn(problem.p, problem.q, cost, reg * max(float(np.ptp(cost)), FLAT))
             change = float(np.abs(after - plan).sum())
             plan = after
-            if reg == self.reg and (change < self.tol or failed):
+            converged = reg == self.reg and change < self.tol
+            if converged or (reg == self.reg and failed):
                 break
             reg = max(self.reg, 0.7 * reg)
-        return problem.matches(plan, iterations, failed=failed)
+        return problem.matches(plan, iterations, failed=failed, converged=converged)
 
 
 @dataclass(frozen=True)
@@ -209,6 +257,7 @@ class PartialFGW:
         if not 0 < self.mass <= 1:
             raise ValueError(f"PartialFGW.mass: expected a share in (0, 1]; found {self.mass}.")
         positive("PartialFGW.alpha", self.alpha, zero=True)
+        positive("PartialFGW.tol", self.tol)
 
     def __call__(self, a: TrackSet, b: TrackSet) -> Matches:
         import ot
@@ -220,8 +269,9 @@ class PartialFGW:
         # fixed mass a constant added to M changes no minimiser: make it dominate the largest possible gradient.
         largest = 2 * max(problem.Ca.max(), problem.Cb.max()) ** 2
         lift = largest / (1 - problem.pot_weight) if problem.pot_weight < 1 else 0.0
+        mass = min(self.mass, float(problem.p.sum()), float(problem.q.sum()))  # 49 times 1/49 is not quite 1
         plan, log = ot.gromov.partial_fused_gromov_wasserstein(
-            problem.M + lift, problem.Ca, problem.Cb, problem.p, problem.q, self.mass, "square_loss",
+            problem.M + lift, problem.Ca, problem.Cb, problem.p, problem.q, mass, "square_loss",
             alpha=problem.pot_weight, log=True, symmetric=True, tol=self.tol, warn=False,
             numItermax=LP_PIVOTS,  # POT hands its outer limit on as the LP's pivots
         )  # fmt: skip
@@ -246,6 +296,7 @@ class Problem:
     def of(cls, a: TrackSet, b: TrackSet, costs: tuple[Cost, ...], alpha: float) -> Problem:
         a.check("a")
         b.check("b")
+        check_memory(len(a), len(b))
         Ca, Cb = normalised_structure(a, b)
         return cls(total_cost(costs, a, b), Ca, Cb, uniform(len(a)), uniform(len(b)), alpha)
 
@@ -257,10 +308,8 @@ class Problem:
     @property
     def flat(self) -> bool:
         """Whether neither features nor structure distinguish the tracks."""
-        return (
-            (self.alpha == 0 or is_flat(self.M))
-            and is_flat(self.Ca, diagonal=False)
-            and is_flat(self.Cb, diagonal=False)
+        return (self.alpha == 0 or is_flat(self.M)) and (
+            is_flat(self.Ca, diagonal=False) or is_flat(self.Cb, diagonal=False)
         )
 
     def structure(self, plan: Float[np.ndarray, "Na Nb"]) -> Float[np.ndarray, "Na Nb"]:
@@ -276,12 +325,16 @@ class Problem:
         """F of the paper's Eq. 1."""
         return float((self.structure(plan) * plan).sum() + self.alpha / 2 * (self.M * plan).sum())
 
-    def matches(self, plan: np.ndarray, iterations: int, *, mass: float = 1.0, failed: bool = False) -> Matches:
+    def matches(
+        self, plan: np.ndarray, iterations: int, *, mass: float = 1.0, failed: bool = False, converged: bool = True
+    ) -> Matches:
+        """Discrete matches of a plan; ``stats["converged"]`` is 0 when the solver stopped at its limit."""
         objective = self.objective(plan)
         stats = {
             "objective": objective,
             "objective_pot": objective / (1 + self.alpha / 2),
             "iterations": float(iterations),
+            "converged": float(converged),
         }
         return from_plan(plan, self.gradient(plan), self.p, self.q, mass, stats, failed)
 
@@ -352,53 +405,34 @@ def is_flat(C: np.ndarray, *, diagonal: bool = True) -> bool:
     return values.size <= 1 or float(np.ptp(values)) <= FLAT * max(1.0, float(np.abs(values).max()))
 
 
+def check_memory(n_a: int, n_b: int) -> None:
+    """ValueError, before anything is allocated, when a dense problem's matrices cannot fit into memory."""
+    need = 8 * (6 * n_a * n_b + 3 * n_a**2 + 3 * n_b**2)  # at the peak of POT's conditional gradient
+    have = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if need > have:
+        raise ValueError(
+            f"a, b: a dense solver needs about {need / 2**30:.0f} GiB for {n_a} x {n_b} tracks; this machine has "
+            f"{have / 2**30:.0f}. Use AnchoredFGW, which is sparse, or take fewer tracks."
+        )
+
+
+def linear_cost(costs: tuple[Cost, ...], a: TrackSet, b: TrackSet) -> Float[np.ndarray, "Na Nb"]:
+    """M, when it fits into memory."""
+    check_memory(len(a), len(b))
+    return total_cost(costs, a, b)
+
+
+def on_device(device: str | None, *arrays: np.ndarray) -> list[Any]:
+    """The arrays as they are, or as torch tensors on ``device``."""
+    if device is None:
+        return list(arrays)
+    import torch
+
+    return [torch.as_tensor(x, device=device) for x in arrays]
+
+
 def uniform(n: int) -> Float[np.ndarray, " n"]:
     return np.full(n, 1.0 / n)
-
-
-def sinkhorn(
-    p: np.ndarray, q: np.ndarray, cost: np.ndarray, eps: float, *, max_iter: int = 5000, tol: float = 1e-9
-) -> tuple[np.ndarray, int, bool]:
-    """Entropic plan, rounded to its marginals: (plan, iterations, failed).
-
-    Scalings are absorbed into the potentials before they leave the range of floats, and ε is annealed down from the
-    spread of the cost (Schmitzer, Stabilized sparse scaling algorithms for entropy regularized transport, 2019). POT's
-    own variants return zeros, nan or negative entries for ε below about a hundredth of the spread.
-    """
-    f = cost.min(1)
-    g = (cost - f[:, None]).min(0)  # each row and column now has an entry without slack: no sum underflows to zero
-    step, iterations = max(float(np.ptp(cost)), eps), 0
-    while True:
-        step = max(eps, step / 4)
-        u, v, error = np.ones_like(p), np.ones_like(q), np.inf
-        K = np.exp((f[:, None] + g[None] - cost) / step)
-        for k in range(max_iter if step == eps else 50):
-            u = p / (K @ v)
-            v = q / (K.T @ u)
-            iterations += 1
-            extreme = max(np.abs(np.log(u)).max(), np.abs(np.log(v)).max()) > 100
-            if extreme or k % 10 == 9:
-                error = float(np.abs(u * (K @ v) - p).sum())
-            if extreme:
-                f, g = f + step * np.log(u), g + step * np.log(v)
-                u, v = np.ones_like(p), np.ones_like(q)
-                K = np.exp((f[:, None] + g[None] - cost) / step)
-            if error < tol:
-                break
-        f, g = f + step * np.log(u), g + step * np.log(v)
-        if step == eps:
-            break
-    plan = np.exp((f[:, None] + g[None] - cost) / eps)
-    return round_to_marginals(plan, p, q), iterations, not error < MARGINAL_ERROR
-
-
-def round_to_marginals(plan: np.ndarray, p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """The nearby plan that meets its marginals exactly (Altschuler, Weed and Rigollet, NeurIPS 2017, Alg. 2)."""
-    tiny = np.finfo(float).tiny
-    plan = plan * np.minimum(1.0, p / np.maximum(plan.sum(1), tiny))[:, None]
-    plan = plan * np.minimum(1.0, q / np.maximum(plan.sum(0), tiny))[None]
-    rows, columns = np.maximum(p - plan.sum(1), 0), np.maximum(q - plan.sum(0), 0)
-    return plan + np.outer(rows, columns) / max(float(np.abs(rows).sum()), tiny)
 
 
 def positive(name: str, value: float, *, zero: bool = False) -> None:

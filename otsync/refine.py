@@ -17,7 +17,7 @@ from .costs import binary_scale
 from .fit import Clock, Fit, fit_clock, overlap_seconds, velocity_correlation
 from .splines import SMOOTHING, TrackSplines
 from .trust import Trust
-from .types import Alignment, Matches, Refused, Status, TrackSet, gravest, in_order
+from .types import Alignment, Matches, Refused, Status, TrackSet, check_same_world, gravest, in_order
 
 LEAST_SIGMA = 0.012 / 30
 """Seconds; no sigma is reported below this."""
@@ -56,8 +56,10 @@ def refine(
         refiner: the algorithm; default :class:`SplineRefine`. :class:`Unrefined` leaves the alignment as it is.
         throw: raise :class:`otsync.Refused` when the answer is flagged, instead of returning it.
     """
-    a.check("a")
-    b.check("b")
+    needs_xyz = getattr(refiner, "needs_xyz", True)  # the epipolar fit reads pixels
+    a.check("a", xyz=needs_xyz)
+    b.check("b", xyz=needs_xyz)
+    check_same_world(a, b)
     matches.check("matches", len(a), len(b))
     started = time.perf_counter()
     found = (refiner or SplineRefine())(a, b, matches, alignment)
@@ -70,6 +72,8 @@ def refine(
 @dataclass(frozen=True)
 class Unrefined:
     """Takes the aligner's answer as it is."""
+
+    needs_xyz = False
 
     def __call__(self, a: TrackSet, b: TrackSet, matches: Matches, alignment: Alignment) -> Alignment:
         return alignment

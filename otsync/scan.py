@@ -279,9 +279,11 @@ def vertex(lags: Int[np.ndarray, " K"], score: Float[np.ndarray, " K"], i: int) 
     return float(lags[i])
 
 
-def unanswered(pair: CommonClock, matches: Matches, cost: np.ndarray | None = None) -> Alignment:
-    """The answer when no lag leaves matched samples to compare."""
-    flags = (Status.FEW_MATCHES if len(matches) == 0 else Status.NO_OVERLAP,)
+def unanswered(
+    pair: CommonClock, matches: Matches, cost: np.ndarray | None = None, why: Status = Status.NO_OVERLAP
+) -> Alignment:
+    """The answer when no lag leaves matched samples to compare, or they tell nothing."""
+    flags = (Status.FEW_MATCHES if len(matches) == 0 else why,)
     stats = {"matches": float(len(matches))}
     return Alignment(float("nan"), cost=cost, fps=pair.fps, status=gravest(flags), flags=flags, stats=stats)
 

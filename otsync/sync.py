@@ -61,7 +61,11 @@ def synchronize(
 
     A pair that fails gets a status and nan; the others live. Wrong input raises ValueError before any work.
     """
-    chosen = check_tracks(tracks, reference)
+    chosen = check_tracks(tracks, reference, xyz=getattr(aligner, "needs_xyz", True))
+    costs = (Cosine(),) if matcher is None else getattr(matcher, "costs", ())
+    if matches is None and any(isinstance(cost, Cosine) for cost in costs):
+        for v, t in enumerate(tracks):
+            t.check(f"tracks[{v}]", xyz=False, features=True)
     if rate not in ("fixed", "fit"):
         raise ValueError(f"rate: expected 'fixed' or 'fit'; found {rate!r}.")
     started = time.perf_counter()
@@ -158,8 +162,10 @@ def rematching(jobs: list[Job], found: Settled) -> list[Job]:
             continue
         # t_a = (r_b t_b + x_b - x_a) / r_a
         offset, rate = (found.x[j] - found.x[i]) / found.rates[i], found.rates[j] / found.rates[i]
+        at = getattr(job.matcher, "at", None)  # a matcher may know better how to match at known times
         costs = getattr(job.matcher, "costs", (Cosine(),))
-        again.append(dataclasses.replace(job, matcher=SynchronousMatching(float(offset), float(rate), costs)))
+        matcher = at(float(offset), float(rate)) if at else SynchronousMatching(float(offset), float(rate), costs)
+        again.append(dataclasses.replace(job, matcher=matcher))
     return again
 
 
@@ -188,7 +194,7 @@ def to_offsets(tracks: Sequence[TrackSet], found: Settled, seconds: float) -> Of
     )
 
 
-def check_tracks(tracks: Sequence[TrackSet], reference: int | Literal["auto"]) -> int | None:
+def check_tracks(tracks: Sequence[TrackSet], reference: int | Literal["auto"], *, xyz: bool = True) -> int | None:
     """ValueError unless there are at least two sound track sets; the reference's index, None when it is to be chosen."""
     if isinstance(tracks, TrackSet) or len(tracks) < 2:
         raise ValueError("tracks: expected a sequence of at least two track sets, one per video; found fewer.")
@@ -200,7 +206,7 @@ def check_tracks(tracks: Sequence[TrackSet], reference: int | Literal["auto"]) -
             )
         chosen = reference % len(tracks)
     for v, t in enumerate(tracks):
-        t.check(f"tracks[{v}]")
+        t.check(f"tracks[{v}]", xyz=xyz)
     frames = {t.frame for t in tracks if t.frame is not None}
     if len(frames) > 1:
         raise ValueError(f"tracks: expected one world frame; found {sorted(frames)}. Bring the positions into one.")

@@ -140,6 +140,26 @@ def test_too_short_for_the_required_overlap_is_said():
     assert align(a, b, matches, ConstantShift(min_overlap=0.5)).frames == pytest.approx(0, abs=0.3)
 
 
+@pytest.mark.parametrize("aligner", ALIGNERS, ids=str)
+def test_things_at_rest_tell_no_time(aligner):
+    a, b, matches = films(7, 0.0)
+    still = [replace(t, xyz=np.repeat(t.xyz[:, :1], 120, axis=1)) for t in (a, b)]
+    found = align(*still, matches, aligner, throw=False)
+    assert found.status is Status.STATIC and np.isnan(found.offset)
+
+
+def test_a_clip_shorter_than_any_overlap_has_no_answer():
+    a, b, matches = films(7, 0.0, frames=20)
+    assert align(a, b, matches, DTW(), throw=False).status is Status.NO_OVERLAP
+
+
+def test_different_declared_worlds_are_refused():
+    a, b, matches = films(7, 0.0)
+    with pytest.raises(ValueError, match=r"b\.frame: expected 'here' as a declares; found 'there'"):
+        align(replace(a, frame="here"), replace(b, frame="there"), matches, DTW())
+    assert align(replace(a, frame="here"), b, matches, DTW()).status.ok
+
+
 def test_max_lag_bounds_the_search():
     a, b, matches = films(8, 1.0)
     found = align(a, b, matches, ConstantShift(max_lag=0.5))

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from otsync import Cosine, TrackSet, track_distance
-from otsync.costs import binary_scale, cosine_distance, fill_unseen, frame_cost, unit_features, velocity
+from otsync.costs import binary_scale, cosine_distance, fill_unseen, frame_cost, total_cost, unit_features, velocity
 
 
 def naive_track_distance(x, seen, y, seen_y):
@@ -113,3 +113,19 @@ def test_binary_scale_is_a_power_of_two():
         s = binary_scale(np.array([x, np.nan, -x / 3]))
         assert np.frexp(s)[0] == 0.5 and 0.5 <= x / s <= 1
     assert binary_scale(np.zeros(3)) == binary_scale(np.array([np.nan])) == 1
+
+
+def test_track_distance_refuses_what_it_cannot_compare():
+    x, seen = np.zeros((4, 6, 3)), np.ones((4, 6), bool)
+    with pytest.raises(ValueError, match="other: expected"):
+        track_distance(x, seen, np.zeros((4, 3, 3)), seen[:, :3])
+    with pytest.raises(ValueError, match="xyz: expected finite"):
+        track_distance(np.full((4, 6, 3), np.nan), seen)
+    assert track_distance(x, seen, np.ones((7, 6, 3))).shape == (4, 7)
+
+
+@pytest.mark.parametrize("weight", [-1.0, np.nan])
+def test_weights_are_checked(weight):
+    a = TrackSet(np.zeros((2, 2, 3)), features=np.eye(2), fps=30)
+    with pytest.raises(ValueError, match="expected weights >= 0"):
+        total_cost((Cosine(weight=weight),), a, a)

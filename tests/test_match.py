@@ -24,7 +24,8 @@ from otsync import (
     TrackSet,
     match,
 )
-from otsync.match import Problem, round_to_marginals, sinkhorn
+from otsync.match import Problem
+from otsync.sinkhorn import round_to_marginals, sinkhorn
 
 from .conftest import wiggle
 
@@ -156,6 +157,26 @@ def test_one_far_track_does_not_wipe_out_the_structure(pair):
     found = match(replace(a, xyz=far), b, PartialFGW(mass=0.9))
     assert (where[found.pairs[:, 0]] == found.pairs[:, 1]).mean() > 0.9
     assert abs(found.stats["mass"] - 0.9) < 1e-9
+
+
+def test_any_number_of_tracks_may_keep_all_its_mass():
+    rng = np.random.default_rng(0)
+    for n in (3, 10, 49):
+        t = TrackSet(rng.normal(size=(n, 5, 3)), features=rng.normal(size=(n, 8)), fps=30)
+        assert abs(PartialFGW(mass=1.0)(t, t).stats["mass"] - 1) < 1e-9
+
+
+def test_structure_of_one_side_alone_is_no_information():
+    rng = np.random.default_rng(0)
+    flat = TrackSet(np.ones((5, 4, 3)), features=np.ones((5, 3)), fps=30)
+    b = TrackSet(rng.normal(size=(5, 4, 3)), features=np.ones((5, 3)), fps=30)
+    assert match(flat, b, FusedGromovWasserstein(), throw=False).status is Status.NO_INFORMATION
+
+
+def test_a_solver_that_stopped_at_its_limit_says_so(pair):
+    a, b, _ = pair
+    assert FusedGromovWasserstein()(a, b).stats["converged"] == 1
+    assert FusedGromovWasserstein(max_iter=1)(a, b).stats["converged"] == 0
 
 
 @pytest.mark.parametrize("matcher", STRUCTURED, ids=name)

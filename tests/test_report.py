@@ -19,7 +19,7 @@ from .test_align import films
 def answer():
     a, b, matches = films(0, 0.4)
     c = films(0, -0.3)[1]
-    tracks = [replace(t, name=n) for t, n in ((a, "left"), (b, "<script>alert(1)</script>"), (c, "right & far"))]
+    tracks = [replace(t, name=n) for t, n in ((a, "left"), (b, "<script>alert(1)</script>"), (c, "right & far $x_{$"))]
     given = {(0, 1): matches, (0, 2): matches}
     return tracks, synchronize(tracks, matches=given, aligner=ConstantShift())
 

@@ -164,6 +164,8 @@ good = {"xyz": np.zeros((2, 3, 3)), "fps": 30.0}
         ({"fps": np.nan}, "TrackSet.fps"),
         ({"fps": None}, "TrackSet.fps: expected frames per second, or timestamps"),
         ({"timestamps": np.array([0.0, 0.1])}, "TrackSet.timestamps: expected 3 finite seconds"),
+        ({"timestamps": np.array([0.0, 33.3, 66.7])}, "expected seconds about 1/fps = 0.03333 apart; found a median step of 33"),
+        ({"timestamps": np.array([0.0, 0.033, 86400.0])}, "expected"),
         ({"timestamps": np.array([0.0, 0.1, 0.1])}, "frames 1 and 2 are at 0.1 and 0.1"),
     ],
 )  # fmt: skip

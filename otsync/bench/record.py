@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 import os
 import platform
 import subprocess
@@ -66,7 +67,11 @@ def gate(name: str, measured: Mapping[str, float], worse: Callable[[str, float, 
     """
     baseline = read_json(baseline_path(name))["figures"]
     missing = sorted(set(baseline) - set(measured))
-    failed = [key for key, value in measured.items() if key in baseline and worse(key, value, baseline[key])]
+    failed = [
+        key
+        for key, value in measured.items()
+        if key in baseline and not (math.isfinite(value) and not worse(key, value, baseline[key]))
+    ]
     for key in failed:
         print(f"gate {name}: {key}: {measured[key]:.4g}, baseline {baseline[key]:.4g}", file=sys.stderr)
     for key in missing:

@@ -31,6 +31,8 @@ def _svg(figure, label: str) -> str:
     """The figure as an <svg> element; the same input gives the same bytes."""
     import matplotlib
 
+    for text in figure.findobj(lambda artist: hasattr(artist, "set_parse_math")):
+        text.set_parse_math(False)  # names are data: a dollar sign in one is no formula
     buffer = io.StringIO()
     with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "otsync", "font.size": 8}):
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
@@ -39,16 +41,21 @@ def _svg(figure, label: str) -> str:
     return text[text.index("<svg") :].replace("<svg ", f'<svg role="img" aria-label="{label}" ', 1)
 
 
-def clock_bars(offsets: Offsets, durations: Sequence[float]) -> str:
-    """Every video as a bar on the common clock; a whisker of two sigma at its start."""
+def clock_bars(offsets: Offsets, clips: Sequence[tuple[float, float]]) -> str:
+    """Every video as a bar on the common clock; a whisker of two sigma at its start.
+
+    ``clips``: first second and duration of every video on its own clock.
+    """
     figure, ax = _axes(7.2, 0.9 + 0.24 * len(offsets))
     for v, name in enumerate(offsets.names):
-        start, sigma = offsets.seconds[v], offsets.sigma[v]
-        if not np.isfinite(start):
-            ax.text(0, v, f"{name}: no answer", va="center", fontsize=8, color=PATH)
+        first, duration = clips[v]
+        start, sigma = offsets.seconds[v] + offsets.rates[v] * first, offsets.sigma[v]
+        if not np.isfinite(start) or offsets.component[v] != offsets.reference:
+            why = "no answer" if not np.isfinite(start) else "on a clock of its own group"
+            ax.text(0, v, f"{name}: {why}", va="center", fontsize=8, color=PATH)
             continue
         color = CHOSEN if offsets.status[v].ok else GREY
-        ax.barh(v, offsets.rates[v] * durations[v], left=start, height=0.62, color=color, alpha=0.85)
+        ax.barh(v, offsets.rates[v] * duration, left=start, height=0.62, color=color, alpha=0.85)
         if np.isfinite(sigma) and sigma > 0:
             ax.errorbar(start, v, xerr=2 * sigma, color="black", capsize=2, lw=1)
     ax.set_yticks(range(len(offsets)), list(offsets.names))

@@ -32,6 +32,7 @@ def write_report(
     *,
     truth: Sequence[float] | None = None,
     title: str = "Synchronisation report",
+    extra: str = "",
 ) -> None:
     """Write the report page, atomically.
 
@@ -39,6 +40,7 @@ def write_report(
         offsets: from :func:`otsync.synchronize`.
         tracks: what they were made from; with it the page shows cost maps and DTW paths.
         truth: true offsets in seconds on the reference's clock, for simulated worlds.
+        extra: further sections as HTML, after the graph (a recording's pictures).
     """
     page = [
         f"<h1>{escape(title)}</h1>",
@@ -48,9 +50,10 @@ def write_report(
         "<p class=s>A positive offset means that the video started later than its reference. "
         "t<sub>world</sub> = rate · t<sub>video</sub> + offset.</p>",
         "<h2>On the common clock</h2>",
-        figures.clock_bars(offsets, _durations(offsets, tracks)),
+        figures.clock_bars(offsets, _clips(offsets, tracks)),
         _remedies(offsets),
         _graph(offsets),
+        extra,
         "<h2>Pairs</h2>",
         _pair_table(offsets, truth),
         *_pair_details(offsets, tracks, truth),
@@ -180,10 +183,11 @@ def _cost_map(
     return paper.cost, paper.path, origin
 
 
-def _durations(offsets: Offsets, tracks: Sequence[TrackSet] | None) -> list[float]:
+def _clips(offsets: Offsets, tracks: Sequence[TrackSet] | None) -> list[tuple[float, float]]:
+    """First second and duration of every video on its own clock; a second where the tracks are not at hand."""
     if tracks is None:
-        return [1.0] * len(offsets)
-    return [float(t.times[-1] - t.times[0] + 1 / (t.fps or 1)) for t in tracks]
+        return [(0.0, 1.0)] * len(offsets)
+    return [(float(t.times[0]), float(t.times[-1] - t.times[0] + 1 / (t.fps or 1))) for t in tracks]
 
 
 def _footer(offsets: Offsets) -> str:

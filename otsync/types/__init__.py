@@ -3,7 +3,7 @@
 from .camera import Camera, Video
 from .results import Alignment, Matches, Offsets, Stats
 from .status import Refused, Status, gravest, in_order
-from .tracks import TrackSet
+from .tracks import TrackSet, check_same_world
 
 __all__ = [
     "Alignment",
@@ -15,6 +15,7 @@ __all__ = [
     "Status",
     "TrackSet",
     "Video",
+    "check_same_world",
     "gravest",
     "in_order",
 ]

@@ -9,6 +9,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+FPS_FACTOR = 3.0
+"""Timestamps may disagree with the nominal rate by this factor; beyond it their unit is wrong."""
+
+LONGEST_GAPS = 1000.0
+"""A clip may span so many times its frames; beyond it one wrong timestamp would ask for gigabytes of empty clock."""
+
 _DISTORTION_LENGTHS = (4, 5, 8, 12, 14)
 
 
@@ -139,6 +145,18 @@ def clock(
             fps = float(1.0 / np.median(np.diff(timestamps)))
     if fps is not None and not (np.isfinite(fps) and fps > 0):
         raise ValueError(f"{owner}.fps: expected a positive number of frames per second; found {fps}.")
+    if fps is not None and timestamps is not None and n_frames > 1:
+        step = float(np.median(np.diff(timestamps)))
+        if not 1 / FPS_FACTOR <= fps * step <= FPS_FACTOR:
+            raise ValueError(
+                f"{owner}.timestamps: expected seconds about 1/fps = {1 / fps:.4g} apart; found a median step of "
+                f"{step:.4g}. Give seconds, not milliseconds or ticks, or leave fps out."
+            )
+        if timestamps[-1] - timestamps[0] > LONGEST_GAPS * n_frames * step:
+            raise ValueError(
+                f"{owner}.timestamps: expected a clip without pauses of hours; {n_frames} frames span "
+                f"{timestamps[-1] - timestamps[0]:.4g} s. Cut it where recording stopped, or mend the odd timestamp."
+            )
     return (None if fps is None else float(fps)), timestamps
 
 

@@ -39,8 +39,9 @@ class Status(StrEnum):
         "graph, or limit max_lag."
     )
     AMBIGUOUS = (
-        "Several offsets explain the motion about equally well (periodic motion?). Look at the hypotheses; add "
-        "videos to the graph, limit max_lag, or use a longer clip."
+        "Several answers explain the data about equally well (a periodic motion; a symmetric or mirrored scene). Look "
+        "at the hypotheses; add videos to the graph, limit max_lag, use a longer clip, or features and labels that "
+        "tell the parts apart."
     )
     DISAGREE = (
         "Slow motion, fast motion and positions point to different offsets. Check the matches; wrong ones or a "

@@ -30,7 +30,8 @@ class TrackSet:
         sigma: one standard deviation of position, world units, (N,T).
         labels: (N,) integer instance or class, or (N,L) soft memberships.
         camera: who filmed.
-        frame: name of the world frame of ``xyz``. Positions of two sets are compared only when both declare the same.
+        frame: name of the world frame of ``xyz``. Two sets that declare different ones are never aligned; position
+            costs of a matcher ask both to declare the same.
 
     Shapes and the clock are checked here; contents (nan in visible samples, zero features) by the verbs, which
     name their argument. Integer and half-precision positions become float64 and float32.
@@ -182,6 +183,14 @@ class TrackSet:
             )
         except (ValueError, TypeError, KeyError) as error:
             raise ValueError(f"{path}: not a sound track set; {error}") from None
+
+
+def check_same_world(a: TrackSet, b: TrackSet) -> None:
+    """ValueError when both declare a world frame and not the same one: their positions say nothing to each other."""
+    if a.frame is not None and b.frame is not None and a.frame != b.frame:
+        raise ValueError(
+            f"b.frame: expected {a.frame!r} as a declares; found {b.frame!r}. Bring the positions into one world frame."
+        )
 
 
 def _real(value: Any, shape: tuple[int | None, ...], name: str) -> np.ndarray:

@@ -1,0 +1,198 @@
+"""What matching accuracy costs in time: every matcher at every size that it can take, with POT's own solver beside it.
+
+Each cell runs in a process of its own, warmed up on a small world, so that peak memory is that cell's.
+"""
+
+from __future__ import annotations
+
+import json
+import resource
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..anchored import AnchoredFGW
+from ..costs import Cosine, total_cost
+from ..match import (
+    EntropicFGW,
+    FusedGromovWasserstein,
+    Matcher,
+    NearestNeighbor,
+    OptimalTransport,
+    PartialFGW,
+    from_plan,
+    normalised_structure,
+    uniform,
+)
+from ..metrics import match_quality
+from ..simulate import matching_world
+from ..types import Matches, TrackSet
+from . import record
+from .record import table, write_rows
+
+SIZES = (200, 500, 1000, 2000, 5000, 20_000, 50_000)
+REFERENCE = "POT fused_gromov_wasserstein"
+FIGURES = ("precision", "recall", "flips", "p50")
+
+
+@dataclass(frozen=True)
+class PotDefaults:
+    """POT called directly with its own defaults on prepared matrices; its time is that of the call alone."""
+
+    def __call__(self, a: TrackSet, b: TrackSet) -> Matches:
+        import ot
+
+        M, (Ca, Cb) = total_cost((Cosine(),), a, b), normalised_structure(a, b)
+        p, q = uniform(len(a)), uniform(len(b))
+        wall, cpu = time.perf_counter(), time.process_time()
+        plan, log = ot.gromov.fused_gromov_wasserstein(M, Ca, Cb, p, q, log=True)
+        stats = {"solver_seconds": time.perf_counter() - wall, "solver_cpu": time.process_time() - cpu}
+        linear = (Ca**2 @ p)[:, None] + (Cb**2 @ q)[None] - 2 * Ca @ plan @ Cb + 0.5 * M
+        return from_plan(plan, linear, p, q, 1.0, stats | {"objective": float(log["fgw_dist"])}, False)
+
+
+#: name -> matcher, and the largest size it is tried at
+MATCHERS: dict[str, tuple[Matcher, int]] = {
+    REFERENCE: (PotDefaults(), 5000),
+    "NearestNeighbor": (NearestNeighbor(), 5000),
+    "OptimalTransport": (OptimalTransport(), 5000),
+    "FusedGromovWasserstein": (FusedGromovWasserstein(), 5000),
+    "EntropicFGW": (EntropicFGW(), 2000),
+    "PartialFGW": (PartialFGW(), 2000),
+    "AnchoredFGW, small": (AnchoredFGW(anchors=100, cells=500, restarts=1), 50_000),
+    "AnchoredFGW": (AnchoredFGW(), 50_000),
+}
+
+
+def rivals() -> dict[str, tuple[Matcher, int]]:
+    """Other packages' FGW, where they are installed."""
+    from . import rivals
+
+    return rivals.installed()
+
+
+def run(
+    out: Path,
+    *,
+    sizes: tuple[int, ...] = SIZES,
+    seeds: int = 2,
+    first_seed: int = 9000,
+    limit: float = 60.0,
+    only: tuple[str, ...] = (),
+    gate: bool = False,
+    rebase: bool = False,
+) -> int:
+    """Measure every matcher at every size; print the table, write CSV, JSON and the plot.
+
+    Args:
+        seeds: worlds a cell; fixed, and nothing is tuned on them.
+        limit: CPU seconds a world; a matcher is not tried at sizes where it is expected to take longer.
+        only: names of matchers; default: all.
+        gate: compare with the committed baseline, 1 when something got worse. rebase: make this the baseline.
+    """
+    rows: list[dict[str, Any]] = []
+    for name, (_, largest) in (MATCHERS | rivals()).items():
+        if only and name not in only:
+            continue
+        for n in (s for s in sizes if s <= largest):
+            last = rows[-1] if rows and rows[-1]["matcher"] == name else None
+            if last and last.get("cpu_seconds", limit) * (n / last["n"]) ** GROWTH.get(name, 1.0) > limit:
+                break
+            row = cell(name, n, range(first_seed, first_seed + seeds), limit)
+            rows.append(row)
+            print(table([row], COLUMNS).splitlines()[-1], flush=True)
+            if row["status"] != "ok":
+                break
+    for row in rows:
+        base = next((r for r in rows if (r["matcher"], r["n"]) == (REFERENCE, row["n"]) and r["status"] == "ok"), None)
+        row["speedup"] = base["cpu_seconds"] / row["cpu_seconds"] if base and row["status"] == "ok" else None
+    mark_front(rows)
+    print("\n" + table(rows, COLUMNS))
+    write_rows(out, "match", rows, {"seeds": seeds, "first_seed": first_seed, "limit": limit})
+    from .match_plot import plot
+
+    plot(rows, out / "match_frontier.svg")
+    figures = figures_of(rows)
+    if rebase:
+        record.save_baseline("match", figures)
+    return record.gate("match", figures, worse) if gate else 0
+
+
+#: seconds grow with this power of the number of tracks; 1 where not named
+GROWTH = {name: 2.0 for name in MATCHERS if not name.startswith("Anchored")}
+
+COLUMNS = ("matcher", "n", "status", *FIGURES, "objective", "seconds", "cpu_seconds", "speedup", "peak_gb", "front")
+
+
+def figures_of(rows: list[dict[str, Any]]) -> dict[str, float]:
+    """What the gate compares: accuracy, and times as ratios to POT's own solver at 2000 tracks in the same run.
+
+    Ratios of sizes below 1000 are left out: what takes milliseconds varies too much.
+    """
+    done = [r for r in rows if r["status"] == "ok"]
+    figures = {f"{r['matcher']} {r['n']} p50": r["p50"] for r in done}
+    pot = next((r["cpu_seconds"] for r in done if (r["matcher"], r["n"]) == (REFERENCE, 2000)), None)
+    if pot is not None:
+        large = (r for r in done if r["n"] >= 1000 and r["matcher"] != REFERENCE)
+        figures |= {f"{r['matcher']} {r['n']} against POT at 2000": pot / r["cpu_seconds"] for r in large}
+    return figures
+
+
+def worse(key: str, measured: float, baseline: float) -> bool:
+    """Accuracy may vary by .04 between platforms' roundings, the ratio to POT in the same run by two fifths."""
+    return measured < baseline - 0.04 if key.endswith("p50") else measured < 0.6 * baseline
+
+
+def cell(name: str, n: int, seeds: range, limit: float) -> dict[str, Any]:
+    """One matcher at one size, in a process of its own: mean accuracy, median times, peak memory."""
+    code = f"from otsync.bench.match import measure; measure({name!r}, {n}, {list(seeds)})"
+    row: dict[str, Any] = {"matcher": name, "n": n}
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, timeout=60 + 4 * limit * len(seeds)
+        )
+    except subprocess.TimeoutExpired:
+        return row | {"status": "over the time limit"}
+    if done.returncode:
+        return row | {"status": done.stderr.strip().splitlines()[-1][:100] if done.stderr else "killed"}
+    row |= json.loads(done.stdout.splitlines()[-1])
+    return row | {"status": "ok" if row["cpu_seconds"] <= limit else "over the time limit"}
+
+
+def measure(name: str, n: int, seeds: list[int]) -> None:
+    """What :func:`cell` runs; prints one line of JSON."""
+    matcher = (MATCHERS | rivals())[name][0]
+    matcher(*matching_world(60, seed=1)[:2])
+    if isinstance(matcher, AnchoredFGW):
+        matcher(*matching_world(3 * matcher.cells // 2 + 300, seed=1, frames=20)[:2])
+    runs = []
+    for seed in seeds:
+        a, b, truth = matching_world(n, seed=seed)
+        wall, cpu = time.perf_counter(), time.process_time()
+        found = matcher(a, b)
+        spent = {"seconds": time.perf_counter() - wall, "cpu_seconds": time.process_time() - cpu}
+        if "solver_cpu" in found.stats:
+            spent = {"seconds": found.stats["solver_seconds"], "cpu_seconds": found.stats["solver_cpu"]}
+        objective = found.stats.get("objective", float("nan"))
+        runs.append(match_quality(found, truth) | spent | {"objective": objective})
+    row = {key: float(np.mean([r[key] for r in runs])) for key in (*FIGURES, "objective")}
+    row |= {key: float(np.median([r[key] for r in runs])) for key in ("seconds", "cpu_seconds")}
+    row["peak_gb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    print(json.dumps(row))
+
+
+def mark_front(rows: list[dict[str, Any]]) -> None:
+    """``front``: no matcher at the same size is both faster and at least as accurate."""
+    for row in rows:
+        same = [r for r in rows if r["n"] == row["n"] and r["status"] == "ok" and r is not row]
+        beaten = (
+            any(r["cpu_seconds"] <= row["cpu_seconds"] and r["p50"] >= row["p50"] for r in same)
+            if row["status"] == "ok"
+            else True
+        )
+        row["front"] = "" if beaten else "*"

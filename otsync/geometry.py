@@ -1,0 +1,84 @@
+"""Two-view geometry of calibrated cameras: fundamental matrices, epipolar residuals, undistorted pixels."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from .types import Camera, TrackSet
+
+
+def fundamental(a: Camera, b: Camera, frame_a: int = 0, frame_b: int = 0) -> Float[np.ndarray, "3 3"]:
+    """F with ``[x_b 1] F [x_a 1]ᵀ = 0`` for pixels of one world point, up to scale.
+
+    ``frame_a``, ``frame_b`` choose the pose of a camera that moves. (Hartley and Zisserman, Sec. 9.2.)
+    """
+    Ra, ta = _pose(a, frame_a)
+    Rb, tb = _pose(b, frame_b)
+    R = Rb @ Ra.T
+    t = tb - R @ ta
+    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
+    F = np.linalg.inv(b.K).T @ cross @ R @ np.linalg.inv(a.K)
+    return F / max(float(np.linalg.norm(F)), 1e-300)
+
+
+def fundamentals(a: Camera, b: Camera) -> Float[np.ndarray, "Fa Fb 3 3"]:
+    """One F per pair of poses: axes of length 1 for static cameras."""
+    poses_a = 1 if a.w2c.ndim == 2 else len(a.w2c)
+    poses_b = 1 if b.w2c.ndim == 2 else len(b.w2c)
+    return np.array([[fundamental(a, b, i, j) for j in range(poses_b)] for i in range(poses_a)])
+
+
+def sampson(
+    F: Float[np.ndarray, "3 3"], xa: Float[np.ndarray, "N 2"], xb: Float[np.ndarray, "N 2"]
+) -> Float[np.ndarray, " N"]:
+    """Signed first-order distance in pixels of (x_a, x_b) to the epipolar constraint (Hartley and Zisserman, 11.4.3)."""
+    ha, hb = (np.concatenate([x, np.ones((len(x), 1))], 1) for x in (xa, xb))
+    la, lb = ha @ F.T, hb @ F
+    norm = np.sqrt(la[:, 0] ** 2 + la[:, 1] ** 2 + lb[:, 0] ** 2 + lb[:, 1] ** 2)
+    return (hb * la).sum(1) / np.maximum(norm, 1e-300)
+
+
+def undistort(camera: Camera, uv: Float[np.ndarray, "*N 2"]) -> Float[np.ndarray, "*N 2"]:
+    """Pixels of the ideal pinhole with the same K; nan stays nan."""
+    if camera.distortion is None or not np.any(camera.distortion):
+        return uv
+    import cv2
+
+    flat = uv.reshape(-1, 2)
+    ok = np.isfinite(flat[:, 0])
+    out = np.full_like(flat, np.nan)
+    if ok.any():
+        points = flat[ok].astype(np.float64).reshape(-1, 1, 2)
+        out[ok] = cv2.undistortPoints(points, camera.K, camera.distortion, P=camera.K).reshape(-1, 2)
+    return out.reshape(uv.shape)
+
+
+def seen_pixels(tracks: TrackSet) -> Float[np.ndarray, "N T 2"]:
+    """``uv`` in float64 with nan where not visible. ValueError when the set holds none."""
+    if tracks.uv is None:
+        raise ValueError("uv: expected pixels; this track set holds positions only.")
+    return np.where(tracks.seen[..., None], tracks.uv, np.nan).astype(float)
+
+
+def view_angle(a: Camera, b: Camera, target: Float[np.ndarray, " 3"]) -> float:
+    """Degrees between the directions from ``target`` to both cameras (first poses)."""
+    va, vb = (np.atleast_2d(c.center)[0] - target for c in (a, b))
+    cosine = va @ vb / max(float(np.linalg.norm(va) * np.linalg.norm(vb)), 1e-300)
+    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+
+
+def common_target(cameras: list[Camera]) -> Float[np.ndarray, " 3"]:
+    """The point nearest to all optical axes in the least-squares sense (first poses)."""
+    A, b = 1e-9 * np.eye(3), np.zeros(3)
+    for camera in cameras:
+        R, _ = _pose(camera, 0)
+        across = np.eye(3) - np.outer(R[2], R[2])
+        A += across
+        b += across @ np.atleast_2d(camera.center)[0]
+    return np.linalg.solve(A, b)
+
+
+def _pose(camera: Camera, frame: int) -> tuple[np.ndarray, np.ndarray]:
+    w2c = camera.w2c if camera.w2c.ndim == 2 else camera.w2c[frame]
+    return w2c[:3, :3], w2c[:3, 3]

@@ -1,0 +1,75 @@
+"""Single images, masks and depth maps from files that a stranger may have written."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from ..files import existing, read_npz
+
+MAX_PIXELS = 64 * 2**20
+"""Largest image that is decoded (64 megapixels, 8K x 8K)."""
+
+FORMATS = ("JPEG", "PNG", "BMP")
+"""Decoders that are offered a stranger's bytes; Pillow knows thirty more."""
+
+
+def read_image(path: str | os.PathLike[str]) -> UInt8[np.ndarray, "H W 3"]:
+    """An RGB image. ValueError names the file when it is truncated, damaged, too large or no image at all."""
+    return np.asarray(_decode(path).convert("RGB"))
+
+
+def read_mask(path: str | os.PathLike[str]) -> Bool[np.ndarray, "H W"]:
+    """Foreground where an image is brighter than half of its own maximum (files hold 0/1 as well as 0/255)."""
+    values = np.asarray(_decode(path).convert("L"))
+    return values > values.max(initial=0) / 2
+
+
+def read_depth(path: str | os.PathLike[str], scale: float) -> Float[np.ndarray, "H W"]:
+    """Depth along z in world units, 0 where unknown: 16-bit PNG times ``scale``, ``.npy``, or ``.npz`` with one array."""
+    suffix = os.path.splitext(path)[1].lower()
+    if suffix == ".npy":
+        values = read_npy(path)
+    elif suffix == ".npz":
+        arrays = read_npz(path, max_bytes=8 * MAX_PIXELS)
+        if len(arrays) != 1 and "depth" not in arrays:
+            raise ValueError(f"{path}: expected one array, or one named 'depth'; found {', '.join(arrays)}.")
+        values = arrays["depth"] if "depth" in arrays else next(iter(arrays.values()))
+    else:
+        values = np.asarray(_decode(path))
+    if values.ndim != 2 or values.dtype.kind not in "iuf":
+        raise ValueError(f"{path}: expected a depth map (H,W) of numbers; found {values.dtype} of {values.shape}.")
+    depth = values.astype(np.float32) * np.float32(scale)
+    return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
+
+
+def read_npy(path: str | os.PathLike[str], *, memmap: bool = False) -> np.ndarray:
+    """A plain ``.npy`` array without pickle, its declared size checked against the file's."""
+    path = existing(path)
+    try:
+        return np.load(path, mmap_mode="r" if memmap or path.stat().st_size > 2**20 else None, allow_pickle=False)
+    except (ValueError, OSError, EOFError, SyntaxError, TypeError, KeyError, OverflowError) as error:
+        raise ValueError(f"{path}: expected a plain .npy array; {error}. Write it again.") from None
+
+
+def _decode(path: str | os.PathLike[str]) -> Any:
+    """The decoded image. Pillow checks the whole stream, where OpenCV fills a truncated JPEG with grey in silence."""
+    from PIL import Image
+
+    path = existing(path)
+    try:
+        with Image.open(path, formats=FORMATS) as image:
+            if image.width * image.height > MAX_PIXELS:
+                raise ValueError(f"{image.width} x {image.height} pixels, more than the {MAX_PIXELS} allowed")
+            image.load()
+            return image.copy()
+    except MemoryError:
+        raise
+    except Exception as error:  # decoders raise OSError, SyntaxError, struct.error, ... on damaged bytes
+        raise ValueError(
+            f"{path}: expected a readable image ({', '.join(FORMATS)}); {type(error).__name__}: {error}. "
+            "Copy the file again, or leave this frame out."
+        ) from None

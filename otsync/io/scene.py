@@ -1,0 +1,269 @@
+"""``scene.json``: which videos, which clocks, which cameras; and the :class:`Scene` it describes.
+
+A document::
+
+    {"format": "otsync.scene", "version": 1, "frame": "world",
+     "videos": [{"name": "left", "file": "left.mp4",
+                 "camera": {"K": [[f,0,cx],[0,f,cy],[0,0,1]], "w2c": [[...4x4...]], "width": 1920, "height": 1080}},
+                {"name": "right", "frames": "right/*.png", "fps": 30, "range": [10, 160],
+                 "camera": {...}, "masks": "seg/right/*.png",
+                 "depth": {"frames": "depth/right/*.png", "scale": 0.001}}]}
+
+Paths are relative to the file's folder and may not leave it. ``w2c`` is world-to-camera, OpenCV axes, 4x4 or one per
+frame. ``range`` [first, stop) keeps some frames; a video file's clock comes from its container unless fps or
+timestamps are given.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..files import read_json, write_json
+from ..types import Camera, Video
+from .frames import ArrayFrames, FrameRange, ImageFrames, LazyFrames, VideoFrames
+from .images import read_depth, read_image, read_mask
+
+FORMAT, VERSION = "otsync.scene", 1
+MAX_VIDEOS, MAX_FILES = 1000, 200_000
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """The videos of one recording.
+
+    Args:
+        videos: each with its camera and clock; frames decode lazily.
+        masks: per video a sequence of (H,W) bool foreground masks, or None.
+        frame: name of the world frame that the cameras share.
+        root: the folder that paths are relative to.
+        notes: what the reader assumed or could not find.
+    """
+
+    videos: tuple[Video, ...]
+    masks: tuple[Sequence[np.ndarray] | None, ...]
+    frame: str = "world"
+    root: Path = Path()
+    notes: tuple[str, ...] = field(default_factory=tuple)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(v.name for v in self.videos)
+
+    def take(self, names: Sequence[str]) -> Scene:
+        """The named videos, in that order. ValueError lists what there is."""
+        missing = [n for n in names if n not in self.names]
+        if missing:
+            raise ValueError(
+                f"cameras: expected some of {', '.join(self.names)}; found {', '.join(missing)}. Check the names."
+            )
+        index = [self.names.index(n) for n in names]
+        return replace(self, videos=tuple(self.videos[i] for i in index), masks=tuple(self.masks[i] for i in index))
+
+
+def open_scene(path: str | os.PathLike[str], *, allow_outside: bool = False) -> Scene:
+    """Read ``scene.json``, a folder that holds one, or a folder in Panoptic layout.
+
+    Args:
+        allow_outside: let the file name paths outside its own folder. Off, because a file from a stranger could
+            otherwise have any file of yours read.
+    """
+    document, root = read_document(path)
+    return scene_from_document(document, root, allow_outside=allow_outside)
+
+
+def read_document(path: str | os.PathLike[str]) -> tuple[dict[str, Any], Path]:
+    """The scene document behind ``path``, and the folder its paths are relative to."""
+    path = Path(path)
+    if path.is_dir():
+        from .panoptic import describe_panoptic, is_panoptic
+
+        if not (path / "scene.json").is_file():
+            if is_panoptic(path):
+                return describe_panoptic(path), path
+            raise ValueError(f"{path}: expected a scene.json in this folder; found none. Run: otsync init {path}")
+        path = path / "scene.json"
+    document = read_json(path)
+    if not isinstance(document, dict) or document.get("format") != FORMAT:
+        raise ValueError(f"{path}: expected a scene (format {FORMAT!r}); found something else. Run: otsync init FOLDER")
+    if document.get("version") != VERSION:
+        raise ValueError(f"{path}: expected version {VERSION}; found {document.get('version')!r}. Write it anew.")
+    return document, path.parent
+
+
+def write_document(path: str | os.PathLike[str], videos: Sequence[dict[str, Any]], frame: str = "world") -> None:
+    """Write a scene document, atomically."""
+    write_json(path, {"format": FORMAT, "version": VERSION, "frame": frame, "videos": list(videos)})
+
+
+def scene_from_document(document: dict[str, Any], root: Path, *, allow_outside: bool = False) -> Scene:
+    """Build the scene; ValueError names the video and the field for anything unsound."""
+    entries = document.get("videos")
+    if not isinstance(entries, list) or not 1 <= len(entries) <= MAX_VIDEOS:
+        raise ValueError(f"scene.videos: expected a list of 1 to {MAX_VIDEOS} videos; found {_short(entries)}.")
+    if document.get("missing"):
+        raise ValueError(
+            f"scene.json: still missing: {_short(document['missing'])}. Fill it in, then delete 'missing'."
+        )
+    builder = Paths(root, allow_outside)
+    built = [_video(entry, n, builder) for n, entry in enumerate(entries)]
+    names = [video.name for video, _ in built]
+    twice = sorted({n for n in names if names.count(n) > 1})
+    if twice:
+        raise ValueError(f"scene.videos: expected unique names; {', '.join(twice)} occur more than once.")
+    return Scene(
+        tuple(v for v, _ in built),
+        tuple(m for _, m in built),
+        str(document.get("frame", "world")),
+        Path(root),
+        tuple(str(n) for n in document.get("notes", ())),
+    )
+
+
+def _video(entry: Any, n: int, paths: Paths) -> tuple[Video, Sequence[np.ndarray] | None]:
+    if not isinstance(entry, dict):
+        raise ValueError(f"scene.videos[{n}]: expected an object; found {_short(entry)}.")
+    name = str(entry.get("name", f"video{n}"))
+    where = f"scene.videos[{n}] ({name[:80]})"
+    try:
+        frames, timestamps, fps = video_frames(entry, paths)
+        keep = _range(entry, len(frames))
+        camera = camera_from(entry.get("camera"))
+        if camera.w2c.ndim == 3 and len(camera.w2c) == len(frames):
+            camera = replace(camera, w2c=camera.w2c[keep.start : keep.stop])
+        if timestamps is not None and len(timestamps) == len(frames):
+            timestamps = timestamps[keep.start : keep.stop]
+
+        def cut(sequence: LazyFrames | None, what: str) -> LazyFrames | None:
+            if sequence is None:
+                return None
+            if len(sequence) != len(frames):
+                raise ValueError(f"{what}: expected {len(frames)} files, one a frame; found {len(sequence)}.")
+            return sequence if len(keep) == len(sequence) else FrameRange(sequence, keep)
+
+        depth = cut(_depth(entry.get("depth"), paths), "depth")
+        masks = cut(_masks(entry.get("masks"), paths), "masks")
+        video = Video(cut(frames, "frames") or frames, camera, fps, timestamps, name, depth)
+        return video, masks
+    except FileNotFoundError as error:
+        raise FileNotFoundError(f"{where}: {error}") from None
+    except (ValueError, TypeError, KeyError, OverflowError) as error:
+        raise ValueError(f"{where}: {error}") from None
+
+
+def video_frames(entry: dict[str, Any], paths: Paths) -> tuple[LazyFrames, np.ndarray | None, float | None]:
+    """Frames, timestamps and fps of one entry, before ``range``."""
+    stamps, fps = entry.get("timestamps"), entry.get("fps")
+    timestamps = None if stamps is None else np.asarray(stamps, float)
+    fps = None if fps is None else float(fps)
+    if ("file" in entry) == ("frames" in entry):
+        raise ValueError("expected either 'file' (a video) or 'frames' (a pattern of images); found both or neither.")
+    if "file" in entry:
+        video = VideoFrames(paths.one(entry["file"]))
+        if timestamps is None and fps is None:
+            timestamps = video.timestamps
+        return video, timestamps, fps
+    return ImageFrames(paths.many(entry["frames"]), read_image), timestamps, fps
+
+
+def camera_from(value: Any) -> Camera:
+    """A camera of the document. ValueError says which field is missing."""
+    if not isinstance(value, dict):
+        raise ValueError("camera: expected K, w2c, width and height; found none. Add the calibration.")
+    missing = [f for f in ("K", "w2c", "width", "height") if value.get(f) is None]
+    if missing:
+        raise ValueError(f"camera: expected K, w2c, width and height; {', '.join(missing)} missing. Add them.")
+    return Camera(
+        np.asarray(value["K"], float),
+        np.asarray(value["w2c"], float),
+        int(value["width"]),
+        int(value["height"]),
+        None if value.get("distortion") is None else np.asarray(value["distortion"], float),
+        None if value.get("readout") is None else float(value["readout"]),
+    )
+
+
+def _depth(value: Any, paths: Paths) -> LazyFrames | None:
+    if value is None:
+        return None
+    if not isinstance(value, dict) or ("file" in value) == ("frames" in value):
+        raise ValueError("depth: expected {'frames': pattern, 'scale': units per step} or {'file': 'x.npy'}.")
+    scale = float(value.get("scale", 1.0))
+    if not (np.isfinite(scale) and scale > 0):
+        raise ValueError(f"depth.scale: expected world units per stored step, above 0; found {scale}.")
+    if "file" in value:
+        return ArrayFrames(paths.one(value["file"]), scale)
+    return ImageFrames(paths.many(value["frames"]), lambda path: read_depth(path, scale), f"depth*{scale:g}")
+
+
+def _masks(value: Any, paths: Paths) -> LazyFrames | None:
+    return None if value is None else ImageFrames(paths.many(value), read_mask, "mask")
+
+
+def _range(entry: dict[str, Any], n: int) -> range:
+    value = entry.get("range")
+    if value is None:
+        return range(n)
+    if not (isinstance(value, list) and len(value) == 2 and all(isinstance(x, int) for x in value)):
+        raise ValueError(f"range: expected [first, stop]; found {_short(value)}.")
+    if not 0 <= value[0] < value[1] <= n:
+        raise ValueError(f"range: expected 0 <= first < stop <= {n}, the number of frames; found {value}.")
+    return range(value[0], value[1])
+
+
+@dataclass(frozen=True)
+class Paths:
+    """Turns the document's paths into files below ``root``; links are followed before the check."""
+
+    root: Path
+    allow_outside: bool = False
+    resolve: Callable[[Path], Path] = Path.resolve
+
+    def one(self, text: Any) -> Path:
+        """A single file."""
+        if not isinstance(text, str) or not text or "\0" in text:
+            raise ValueError(f"path: expected a file name; found {_short(text)}.")
+        path = Path(self.root) / text
+        if not self.allow_outside:
+            home = self.resolve(Path(self.root))
+            if not self.resolve(path).is_relative_to(home):
+                raise ValueError(
+                    f"path {text!r}: expected a file inside {self.root}; it points outside. Move the file there, or "
+                    "allow it (allow_outside=True, --allow-outside)."
+                )
+        return path
+
+    def many(self, pattern: Any) -> list[Path]:
+        """Files of a list, or of a pattern with ``*``, in natural order (9 before 10)."""
+        if isinstance(pattern, list):
+            if not 0 < len(pattern) <= MAX_FILES:
+                raise ValueError(f"frames: expected 1 to {MAX_FILES} files; found {len(pattern)}.")
+            return [self.one(p) for p in pattern]
+        if not isinstance(pattern, str) or "*" not in pattern or ".." in Path(pattern).parts or "**" in pattern:
+            raise ValueError(f"frames: expected a pattern like 'left/*.jpg', or a list; found {_short(pattern)}.")
+        base, _, name = pattern.rpartition("/")
+        if "*" in base:
+            raise ValueError(f"frames: expected '*' in the file name only; found {_short(pattern)}.")
+        folder = self.one(base or ".")
+        found = sorted(folder.glob(name), key=natural)[: MAX_FILES + 1] if folder.is_dir() else []
+        if not 0 < len(found) <= MAX_FILES:
+            raise FileNotFoundError(f"no files (or more than {MAX_FILES}) match {pattern!r} in {self.root}.")
+        if self.allow_outside:
+            return found
+        return [self.one(f"{base}/{p.name}" if base else p.name) for p in found]
+
+
+def natural(path: Path) -> list[Any]:
+    """Sort key by which frame_9 comes before frame_10."""
+    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name[:255])]
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 80 else text[:77] + "..."

@@ -1,0 +1,104 @@
+"""What moves: foreground masks of a video at working resolution."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Bool
+
+from ..types import Camera
+from .flow import DISFlow
+from .working import WorkingFrames
+
+
+class Masker(Protocol):
+    """The ``masks`` slot: frames in, (T,h,w) foreground out."""
+
+    def __call__(self, frames: WorkingFrames, camera: Camera) -> Bool[np.ndarray, "T h w"]: ...
+
+
+@dataclass(frozen=True)
+class MedianBackground:
+    """Static camera: what differs from the temporal median. IoU .72-.79 with given masks on basketball.
+
+    Args:
+        threshold: grey levels (of 255) in any channel. min_area: pixels of a component at 640 of width.
+        samples: frames that the median is taken of; bounds the memory (50 frames of 640 x 360 are 35 MB).
+    """
+
+    threshold: int = 12
+    min_area: int = 300
+    samples: int = 50
+
+    def __call__(self, frames: WorkingFrames, camera: Camera) -> Bool[np.ndarray, "T h w"]:
+        import cv2
+
+        picks = np.unique(np.linspace(0, len(frames) - 1, min(self.samples, len(frames))).round().astype(int))
+        background = np.median(np.stack([frames[int(k)] for k in picks]), 0).astype(np.uint8)
+        out = np.zeros((len(frames), frames.size[1], frames.size[0]), bool)
+        for k in range(len(frames)):
+            changed = cv2.absdiff(frames[k], background).max(2) > self.threshold
+            out[k] = tidy(changed, frames.unit, self.min_area)
+        return out
+
+
+@dataclass(frozen=True)
+class GivenMasks:
+    """Masks that came with the recording, brought to working resolution."""
+
+    masks: Sequence[np.ndarray]
+
+    def __call__(self, frames: WorkingFrames, camera: Camera) -> Bool[np.ndarray, "T h w"]:
+        return np.stack([frames.mask(np.asarray(m)) for m in self.masks])
+
+
+@dataclass(frozen=True)
+class FlowResidual:
+    """Moving camera with known poses: pixels whose flow leaves the epipolar line that a static point would follow.
+
+    A static point seen at x moves along the line F x of the next frame. The Sampson distance of x and x + flow to
+    that geometry is 0 for it at any depth; a point that moves along its own epipolar line is missed.
+
+    Args:
+        threshold: pixels of distance at 640 of width, over ``step`` frames (a longer step sees slower motion).
+    """
+
+    threshold: float = 1.0
+    min_area: int = 300
+    step: int = 1
+    flow: DISFlow = field(default_factory=DISFlow)
+
+    def __call__(self, frames: WorkingFrames, camera: Camera) -> Bool[np.ndarray, "T h w"]:
+        from ..geometry import fundamental, sampson
+
+        T, (w, h) = len(frames), frames.size
+        grid = np.stack(np.meshgrid(np.arange(w), np.arange(h)), -1).reshape(-1, 2).astype(float)
+        out = np.zeros((T, h, w), bool)
+        for k in range(T):
+            other = k + self.step if k + self.step < T else k - self.step
+            if not 0 <= other < T:
+                continue
+            forward, _ = self.flow.pair(frames.gray(k), frames.gray(other))
+            F = fundamental(camera, camera, k, other)
+            here, there = frames.to_full(grid), frames.to_full(grid + forward.reshape(-1, 2))
+            residual = np.abs(sampson(F, here, there)) * frames.scale
+            out[k] = tidy((residual > self.threshold * frames.unit).reshape(h, w), frames.unit, self.min_area)
+        return out
+
+
+def tidy(changed: Bool[np.ndarray, "h w"], unit: float, min_area: int) -> Bool[np.ndarray, "h w"]:
+    """Specks removed (3 px opening), holes closed (9 px), components below ``min_area`` dropped."""
+    import cv2
+
+    def square(pixels: int) -> np.ndarray:
+        return np.ones((max(1, round(pixels * unit)),) * 2, np.uint8)
+
+    mask = cv2.morphologyEx(changed.astype(np.uint8), cv2.MORPH_OPEN, square(3))
+    mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, square(9))
+    _, component, stats, _ = cv2.connectedComponentsWithStats(mask)
+    keep = stats[:, cv2.CC_STAT_AREA] > min_area * unit**2
+    keep[0] = False
+    return keep[component]

@@ -1,0 +1,309 @@
+"""From a scene of recordings to offsets: which route, in which stages, each kept on disk so that a run continues.
+
+Routes::
+
+    tracks    depth is given          tracks -> lift -> match, scan, refine -> graph
+    epipolar  cameras only            tracks -> epipolar scan -> graph
+    stereo    a static rig            the epipolar route, then hull and stereo at its offsets, then the tracks route
+
+Measured on basketball, 8 cameras of 120 frames of 640 x 360, two cores: the epipolar route 45 s cold, 3 s warm, 0.42 GB
+at most; the stereo route 25 s more, 0.79 GB. Longer clips take about 30 kB a frame and video for masks, and as much as
+the 4000 longest tracks of a video take (32 kB a frame) while it is tracked.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from .align import Aligner
+from .costs import Cosine
+from .epipolar import EpipolarScan
+from .epipolar_fit import EpipolarRefine
+from .geometry import seen_pixels
+from .graph import Graph
+from .io.scene import Scene
+from .keep import KeptPairs
+from .lift import Lift, depth_at
+from .match import Matcher
+from .partners import Candidates
+from .position_costs import CurveDistance
+from .priors.cache import Cache, digest_of
+from .priors.stereo import HullStereo, Rig
+from .refine import Refiner, SplineRefine
+from .scan import LikelihoodScan
+from .sync import MapLike, synchronize
+from .tracks import Selection, Tracking, pixel_tracks
+from .types import Offsets, Status, TrackSet, Video
+
+Route = Literal["auto", "tracks", "epipolar", "stereo"]
+
+Tell = Callable[[str], None]
+
+COLOUR = 3.0
+"""Weight of the colour histograms beside the curve distance: what separates limbs that run close together."""
+
+
+@dataclass(frozen=True)
+class Stages:
+    """The objects in the slots of every stage."""
+
+    tracking: Tracking = field(default_factory=Tracking)
+    selection: Selection = field(default_factory=Selection)
+    stereo: HullStereo = field(default_factory=HullStereo)
+    lift: Lift = field(default_factory=Lift)
+    graph: Graph = field(default_factory=Graph)
+    epipolar_matcher: Matcher = field(default_factory=lambda: Candidates(20, None))
+    epipolar_aligner: Aligner = field(default_factory=EpipolarScan)
+    epipolar_refiner: Refiner = field(default_factory=EpipolarRefine)
+    matcher: Matcher = field(
+        default_factory=lambda: Candidates(2, 200, (Cosine(weight=COLOUR, center=False), CurveDistance()))
+    )
+    aligner: Aligner = field(default_factory=LikelihoodScan)
+    refiner: Refiner = field(default_factory=SplineRefine)
+
+
+@dataclass(frozen=True, eq=False)
+class Synchronized:
+    """What a run came to.
+
+    Args:
+        offsets: the answer. tracks: what it was made from.
+        route, why: which way was taken, and the reasons in words.
+        first: offsets of the epipolar route where the stereo route went on from them.
+        seconds: wall time per stage.
+    """
+
+    offsets: Offsets
+    tracks: tuple[TrackSet, ...]
+    route: str
+    why: tuple[str, ...]
+    first: Offsets | None = None
+    seconds: dict[str, float] = field(default_factory=dict)
+
+
+def synchronize_scene(
+    scene: Scene,
+    *,
+    route: Route = "auto",
+    reference: int = 0,
+    stages: Stages | None = None,
+    cache: Cache | None = None,
+    map: MapLike = map,
+    tell: Tell = lambda text: None,
+) -> Synchronized:
+    """Put the videos of a scene on one clock.
+
+    Args:
+        route: "auto" decides by what is there; naming one overrides it. ValueError says what a named route lacks.
+        cache: where stages are kept; a run that was killed continues from what is there, with the same result.
+        map: any map-like callable; two threads use two cores.
+        tell: receives one line per stage.
+    """
+    stages, cache = stages or Stages(), cache or Cache()
+    chosen, why = choose_route(scene, route, stages)
+    for line in why:
+        tell(line)
+    clock = Stopwatch(tell)
+    raw = track_all(scene, stages, cache, map, tell)
+    clock.lap("tracks")
+    if chosen == "tracks":
+        lifted = lift_given(scene, raw, stages, cache, map)
+        clock.lap("lift")
+        offsets = pairs_in_space(lifted, reference, stages, cache, map)
+        clock.lap("synchronise")
+        return Synchronized(without_times(offsets), tuple(lifted), chosen, why, None, clock.seconds)
+    flat = [select(video, r, stages, scene.frame) for video, r in zip(scene.videos, raw, strict=True)]
+    first = without_times(pairs_in_pixels(flat, reference, stages, cache, map))
+    clock.lap("epipolar")
+    if chosen == "epipolar":
+        return Synchronized(first, tuple(flat), chosen, why, None, clock.seconds)
+    doubt = _too_doubtful(first, stages)
+    if doubt:
+        why = (*why, doubt)
+        tell(doubt)
+        return Synchronized(first, tuple(flat), "epipolar", why, None, clock.seconds)
+    depth = stereo_depth(scene, flat, first, stages, cache, map)
+    lifted = [stages.lift(t, z) for t, z in zip(flat, depth, strict=True)]
+    clock.lap("stereo")
+    bare = [t.name for t in lifted if len(t) == 0]
+    if bare:
+        line = f"stereo found no depth for {', '.join(bare)}: the epipolar answer stands"
+        tell(line)
+        return Synchronized(first, tuple(flat), "epipolar", (*why, line), None, clock.seconds)
+    offsets = without_times(pairs_in_space(lifted, reference, stages, cache, map))
+    clock.lap("synchronise")
+    if _flagged(offsets) > _flagged(first):
+        line = "the lifted tracks leave more doubt than the pixels did: the epipolar answer stands"
+        tell(line)
+        return Synchronized(first, tuple(flat), "epipolar", (*why, line), None, clock.seconds)
+    return Synchronized(offsets, tuple(lifted), chosen, why, first, clock.seconds)
+
+
+def choose_route(scene: Scene, route: Route, stages: Stages) -> tuple[str, tuple[str, ...]]:
+    """The route and the reasons for it, in words. ValueError when the named one is not possible."""
+    if len(scene.videos) < 2:
+        raise ValueError(f"scene: expected at least two videos; found {len(scene.videos)}.")
+    if route not in ("auto", "tracks", "epipolar", "stereo"):
+        raise ValueError(f"route: expected auto, tracks, epipolar or stereo; found {route!r}.")
+    flat = [v.name for v in scene.videos if v.depth is None]
+    moving = [v.name for v in scene.videos if v.camera.w2c.ndim == 3]
+    few = len(scene.videos) < stages.stereo.min_views
+    lacks = {
+        "tracks": f"depth is missing for {', '.join(flat)}" if flat else "",
+        "stereo": f"cameras move: {', '.join(moving)}" if moving
+        else f"{len(scene.videos)} videos are fewer than the {stages.stereo.min_views} that a visual hull needs" if few
+        else "",
+        "epipolar": "",
+    }  # fmt: skip
+    if route != "auto":
+        if lacks[route]:
+            raise ValueError(f"route {route}: {lacks[route]}. Add what is missing, or choose another route.")
+        return route, (f"route {route}: as asked",)
+    for name, reason in (
+        ("tracks", "every video has depth"),
+        ("stereo", f"no depth, {len(scene.videos)} static cameras: epipolar scan, then visual hull and stereo"),
+        ("epipolar", "no depth: offsets from pixels and calibration alone"),
+    ):
+        if not lacks[name]:
+            others = tuple(f"not {n}: {text}" for n, text in lacks.items() if text)
+            return name, (f"route {name}: {reason}", *others)
+    raise AssertionError("the epipolar route needs nothing")
+
+
+def track_all(
+    scene: Scene, stages: Stages, cache: Cache, map: MapLike, tell: Tell = lambda text: None
+) -> list[dict[str, np.ndarray]]:
+    """Masks, point tracks and descriptors of every video. ValueError names the first frame that does not read."""
+    started, done = time.perf_counter(), []
+
+    def one(item: tuple[Video, Any]) -> dict[str, np.ndarray]:
+        video, masks = item
+        found = stages.tracking(video, masks, cache)
+        done.append(video.name)
+        spent = time.perf_counter() - started
+        tell(f"tracks {len(done)}/{len(scene.videos)}: {video.name}, {len(found['uv'])} tracks, {spent:.1f} s")
+        return found
+
+    return list(map(one, list(zip(scene.videos, scene.masks, strict=True))))
+
+
+def select(video: Video, raw: dict[str, np.ndarray], stages: Stages, frame: str) -> TrackSet:
+    """The tracks of one video that are worth keeping, in undistorted pixels."""
+    keep = stages.selection(raw["uv"], video.camera.width, video.fps or 30.0)
+    if len(keep) == 0:
+        raise ValueError(
+            f"video {video.name}: expected moving foreground to track; found no track that lives and moves enough. "
+            "Check the masks, choose a part of the clip with motion, or leave this video out."
+        )
+    return pixel_tracks(
+        raw["uv"][keep], raw["features"][keep], video.camera, fps=video.fps, timestamps=video.timestamps,
+        name=video.name, frame=frame,
+    )  # fmt: skip
+
+
+def pairs_in_pixels(
+    tracks: Sequence[TrackSet], reference: int, stages: Stages, cache: Cache, map: MapLike = map
+) -> Offsets:
+    """The depth-free answer: epipolar scan of every pair, then the graph."""
+    return synchronize(
+        tracks, reference=reference, matcher=stages.epipolar_matcher, aligner=stages.epipolar_aligner,
+        refiner=stages.epipolar_refiner, graph=stages.graph, rematch=0, map=KeptPairs(cache, map),
+    )  # fmt: skip
+
+
+def pairs_in_space(
+    tracks: Sequence[TrackSet], reference: int, stages: Stages, cache: Cache, map: MapLike = map
+) -> Offsets:
+    """The answer from lifted tracks: curve distance, likelihood scan, spline fit, matched again, then the graph."""
+    return synchronize(
+        tracks, reference=reference, matcher=stages.matcher, aligner=stages.aligner, refiner=stages.refiner,
+        graph=stages.graph, map=KeptPairs(cache, map),
+    )  # fmt: skip
+
+
+def lift_given(
+    scene: Scene, raw: Sequence[dict[str, np.ndarray]], stages: Stages, cache: Cache, map: MapLike = map
+) -> list[TrackSet]:
+    """Tracks lifted by the depth maps that came with the recording, then chosen by their life in space."""
+
+    def one(item: tuple[Video, dict[str, np.ndarray]]) -> TrackSet:
+        video, found = item
+        rich = replace(stages.selection, count=3 * stages.selection.count, apart=0.5 * stages.selection.apart)
+        keep = rich(found["uv"], video.camera.width, video.fps or 30.0)
+        uv = found["uv"][keep]
+        flat = select(video, found, replace(stages, selection=rich), scene.frame)
+        key = (stages.tracking.key(video, None), _digest(video.depth), digest_of(uv))
+        depth = cache.arrays("depth", key, lambda: {"z": depth_at(video.depth or [], flat, uv)})["z"]
+        lifted = stages.lift(flat, depth)
+        chosen = lifted.take(stages.selection(seen_pixels(lifted), video.camera.width, video.fps or 30.0))
+        if len(chosen) == 0:
+            raise ValueError(
+                f"video {video.name}: expected depth where things move; no track could be lifted. Check the depth "
+                "maps' scale and holes (otsync check), or use --route epipolar."
+            )
+        return chosen
+
+    return list(map(one, list(zip(scene.videos, raw, strict=True))))
+
+
+def stereo_depth(
+    scene: Scene, tracks: Sequence[TrackSet], offsets: Offsets, stages: Stages, cache: Cache, map: MapLike = map
+) -> list[np.ndarray]:
+    """Depth of every track sample by hull and stereo over the videos whose clocks ``offsets`` knows."""
+    content = [stages.tracking.key(v, m) for v, m in zip(scene.videos, scene.masks, strict=True)]
+    given = list(zip(scene.videos, scene.masks, strict=True))
+    masks = list(map(lambda item: stages.tracking.masks(item[0], item[1], cache), given))
+    # rounding keeps the cache's key the same over the last bits of a solution
+    rig = Rig.at(scene.videos, masks, np.round(offsets.seconds, 6), stages.tracking.width)
+    uv = [seen_pixels(t) for t in tracks]
+    poses = [(v.camera.K.tobytes(), v.camera.w2c.tobytes()) for v in scene.videos]
+    return stages.stereo(rig, uv, cache, (*content, digest_of(*poses)), map)
+
+
+def without_times(offsets: Offsets) -> Offsets:
+    """The same without wall times among the statistics: a run that was killed and continued writes the same file."""
+
+    def clean(stats: dict[str, float]) -> dict[str, float]:
+        return {k: v for k, v in stats.items() if not k.endswith("seconds")}
+
+    alignments = {pair: replace(a, stats=clean(a.stats)) for pair, a in offsets.alignments.items()}
+    return replace(offsets, alignments=alignments, stats=clean(offsets.stats))
+
+
+def _flagged(offsets: Offsets) -> int:
+    return sum(not s.ok for s in offsets.status)
+
+
+def _too_doubtful(first: Offsets, stages: Stages) -> str:
+    """Why depth cannot be built at these offsets; empty when it can."""
+    apart = [n for n, s, c in zip(first.names, first.seconds, first.component, strict=True)
+             if not np.isfinite(s) or c != first.reference]  # fmt: skip
+    if apart:
+        return f"no stereo: {', '.join(apart)} could not be put on the common clock"
+    doubtful = [n for n, s in zip(first.names, first.status, strict=True) if s is not Status.OK]
+    if len(doubtful) > len(first) / 2:
+        return f"no stereo: the epipolar offsets of {', '.join(doubtful)} are doubtful"
+    return ""
+
+
+def _digest(frames: Any) -> str:
+    digest = getattr(frames, "digest", None)
+    return digest() if digest is not None else digest_of(*[np.asarray(f) for f in frames])
+
+
+class Stopwatch:
+    """Wall seconds per stage."""
+
+    def __init__(self, tell: Tell):
+        self.tell, self.seconds, self._last = tell, {}, time.perf_counter()  # type: Tell, dict[str, float], float
+
+    def lap(self, stage: str) -> None:
+        now = time.perf_counter()
+        self.seconds[stage] = now - self._last
+        self._last = now
+        self.tell(f"{stage}: {self.seconds[stage]:.1f} s")
