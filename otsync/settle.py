@@ -31,6 +31,9 @@ ASTRAY = 1.0 * FRAME
 CONFIRMED = 1.5 * FRAME
 """Doubtful pairs this close to the solution by themselves confirm it."""
 
+STANDING_MARGIN = 0.1
+"""Lead of the summed curves' peak, as a share of it, that keeps a flagged estimate; sums are steadier than one curve."""
+
 CAPTURED = 3.0 * FRAME
 """The new fit counts when it ends this close to where it began."""
 
@@ -115,12 +118,12 @@ def _links(n: int, answers: list[Answer], x: np.ndarray, rates: np.ndarray, anch
     """The pairs that link videos: those that vouch for themselves, and flagged ones between videos that stand out.
 
     A flagged pair must agree with the solution. A video stands out when the sum of all its pairs' curves peaks at its place as an undoubted pair's curve would. That
-    keeps an estimate for videos that no pair vouches for, on the clock of the anchor's group. Groups held together by
-    pairs that vouch are never joined by flagged ones: the curves of strangers with the views of one scene add up too.
+    keeps an estimate for videos that no pair vouches for, on the clock of the anchor's group. Groups of three and more held
+    together by pairs that vouch are never joined by flagged ones: the curves of strangers with the views of one scene add up too.
     """
     edges = [as_edge(a, rates) for a in answers]
     curves = CurveSum(n, edges, FRAME)
-    stands = np.array([undoubted(curves, v, x, trust) for v in range(n)])
+    stands = np.array([undoubted(curves, v, x, trust, STANDING_MARGIN) for v in range(n)])
     sound = np.array([e.trusted for e in edges], bool)
     group = components(n, [a.pair for a, ok in zip(answers, sound, strict=True) if ok])
     size = np.bincount(group, minlength=n)[group]
@@ -137,12 +140,12 @@ def is_sound(answer: Answer) -> bool:
     return not NOTHING_COMMON & set(answer.refined.flags)
 
 
-def undoubted(curves: CurveSum, v: int, x: np.ndarray, trust: Trust) -> bool:
+def undoubted(curves: CurveSum, v: int, x: np.ndarray, trust: Trust, margin: float) -> bool:
     """Whether the summed curves of v's pairs peak at x[v], high enough and without a rival."""
     if not curves.around[v]:
         return True  # aligners without curves: nothing to doubt by
     here, rival = curves.standing(v, x)
-    return here >= trust.evidence and (here - rival) >= trust.margin * here
+    return here >= trust.evidence and (here - rival) >= margin * here
 
 
 def as_edge(answer: Answer, rates: np.ndarray) -> Edge:
@@ -324,7 +327,7 @@ def _trusted(
             ]  # fmt: skip
             joined = any(edges[k].trusted for k in near)
             if not joined and graph.curves and len(near) >= max(2, degree[v] / 2):
-                joined = undoubted(CurveSum(n, [edges[k] for k in near], FRAME), int(v), x, trust)
+                joined = undoubted(CurveSum(n, [edges[k] for k in near], FRAME), int(v), x, trust, trust.margin)
             if joined:
                 trusted[v] = growing = True
     return trusted
