@@ -72,9 +72,8 @@ def render(
     image, depths, alphas = engine.rasterize(splats, features, width, height, options.depth)
     inputs = (means, quats, scales, opacities, colors, viewmats)
     if torch.is_grad_enabled() and not image.requires_grad and any(t.requires_grad for t in inputs):
-        image = image + 0 * sum(
-            t.nan_to_num().sum() for t in inputs
-        )  # nothing is in view: gradients are zeros, not absent
+        # nothing is in view: gradients are zeros, not absent
+        image = image + 0 * sum(t.nan_to_num().sum() for t in inputs)
     if backgrounds is not None:
         image = image + (1 - alphas) * backgrounds[:, None, None, :]
     return Rendering(image, alphas, depths, splats.means2d, splats.radii, name)

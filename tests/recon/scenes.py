@@ -169,7 +169,8 @@ def run(scene: Scene, backend: str, dtype: torch.dtype = torch.float32):
         out = replace(scene, settings={"depth": "accumulated", **scene.settings}).render(backend, **leaves)
         outputs = (out.colors, out.alphas, out.depths)
     loss = weighted(outputs)
-    loss.backward()
+    if backend != "oracle" or loss.requires_grad:  # every back end has gradients, also of an image of nothing
+        loss.backward()
     gradients = {k: t.grad if t.grad is not None else torch.zeros_like(t) for k, t in leaves.items()}
     return tuple(t.detach() for t in outputs), gradients
 
