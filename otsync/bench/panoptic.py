@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from ..align import DTW
+from ..anchored import AnchoredFGW
 from ..costs import Cosine
 from ..files import atomic_write
 from ..geometry import common_target, seen_pixels, view_angle
@@ -235,6 +236,8 @@ def matching_table(material: Material, protocol: Protocol, map: MapLike) -> list
         "EMD on features + curve, best 100": best(OptimalTransport(costs=both), 100),
         "FGW with curve (alpha 5), best 100": best(FusedGromovWasserstein(alpha=5.0, costs=both), 100),
         "partial FGW (mass .65) with curve (alpha 5), best 100": best(PartialFGW(alpha=5.0, costs=both), 100),
+        "anchored FGW, best 100": best(AnchoredFGW(), 100),
+        "anchored FGW with curve, best 100": best(AnchoredFGW(costs=both), 100),
         "two partners, features + curve, best 200": best(Candidates(2, 200, both), None),
         "the same again at synchronised times": best(Candidates(2, 200, both).at(0.0), None),
     }
