@@ -241,6 +241,8 @@ class Bench:
     """Make the figures of this run the baseline that --gate compares with."""
     promises: bool = False
     """For sync and match: measure what is promised, on fresh seeds, instead of the tables."""
+    first_seed: int | None = None
+    """Where the seeds of --promises begin; default: the suite's own."""
     json: bool = False
     """For panoptic: one line of JSON on standard output instead of tables."""
     cache: Path | None = None
@@ -263,7 +265,10 @@ class Bench:
 
             if self.suite not in ("match", "sync"):
                 raise ValueError(f"--promises: expected suite match or sync; found {self.suite}.")
-            return match_limits.run(self.out) if self.suite == "match" else sync_bench.run(self.out, promises=True)
+            seeds = {} if self.first_seed is None else {"first_seed": self.first_seed}
+            if self.suite == "match":
+                return match_limits.run(self.out, **seeds)
+            return sync_bench.run(self.out, promises=True, **seeds)
         suites = SUITES.values() if self.suite == "all" else [SUITES[self.suite]]
         try:
             modules = [importlib.import_module(name) for name in suites]
