@@ -265,10 +265,9 @@ class Bench:
 
             if self.suite not in ("match", "sync"):
                 raise ValueError(f"--promises: expected suite match or sync; found {self.suite}.")
-            seeds = {} if self.first_seed is None else {"first_seed": self.first_seed}
             if self.suite == "match":
-                return match_limits.run(self.out, **seeds)
-            return sync_bench.run(self.out, promises=True, **seeds)
+                return match_limits.run(self.out, first_seed=self.first_seed or 9500)
+            return sync_bench.run(self.out, promises=True, first_seed=self.first_seed or sync_bench.FRESH)
         suites = SUITES.values() if self.suite == "all" else [SUITES[self.suite]]
         try:
             modules = [importlib.import_module(name) for name in suites]

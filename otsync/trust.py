@@ -13,7 +13,7 @@ class Trust:
     """Limits beyond which an alignment is flagged.
 
     Calibrated on simulated pairs of the moving classes, mid to brutal, and on the odd cases (static, unrelated, without
-    overlap), seeds 1000-1999; ``python -m otsync.bench.sync --acceptance`` tests them from seed 5000 on.
+    overlap), seeds 1000-1999; ``otsync bench sync --promises`` tests them from seed 5000 on.
 
     Args:
         evidence: WEAK below this rise of the score's peak over its median, in nats a match.

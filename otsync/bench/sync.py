@@ -1,6 +1,6 @@
 """Synchronisation: aligners x refiners x graphs, by preset and band, accuracy against time; and what is promised.
 
-``python -m otsync.bench.sync --acceptance`` measures every promise on fresh seeds and fails when one is missed.
+``otsync bench sync --promises`` measures every promise on fresh seeds and fails when one is missed.
 """
 
 from __future__ import annotations
