@@ -48,7 +48,7 @@ class CurveDistance:
         xa, xb = positions_in_common_frame(a, b)
         distance = curve_distances(_thinned(xa, self.samples), _thinned(xb, self.samples), i, j, self.share)
         unit = self.scale * scene_scale(xa, xb)
-        return np.where(np.isfinite(distance), np.minimum(distance / unit, self.cap), self.cap)
+        return capped(distance, unit, self.cap)
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class MedianPosition:
         xa, xb = positions_in_common_frame(a, b)
         distance = np.linalg.norm(_medians(xa)[i] - _medians(xb)[j], axis=1)
         unit = self.scale * scene_scale(xa, xb)
-        return np.where(np.isfinite(distance), np.minimum(distance / unit, self.cap), self.cap)
+        return capped(distance, unit, self.cap)
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,12 @@ class SynchronousDistance:
         least = max(2, round(self.min_overlap / step))
         distance = synchronous_distances(xa, xb, i, j, at, least)
         unit = self.scale * scene_scale(xa, xb)
-        return np.where(np.isfinite(distance), np.minimum(distance / unit, self.cap), self.cap)
+        return capped(distance, unit, self.cap)
+
+
+def capped(distance: np.ndarray, unit: float, cap: float) -> np.ndarray:
+    """Distances in units, at most ``cap``; unknown ones cost as much as any wrong pair."""
+    return np.where(np.isfinite(distance), np.minimum(distance / unit, cap), cap)
 
 
 def all_pairs(cost: Cost, a: TrackSet, b: TrackSet) -> Float[np.ndarray, "Na Nb"]:
