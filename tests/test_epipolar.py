@@ -14,7 +14,7 @@ from otsync.epipolar import EpipolarScan, mixture, separate_peaks
 from otsync.epipolar_fit import EpipolarRefine, detrended
 from otsync.geometry import common_target, fundamental, fundamentals, sampson, undistort, view_angle
 from otsync.partners import Candidates
-from otsync.position_costs import CurveDistance, MedianPosition, SynchronousDistance, scene_scale
+from otsync.position_costs import CurveDistance, MedianPosition, SynchronousDistance, capped, scene_scale
 from otsync.types import Camera
 
 from .recording_world import paths, ring
@@ -255,6 +255,10 @@ def test_costs_of_pairs_are_entries_of_the_matrix(cost):
     a, b = lifted(paths(t, 7, 3)), lifted(paths(t + 0.1, 5, 3))
     i, j = np.array([0, 6, 3, 3]), np.array([4, 0, 2, 1])
     np.testing.assert_array_equal(cost.pairs(a, b, i, j), cost.matrix(a, b)[i, j])
+
+
+def test_unknown_distances_cost_as_much_as_any_wrong_pair():
+    np.testing.assert_array_equal(capped(np.array([1.0, np.nan, 100.0]), 2.0, 3.0), [0.5, 3.0, 3.0])
 
 
 def test_candidates_hold_both_sides_best_and_the_cheapest_first():
