@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -140,8 +140,8 @@ def synthetic(
     footage = []
     for c, (film, shot) in enumerate(zip(films, shots, strict=True)):
         name = f"cam{c}" if c < cameras else f"held{c - cameras}"
-        video = Video(shot.images, film.camera, fps=FPS, name=name)
-        footage.append(footage_of(video, shot.masks, width=size[0]))
+        video = Video(list(shot.images), film.camera, fps=FPS, name=name)
+        footage.append(footage_of(video, list(shot.masks), width=size[0]))
     tracks, depth = [], []
     for c in range(cameras):
         tracks.append(_tracks(world, lenses[c], shots[c].depth, times + shift[c], f"cam{c}", seed, c))
@@ -163,20 +163,11 @@ class Instant:
 See = Callable[[float], Instant]
 
 
-class Effect(Protocol):
-    """What a camera does: ``see`` tells what is there at a world time, and so does what is returned."""
-
-    def __call__(self, see: See, camera: Camera) -> See: ...
-
-
 @dataclass(frozen=True)
 class Exposure:
     """Every camera has a gain of its own per channel, log-normal with this standard deviation."""
 
     size: float = 0.08
-
-    def __call__(self, see: See, camera: Camera) -> See:
-        return see  # gains act on the whole image, backdrop included: see Film.shoot
 
     def draw(self, rng: np.random.Generator) -> Float[np.ndarray, " 3"]:
         """Factors of R, G and B."""
@@ -188,9 +179,6 @@ class MoreNoise:
     """White noise beyond the usual, standard deviation in 0..1."""
 
     size: float = 0.03
-
-    def __call__(self, see: See, camera: Camera) -> See:
-        return see  # noise is the sensor's: see Film.shoot
 
 
 @dataclass(frozen=True)
@@ -229,6 +217,9 @@ class Rolling:
             return Instant(torch.cat([p.rgb for p in parts]), torch.cat([p.alpha for p in parts]))
 
         return rolled
+
+
+Effect = Exposure | MoreNoise | Blur | Rolling
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,9 +280,7 @@ class Film:
         if not optics:
             return lambda t: now
 
-        def see(t: float) -> Instant:
-            return self._render(self.world.moving(t), 0.01)[0]
-
+        see: See = lambda t: self._render(self.world.moving(t), 0.01)[0]  # noqa: E731
         for effect in optics:
             see = effect(see, self.camera)
         return see
