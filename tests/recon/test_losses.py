@@ -303,3 +303,13 @@ def test_images_of_other_shapes_are_refused(shapes):
     x, y, usable = (None if s is None else torch.zeros(s) for s in shapes)
     with pytest.raises(ValueError, match="x, y, usable"):
         photometric(x, y, usable, 0.2, SMALL)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_on_cuda_the_twin_says_the_same():
+    x, y = images((50, 70, 3))
+    usable = torch.rand(50, 70)
+    here, there = (t.clone().requires_grad_() for t in (x, x.cuda()))
+    losses.Photometric()(seen(rendered=here, image=y, usable=usable)).backward()
+    losses.Photometric()(seen(rendered=there, image=y.cuda(), usable=usable.cuda())).backward()
+    torch.testing.assert_close(there.grad.cpu(), here.grad, rtol=0, atol=1e-4 * float(here.grad.abs().max()))
