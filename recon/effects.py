@@ -33,12 +33,14 @@ class Shot:
         t: world seconds, a float64 scalar; renderings are differentiable in it.
         box: (x0, y0, x1, y1) of the wanted crop, pixels of the working image; x1 and y1 are exclusive.
         height: rows of the whole working image, which a rolling shutter reads from the first to the last.
+        frame: index of the frame, whose pose a moving camera has.
     """
 
     video: int
     t: Tensor
     box: tuple[int, int, int, int]
     height: int
+    frame: int = 0
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,16 +27,22 @@ from tqdm import tqdm
 from otsync.types import Offsets
 from recon.checkpoint import Checkpoint, Snapshot, key_of
 from recon.density import Densify
-from recon.effects import Effect, Shot, compose
+from recon.effects import Effect, Shot, compose, initial_parameters, prior
 from recon.footage import Footage
 from recon.gaussians4d import Gaussians4D, scene_arrays, scene_from_arrays
-from recon.losses import LOSSES, Draw, ImageLoss, Loss, MotionLoss, Seen
+from recon.losses import ImageLoss, Mask, Photometric, ScaleHinge, Seen
 from recon.optimize import RATES, Adam, Decay, check_rates
 from recon.quiet import one_thread_each, uninterrupted
+from recon.regularizers import ARAP, Acceleration, Draw, Length, MotionLoss, Velocity
 from recon.stage import Clip, compose_over, observer
 from recon.uncertainty import newton_sigma
 
 logger = logging.getLogger("recon")
+
+Loss = ImageLoss | MotionLoss
+
+LOSSES: tuple[Loss, ...] = (Photometric(), Mask(), ScaleHinge(7e-4), ARAP(), Length(), Velocity(), Acceleration())
+"""What the study of the paper's scene used; depth, tracks and features enter only at initialisation unless added."""
 
 RECORDS = 200  # rows of history in a fit
 CALIBRATION = (20, 60)  # steps between which the speed is taken when a budget in seconds is given
@@ -214,7 +220,7 @@ class Problem:
             )
         if len(scene) == 0:
             raise ValueError("scene: expected moving Gaussians, got none: nothing was seeded where things move")
-        unknown = [type(x).__name__ for x in losses if not isinstance(x, ImageLoss | MotionLoss)]
+        unknown = [type(x).__name__ for x in losses if not hasattr(x, "needs") and not hasattr(x, "every")]
         if unknown:
             raise ValueError(f"losses: expected ImageLoss or MotionLoss objects, got {', '.join(unknown)}")
         keys = [(v, k) for v, f in enumerate(footage) for k in range(len(f.images))
@@ -225,8 +231,7 @@ class Problem:
         return cls(
             scene, tuple(Clip.of(f, device) for f in footage),
             tuple(torch.as_tensor(f.times, dtype=torch.float64) for f in footage), offsets, index,
-            tuple(x for x in losses if isinstance(x, ImageLoss)), tuple(x for x in losses if isinstance(x, MotionLoss)),
-            effects, np.array(keys), batch, seed,
+            tuple(x for x in losses if hasattr(x, "needs")), tuple(x for x in losses if hasattr(x, "every")), effects, np.array(keys), batch, seed,
         )  # fmt: skip
 
     @property
@@ -265,8 +270,7 @@ class Problem:
     def groups(self) -> dict[str, Tensor]:
         """Every parameter group at its start, frozen or not."""
         out = scene_groups(self.scene)
-        for effect in self.effects:
-            out |= effect.parameters(len(self.clips))
+        out |= initial_parameters(self.effects, len(self.clips))
         out["offsets"] = torch.as_tensor(self.start.copy())
         out["clock_rates"] = torch.as_tensor(self.offsets.rates[self.index].copy())
         return out
@@ -300,7 +304,11 @@ class Run:
         self.groups = problem.groups()
         self.rows = np.zeros((0, 4 + len(problem.clips)))
         if snapshot is not None:
-            self.scene, self.step, self.total = scene_from_arrays(snapshot.scene), snapshot.step, snapshot.steps or total
+            self.scene, self.step, self.total = (
+                scene_from_arrays(snapshot.scene),
+                snapshot.step,
+                snapshot.steps or total,
+            )
             self.groups |= {n: v.to(self.groups[n].device) for n, v in snapshot.groups.items()}
             self.rows = snapshot.history
         self.adam = self._adam({} if snapshot is None else snapshot.moments)
@@ -351,7 +359,7 @@ class Run:
         p, clip = self.problem, self.problem.clips[video]
         box = clip.box(frame)
         observe = observer(assemble(self.scene, values), p.clips, values["offsets"])
-        shot = Shot(video, frame, self.world_time(values, video, frame) + later, box, clip.size[1])
+        shot = Shot(video, self.world_time(values, video, frame) + later, box, clip.size[1], frame)
         with torch.no_grad():
             return compose_over(compose(observe, p.effects, values)(shot), clip.behind(box))
 
@@ -371,16 +379,17 @@ class Run:
         clip = p.clips[v]
         box = clip.box(k)
         observe = observer(scene, p.clips, values["offsets"], depth=p.needs_depth, probes=probes if probe else None)
-        shot = Shot(v, k, self.world_time(values, v, k), box, clip.size[1])
+        shot = Shot(v, self.world_time(values, v, k), box, clip.size[1], k)
         rendered = compose(observe, p.effects, values)(shot)
         image = clip.image(k, box)
         seen = Seen(
             rendered=compose_over(rendered, clip.behind(box)), alpha=rendered.alpha, depth=rendered.depth, image=image,
-            mask=clip.mask(k, box), video=v, frame=k, t=shot.t, box=box, scene=scene, view=clip.view(k, box),
+            mask=clip.mask(k, box), video=v, frame=k, t=shot.t, box=box, view=(clip.K, clip.pose(k)),
+            scales=scene.dynamic.scales, footprint=scene.footprint,
         )  # fmt: skip
         parts = [loss.weight * value for loss in p.losses if (value := loss(seen)) is not None]
-        parts += [value for effect in p.effects if (value := effect.prior(values)) is not None]
-        loss = sum(parts, torch.zeros(()))
+        held = prior(p.effects, values)
+        loss = sum(parts if held is None else [*parts, held], torch.zeros(()))
         psnr = -10 * math.log10(float((seen.rendered.detach() - image).square().mean()) + 1e-12)
         wanted = [values[n] for n in names] + [means for means, _ in probes]
         gradients = torch.autograd.grad(loss, wanted, allow_unused=True) if loss.requires_grad else [None] * len(wanted)
@@ -403,7 +412,9 @@ class Run:
         ]  # fmt: skip
         total = sum(parts, torch.zeros(()))
         wanted = [values[n] for n in names]
-        gradients = torch.autograd.grad(total, wanted, allow_unused=True) if total.requires_grad else [None] * len(names)
+        gradients = (
+            torch.autograd.grad(total, wanted, allow_unused=True) if total.requires_grad else [None] * len(names)
+        )
         return Result(float(total.detach()), math.nan, list(gradients), None)
 
     def _guard(self, total: Mapping[str, Tensor], done: Sequence[Result], keys: list[tuple[int, int]]) -> None:
@@ -452,7 +463,12 @@ class Run:
     def snapshot(self) -> Snapshot:
         values = {n: v.detach().clone() for n, v in self.values().items()}
         return Snapshot(
-            self.step, self.total or 0, scene_arrays(assemble(self.scene, values)), values, self.adam.moments(), self.rows
+            self.step,
+            self.total or 0,
+            scene_arrays(assemble(self.scene, values)),
+            values,
+            self.adam.moments(),
+            self.rows,
         )
 
     def finish(self, seconds: float) -> Reconstruction:
@@ -476,7 +492,7 @@ class Run:
             "psnr": float(history.psnr[-1]) if len(history.psnr) else math.nan,
             "drift_frames": drift / scene.frame_step,
         }  # fmt: skip
-        learned = {n: values[n] for effect in p.effects for n in effect.parameters(len(p.clips))}
+        learned = {n: values[n] for n in initial_parameters(p.effects, len(p.clips))}
         return Reconstruction(scene, offsets, learned, history, stats)
 
 

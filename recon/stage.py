@@ -77,13 +77,16 @@ class Clip:
         x0, y0, x1, y1 = box
         return self.background[y0:y1, x0:x1]
 
+    def pose(self, frame: int) -> Tensor:
+        """w2c [4,4] of a frame."""
+        return self.w2c[frame if len(self.w2c) > 1 else 0]
+
     def view(self, frame: int, box: Box) -> tuple[Tensor, Tensor]:
         """(w2c [1,4,4], K [1,3,3]) of a frame, for an image that begins at the box's corner."""
-        w2c = self.w2c[frame : frame + 1] if len(self.w2c) > 1 else self.w2c
         K = self.K.clone()
         K[0, 2] -= box[0]
         K[1, 2] -= box[1]
-        return w2c, K[None]
+        return self.pose(frame)[None], K[None]
 
 
 def observer(
