@@ -247,13 +247,12 @@ class RollingShutter:
 
 def _mean(parts: Sequence[Rendered]) -> Rendered:
     """The mean of renderings; depths weighted by alpha, as their expectation asks for."""
-    n = len(parts)
-    rgb, alpha = sum(p.rgb for p in parts) / n, sum(p.alpha for p in parts) / n
-    depths = [p.depth for p in parts]
-    if any(d is None for d in depths):
+    rgb = torch.stack([p.rgb for p in parts]).mean(0)
+    alpha = torch.stack([p.alpha for p in parts]).mean(0)
+    depths = [p.depth * p.alpha for p in parts if p.depth is not None]
+    if len(depths) < len(parts):
         return Rendered(rgb, alpha)
-    weighted = sum(p.depth * p.alpha for p in parts) / n
-    return Rendered(rgb, alpha, weighted / alpha.clamp_min(1e-10))
+    return Rendered(rgb, alpha, torch.stack(depths).mean(0) / alpha.clamp_min(1e-10))
 
 
 def _stack(parts: Sequence[Rendered]) -> Rendered:

@@ -10,25 +10,28 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
+import numpy as np
 import torch
+from jaxtyping import Float
+from scipy.spatial import cKDTree
 from torch import Tensor
 
-from recon.ssim import SMALL, Window, ssim_map
+from otsync.types import TrackSet
+from recon.ssim import SMALL, Window, photometric
 
 
 @dataclass(frozen=True, eq=False)
 class Sightings:
     """Tracked points of one video in one frame, tied to Gaussians.
 
-    A point stands at ``sum_k weights[k] * means[nearest[k]] + shift``: it goes where its nearest Gaussians go.
+    A point stands at ``mean_k means[nearest[k]] + shift``: it goes where its nearest Gaussians go.
 
     Args:
-        nearest: [m,K] indices of Gaussians. weights: [m,K], rows sum to 1. shift: [m,3] world units.
+        nearest: [m,K] indices of Gaussians. shift: [m,3] world units.
         uv: [m,2] where the point was seen, pixels of the whole working image.
     """
 
     nearest: Tensor
-    weights: Tensor
     shift: Tensor
     uv: Tensor
 
@@ -103,17 +106,6 @@ class Photometric:
         return photometric(seen.rendered, seen.image, seen.usable, self.ssim, self.window)
 
 
-def photometric(x: Tensor, y: Tensor, usable: Tensor | None, ssim: float, window: Window) -> Tensor | None:
-    """See :class:`Photometric`."""
-    weight = torch.ones_like(x[..., :1]) if usable is None else usable.to(x)[..., None]
-    total = weight.sum() * x.shape[-1]
-    difference = x - y
-    loss = (weight * difference.abs()).sum() / total
-    if ssim:
-        loss = loss + ssim * (weight * (1 - ssim_map(y + weight * difference, y, window))).sum() / total
-    return loss
-
-
 @dataclass(frozen=True)
 class Mask:
     """Mean absolute difference of alpha and the soft foreground mask."""
@@ -176,7 +168,7 @@ class Track:
         if seen.tracks is None or seen.means is None or seen.view is None or not len(seen.tracks.uv):
             return None
         s = seen.tracks
-        points = (seen.means[s.nearest] * s.weights[..., None]).sum(1) + s.shift
+        points = seen.means[s.nearest].mean(1) + s.shift
         K, w2c = (m.to(points) for m in seen.view)
         camera = points @ w2c[:3, :3].T + w2c[:3, 3]
         front = camera[:, 2] > 1e-6 * seen.footprint
@@ -185,15 +177,6 @@ class Track:
         camera = camera[front]
         uv = camera[:, :2] / camera[:, 2:] @ K[:2, :2].T + K[:2, 2]
         return robust((uv - s.uv[front]).square().sum(1), self.tolerance, squared=True).mean()
-
-
-def robust(e: Tensor, tolerance: float, squared: bool = False) -> Tensor:
-    """``c (sqrt(1 + (e/c)^2) - 1)``: e^2 / (2c) near zero, |e| - c beyond c (pseudo-Huber; Charbonnier 1997).
-
-    squared: `e` holds e^2.
-    """
-    e2 = e if squared else e * e
-    return tolerance * ((1 + e2 / tolerance**2).sqrt() - 1)
 
 
 @dataclass(frozen=True)
@@ -224,3 +207,59 @@ class ScaleHinge:
         if seen.scales is None or not len(seen.scales):
             return None
         return (seen.scales / seen.footprint - self.limit).relu().mean()
+
+
+def robust(e: Tensor, tolerance: float, squared: bool = False) -> Tensor:
+    """``c (sqrt(1 + (e/c)^2) - 1)``: e^2 / (2c) near zero, |e| - c beyond c (pseudo-Huber; Charbonnier 1997).
+
+    squared: `e` holds e^2.
+    """
+    e2 = e if squared else e * e
+    return tolerance * ((1 + e2 / tolerance**2).sqrt() - 1)
+
+
+def tie_tracks(
+    tracks: TrackSet,
+    gaussians: Float[np.ndarray, "N T 3"],
+    reach: float,
+    *,
+    neighbours: int = 3,
+    scale: float = 1.0,
+) -> list[Sightings | None]:
+    """One video's tracks for :class:`Track`: tied to their nearest Gaussians where they were first seen.
+
+    Args:
+        tracks: lifted (``xyz``) and seen (``uv``), over T frames.
+        gaussians: where the Gaussians are at the world times of the same T frames (``Gaussians4D.tracks``). Ties hold
+            as long as the Gaussians keep their order: tie anew after pruning.
+        reach: world units; a track further from its last neighbour than this is left out. Some footprints will do.
+        neighbours: Gaussians that carry a point.
+        scale: working pixels per pixel of ``tracks.uv``.
+
+    Returns:
+        Sightings per frame; None where no tied track was seen.
+    """
+    if tracks.xyz is None or tracks.uv is None:
+        raise ValueError("tracks: expected positions (xyz) and pixels (uv), found only one of them: lift them first")
+    if gaussians.shape[1:] != (tracks.n_frames, 3) or len(gaussians) < neighbours:
+        raise ValueError(
+            f"gaussians: expected at least {neighbours} of them over the tracks' {tracks.n_frames} frames, (N,T,3); "
+            f"found shape {gaussians.shape}"
+        )
+    nearest = np.zeros((len(tracks), neighbours), np.int64)
+    shift = np.zeros((len(tracks), 3), np.float32)
+    tied = np.zeros(len(tracks), bool)
+    first = np.where(tracks.seen.any(1), tracks.seen.argmax(1), -1)
+    for frame in np.unique(first[first >= 0]):
+        rows = np.flatnonzero(first == frame)
+        points = tracks.xyz[rows, frame]
+        distance, near = cKDTree(gaussians[:, frame]).query(points, k=range(1, neighbours + 1))
+        nearest[rows], tied[rows] = near, distance[:, -1] <= reach
+        shift[rows] = points - gaussians[near, frame].mean(1)
+    out: list[Sightings | None] = []
+    for frame in range(tracks.n_frames):
+        rows = np.flatnonzero(tied & tracks.seen[:, frame])
+        uv = (tracks.uv[rows, frame] * scale).astype(np.float32)
+        found = (torch.from_numpy(a) for a in (nearest[rows], shift[rows], uv))
+        out.append(Sightings(*found) if len(rows) else None)
+    return out
