@@ -32,8 +32,9 @@ def depth_maps(
     stereo over the videos that ``offsets`` puts on the reference's clock. A map has its image's field of view, lens
     distortion included. Videos whose clock is unknown, and moments that too few videos saw, have empty maps.
 
-    Measured on basketball, 14 cameras x 7 frames of 320 x 180, two cores: 8 s for 7 common moments, 9 s for 98 unrelated frames, .5 GB. Against
-    the maps of cameras up to 60 degrees away: median difference .62 %, p90 5.9 %, lifted tracks .58 % and 4.8 %.
+    Measured on basketball, 14 cameras x 7 frames of 320 x 180, two cores: 8 s for 7 common moments, 9 s for 98
+    unrelated frames, .5 GB. Against the maps of cameras up to 60 degrees away: median difference .62 %, p90 5.9 %;
+    lifted tracks have .58 % and 4.8 %.
 
     Args:
         frames_by_video: indices of the frames, in the order of ``scene.videos``; the maps come in the same order.
