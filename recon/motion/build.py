@@ -16,7 +16,7 @@ from recon.motion.nodes import Grid
 from recon.motion.paths import HermiteSpline
 from recon.motion.rotations import continuous, quaternions
 from recon.motion.scaffold import Scaffold
-from recon.motion.solve import FRAME, Observations, Priors, Smoothness, neighbourhood_rotations, solve_curves
+from recon.motion.solve import FRAME, Coupling, Observations, Smoothness, neighbourhood_rotations, solve_curves
 from recon.motion.warp import LINEAR
 
 logger = logging.getLogger("recon.motion")
@@ -150,7 +150,7 @@ def _nodes(grid: Grid, path: HermiteSpline, footprint: float, options: ScaffoldO
     again = picking.pick(full, every, longest, options.second_pick * unit, len(picked))
     assert again is not None
     fit = _Fit(grid, path, picked[again], unit, footprint, options)
-    curves = fit.solve(*picking.neighbours(full[again], every[again], options.neighbours), rounds=2)
+    curves = fit.solve(*picking.neighbours(full[again], every[again], options.neighbours), rounds=3)
     full = fit.on_grid(curves)
     neighbours, distances = picking.neighbours(full, every[again], options.neighbours)
     weights = picking.edge_weights(distances, unit, options.reach)
@@ -200,6 +200,7 @@ class _Fit:
     ) -> None:
         self.grid, self.path, self.unit, self.options = grid, path, unit, options
         self.robust, self.n = options.robust * footprint, len(picked)
+        self.seen = grid.seen[picked]
         self.observed = []
         begin = 0
         for times, xyz in grid.samples:
@@ -214,8 +215,8 @@ class _Fit:
         near = distances < 6 * self.unit
         ties = np.exp(-(distances[near] ** 2) / (2 * (1.5 * self.unit) ** 2))
         edges = np.stack([np.nonzero(near)[0], neighbours[near]], 1)
-        priors = Priors.of(self.path, edges, ties, self.n, self.grid.times, self.options.smooth)
-        return solve_curves(self.path, self.observed, priors, robust=self.robust, rounds=rounds)
+        coupling = Coupling(edges, ties, self.grid.times, self.seen, self.unit)
+        return solve_curves(self.path, self.observed, coupling, self.options.smooth, robust=self.robust, rounds=rounds)
 
     def on_grid(self, curves: np.ndarray) -> np.ndarray:
         """Curves [P,M,3] at the frames at which tracks are compared: float32 [M,G,3] relative to the centre."""
