@@ -242,7 +242,7 @@ class Bench:
     promises: bool = False
     """For sync and match: measure what is promised, on fresh seeds, instead of the tables."""
     first_seed: int | None = None
-    """Where the seeds of --promises begin; default: the suite's own."""
+    """Where the seeds of --promises begin, or panoptic's seed; default: the suite's own."""
     json: bool = False
     """For panoptic: one line of JSON on standard output instead of tables."""
     cache: Path | None = None
@@ -258,7 +258,8 @@ class Bench:
                 raise ValueError("scene: expected a recording: otsync bench panoptic SCENE.")
             from .bench import panoptic
 
-            return panoptic.run(self.scene, self.out, json=self.json, cache=self.cache)
+            protocol = panoptic.Protocol() if self.first_seed is None else panoptic.Protocol(seed=self.first_seed)
+            return panoptic.run(self.scene, self.out, json=self.json, cache=self.cache, protocol=protocol)
         if self.promises:
             from .bench import match_limits
             from .bench import sync as sync_bench

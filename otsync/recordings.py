@@ -255,14 +255,24 @@ def stereo_depth(
     scene: Scene, tracks: Sequence[TrackSet], offsets: Offsets, stages: Stages, cache: Cache, map: MapLike = map
 ) -> list[np.ndarray]:
     """Depth of every track sample by hull and stereo over the videos whose clocks ``offsets`` knows."""
-    content = [stages.tracking.key(v, m) for v, m in zip(scene.videos, scene.masks, strict=True)]
-    given = list(zip(scene.videos, scene.masks, strict=True))
-    masks = list(map(lambda item: stages.tracking.masks(item[0], item[1], cache), given))
-    # rounding keeps the cache's key the same over the last bits of a solution
-    rig = Rig.at(scene.videos, masks, np.round(offsets.seconds, 6), stages.tracking.width)
-    uv = [seen_pixels(t) for t in tracks]
-    poses = [(v.camera.K.tobytes(), v.camera.w2c.tobytes()) for v in scene.videos]
-    return stages.stereo(rig, uv, cache, (*content, digest_of(*poses)), map)
+    pairs = list(zip(scene.videos, scene.masks, strict=True))
+    masks = list(map(lambda item: stages.tracking.masks(item[0], item[1], cache), pairs))
+    rig, key = rig_at(scene, masks, offsets, range(len(scene.videos)), stages)
+    return stages.stereo(rig, [seen_pixels(t) for t in tracks], cache, key, map)
+
+
+def rig_at(
+    scene: Scene, masks: Sequence[Sequence[np.ndarray]], offsets: Offsets, chosen: Sequence[int], stages: Stages
+) -> tuple[Rig, tuple[Any, ...]]:
+    """The chosen videos on one clock, for stereo; and a key of everything that it sees of them."""
+    videos = [scene.videos[v] for v in chosen]
+    # rounding keeps the key the same over the last bits of a solution
+    seconds, rates = np.round(offsets.seconds[list(chosen)], 6), offsets.rates[list(chosen)]
+    rig = Rig.at(videos, [masks[v] for v in chosen], seconds, stages.tracking.width, rates)
+    pixels = [stages.tracking.key(scene.videos[v], scene.masks[v]) for v in chosen]
+    poses = [(c.K.tobytes(), c.w2c.tobytes(), None if c.distortion is None else c.distortion.tobytes())
+             for c in rig.cameras]  # fmt: skip
+    return rig, (*pixels, stages.tracking.masker, stages.tracking.width, digest_of(*poses))
 
 
 def without_times(offsets: Offsets) -> Offsets:

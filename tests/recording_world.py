@@ -67,6 +67,19 @@ def render(camera: Camera, centres: np.ndarray, colours: np.ndarray, radius: flo
     return image
 
 
+def exact_depth(camera: Camera, centres: np.ndarray, radius: float, pixels: np.ndarray | None = None) -> np.ndarray:
+    """Depth along z of the balls' surfaces, 0 on the wall: (H,W) at pixel centres, or at ideal ``pixels`` (...,2)."""
+    if pixels is None:
+        pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), -1) + 0.5
+    rays = np.concatenate([pixels, np.ones_like(pixels[..., :1])], -1) @ np.linalg.inv(camera.K).T
+    z = np.full(pixels.shape[:-1], np.inf)
+    for c in camera.to_camera(centres):
+        a, b, q = (rays**2).sum(-1), rays @ c, c @ c - radius**2
+        root = b**2 - a * q
+        z = np.where(root > 0, np.minimum(z, (b - np.sqrt(np.maximum(root, 0))) / a), z)
+    return np.where(np.isfinite(z), z, 0)
+
+
 def write_recording(
     folder: Path, offsets: list[float], *, frames: int = 75, balls: int = 7, seed: int = 1, suffix: str = ".jpg"
 ) -> np.ndarray:

@@ -24,7 +24,7 @@ from otsync.recordings import Stages, choose_route, synchronize_scene, without_t
 from otsync.sync import Job, run
 from otsync.types import Offsets
 
-from .recording_world import paths, ring, write_recording
+from .recording_world import exact_depth, paths, ring, write_recording
 from .test_epipolar import world
 
 TRUE = [0.0, 7.0, -5.0, 3.5]
@@ -157,16 +157,7 @@ def test_given_depth_takes_the_tracks_route(recording, synced):
     videos = []
     for video, camera, offset in zip(scene.videos, ring(4), TRUE, strict=True):
         centres = paths((np.arange(60) + offset) / 30, 7, 1)
-        y, x = np.mgrid[0:180, 0:320] + 0.5
-        rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(camera.K).T
-        maps = []
-        for k in range(60):
-            z = np.full((180, 320), np.inf)
-            for c in camera.to_camera(centres)[:, k]:
-                a, b, q = (rays**2).sum(-1), rays @ c, c @ c - 0.16**2
-                root = b**2 - a * q
-                z = np.where(root > 0, np.minimum(z, (b - np.sqrt(np.maximum(root, 0))) / a), z)
-            maps.append(np.where(np.isfinite(z), z, 0))
+        maps = [exact_depth(camera, centres[:, k], 0.16) for k in range(60)]
         videos.append(replace(video, depth=maps))
     deep = replace(scene, videos=tuple(videos))
     with ThreadPoolExecutor(2) as pool:
