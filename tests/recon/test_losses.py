@@ -260,3 +260,12 @@ def test_windows_are_checked():
     for wrong in ({"taps": 4}, {"taps": 0}, {"sigma": 0.0}):
         with pytest.raises(ValueError, match="Window"):
             Window(**wrong)
+
+
+@pytest.mark.parametrize(
+    "shapes", [((5, 6, 3), (5, 5, 3), None), ((5, 6, 3), (5, 6, 3), (6, 5)), ((5, 6), (5, 6), None)]
+)
+def test_images_of_other_shapes_are_refused(shapes):
+    x, y, usable = (None if s is None else torch.zeros(s) for s in shapes)
+    with pytest.raises(ValueError, match="x, y, usable"):
+        photometric(x, y, usable, 0.2, SMALL)
