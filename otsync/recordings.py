@@ -151,13 +151,9 @@ def choose_route(scene: Scene, route: Route, stages: Stages) -> tuple[str, tuple
     if route not in ("auto", "tracks", "epipolar", "stereo"):
         raise ValueError(f"route: expected auto, tracks, epipolar or stereo; found {route!r}.")
     flat = [v.name for v in scene.videos if v.depth is None]
-    moving = [v.name for v in scene.videos if v.camera.w2c.ndim == 3]
-    few = len(scene.videos) < stages.stereo.min_views
     lacks = {
         "tracks": f"depth is missing for {', '.join(flat)}" if flat else "",
-        "stereo": f"cameras move: {', '.join(moving)}" if moving
-        else f"{len(scene.videos)} videos are fewer than the {stages.stereo.min_views} that a visual hull needs" if few
-        else "",
+        "stereo": lacks_stereo(scene, stages),
         "epipolar": "",
     }  # fmt: skip
     if route != "auto":
@@ -173,6 +169,16 @@ def choose_route(scene: Scene, route: Route, stages: Stages) -> tuple[str, tuple
             others = tuple(f"not {n}: {text}" for n, text in lacks.items() if text)
             return name, (f"route {name}: {reason}", *others)
     raise AssertionError("the epipolar route needs nothing")
+
+
+def lacks_stereo(scene: Scene, stages: Stages) -> str:
+    """What hull and stereo need and the scene has not; empty when nothing is missing."""
+    moving = [v.name for v in scene.videos if v.camera.w2c.ndim == 3]
+    if moving:
+        return f"cameras move: {', '.join(moving)}"
+    if len(scene.videos) < stages.stereo.min_views:
+        return f"{len(scene.videos)} videos are fewer than the {stages.stereo.min_views} that a visual hull needs"
+    return ""
 
 
 def track_all(

@@ -110,3 +110,124 @@ class Progress:
         yield
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - started
         self.tell(f"{name}: {self.seconds[name]:.1f} s")
+
+
+def readable(scene: Scene, cache: Any, map: MapLike, progress: Progress) -> Scene:
+    """The scene without frames that cannot be read, each of which is noted. ValueError when one video has none left."""
+    from otsync.priors.cache import digest_of
+
+    def look(item: tuple[Video, Any]) -> dict[str, np.ndarray]:
+        video, masks = item
+        parts = [getattr(x, "digest", None) for x in (video.frames, masks, video.depth) if x is not None]
+        compute = lambda: {f"{k:08d}": np.array(why) for k, why in unreadable(video, masks).items()} | {"ok": np.array(1)}  # noqa: E731
+        if not all(parts):  # frames that are in memory have no digest, and are quickly looked at
+            return compute()
+        try:
+            key = (*[digest() for digest in parts], video.camera.width, video.camera.height)  # type: ignore[misc]
+        except OSError:
+            return compute()
+        return cache.arrays("readable", key, compute)
+
+    index = []
+    for video, found in zip(scene.videos, map(look, list(zip(scene.videos, scene.masks, strict=True))), strict=True):
+        bad = {int(k): str(why) for k, why in found.items() if k != "ok"}
+        for k, why in sorted(bad.items())[:3]:
+            progress.note(f"video {video.name}, frame {k} is left out: {why}")
+        if len(bad) > 3:
+            progress.note(f"video {video.name}: {len(bad) - 3} further frames are left out")
+        if len(bad) == len(video.frames):
+            raise ValueError(f"video {video.name}: expected frames that can be read; found none. {bad[0]}")
+        index.append([k for k in range(len(video.frames)) if k not in bad])
+    return keep_frames(scene, index)
+
+
+def split(
+    scene: Scene, offsets: Offsets, held_out: Sequence[str], progress: Progress
+) -> tuple[Scene, Scene | None, Offsets, dict[str, Clock]]:
+    """Training videos, held-out ones, the offsets of the former alone, and the clocks of the latter that are known.
+
+    Videos without an offset on the reference's clock are left out, with a note.
+    """
+    missing = [n for n in held_out if n not in scene.names]
+    if missing:
+        raise ValueError(f"held_out: expected some of {', '.join(scene.names)}; found {', '.join(missing)}.")
+    reference = offsets.names[offsets.reference]
+    known = {n for v, n in enumerate(offsets.names)
+             if np.isfinite(offsets.seconds[v]) and offsets.component[v] == offsets.reference}  # fmt: skip
+    train = [n for n in scene.names if n in known and n not in held_out]
+    if reference not in train:
+        raise ValueError(
+            f"offsets: expected the reference ({reference}) among the videos to fit; found {', '.join(train) or 'none'}. "
+            "Hold out another video, or synchronise with another reference."
+        )
+    for name in scene.names:
+        if name not in train and name not in held_out:
+            why = "has no offset on the common clock" if name in offsets.names else "is not in the offsets"
+            progress.note(f"video {name} is left out: it {why}")
+    clocks = {
+        n: Clock(float(offsets.seconds[v]), float(offsets.rates[v]))
+        for v, n in enumerate(offsets.names) if n in held_out and n in known
+    }  # fmt: skip
+    return scene.take(train), scene.take(held_out) if held_out else None, only(offsets, train), clocks
+
+
+def only(offsets: Offsets, names: Sequence[str]) -> Offsets:
+    """The offsets of some videos, in that order; the reference is one of them."""
+    at = [offsets.names.index(n) for n in names]
+    new = {v: i for i, v in enumerate(at)}
+    pairs = {k: v for k, v in offsets.alignments.items() if k[0] in new and k[1] in new}
+    return replace(
+        offsets, names=tuple(names), fps=offsets.fps[at], seconds=offsets.seconds[at], rates=offsets.rates[at],
+        sigma=offsets.sigma[at], reference=new[offsets.reference], component=np.full(len(at), new[offsets.reference]),
+        status=tuple(offsets.status[v] for v in at), flags=tuple(offsets.flags[v] for v in at),
+        alignments={(new[i], new[j]): a for (i, j), a in pairs.items()}, matches={},
+    )  # fmt: skip
+
+
+def lifted_tracks(
+    scene: Scene, offsets: Offsets, cache: Any, map: MapLike, progress: Progress
+) -> tuple[TrackSet, ...]:
+    """Tracks in space of every video that has some: by given depth, else by hull and stereo at the offsets."""
+    from otsync import recordings
+
+    stages = recordings.Stages()
+    raw = recordings.track_all(scene, stages, cache, map, progress.tell)
+    flat: list[TrackSet | None] = []
+    for video, found in zip(scene.videos, raw, strict=True):
+        try:
+            flat.append(recordings.select(video, found, stages, scene.frame))
+        except ValueError:
+            flat.append(None)
+            progress.note(f"video {video.name}: nothing moves enough to be tracked; it only adds images")
+    if not any(flat):
+        raise ValueError(
+            "scene: expected something that moves; found no track that lives and moves enough in any video. Check the "
+            "masks, or choose a part of the recording with motion (--frames)."
+        )
+    out: list[TrackSet] = []
+    for v, (video, tracks) in enumerate(zip(scene.videos, flat, strict=True)):
+        if tracks is not None and video.depth is not None:
+            part = scene.take([video.name])
+            try:
+                out += recordings.lift_given(part, [raw[v]], stages, cache)
+            except ValueError as error:
+                progress.note(str(error))
+    bare = [v for v, video in enumerate(scene.videos) if video.depth is None and flat[v] is not None]
+    if bare:
+        lacking = recordings.lacks_stereo(scene, stages)
+        if lacking and not out:
+            raise ValueError(
+                f"depth: none was given for {', '.join(scene.videos[v].name for v in bare)}, and none can be measured: "
+                f"{lacking}. Add depth maps to the scene, or more static cameras."
+            )
+        if lacking:
+            progress.note(f"no tracks in space from {', '.join(scene.videos[v].name for v in bare)}: {lacking}")
+        else:
+            kept = [v for v, t in enumerate(flat) if t is not None]
+            part, sets = scene.take([scene.names[v] for v in kept]), [t for t in flat if t is not None]
+            depth = recordings.stereo_depth(part, sets, only(offsets, part.names), stages, cache, map)
+            lifted = [stages.lift(t, z) for t, z in zip(sets, depth, strict=True)]
+            out += [t for v, t in zip(kept, lifted, strict=True) if v in bare and len(t)]
+    if not out:
+        raise ValueError("depth: expected depth where things move; no track could be lifted. Check the depth or masks.")
+    return tuple(out)
