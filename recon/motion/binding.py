@@ -1,0 +1,111 @@
+"""Which nodes carry which Gaussian, and where those nodes stood when it was bound."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+from torch import Tensor
+
+NODES = 8  # per Gaussian: the nearest one and its topological neighbours
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """The (rest, node) pairs that a binding uses, and the two ways through them that a warp takes.
+
+    Q pairs in ascending order of the node, then the rest: `of_slot` [N,8] says which pair a Gaussian's slot is, `starts`
+    [Q+1] and `slots` [N*8] list the slots (Gaussian * 8 + k) of every pair in ascending order, `node_starts` [M+1] the
+    pairs of every node. Sums over slots and pairs run in these orders: the same to the last bit, whoever computes them.
+    """
+
+    node: np.ndarray
+    rest: np.ndarray
+    of_slot: np.ndarray
+    starts: np.ndarray
+    slots: np.ndarray
+    node_starts: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Binding:
+    """N Gaussians bound to M nodes: constants of a fit, apart from its learnable parameters.
+
+    rest int64 [N]: which of the R rests the Gaussian was bound at; nodes int64 [N,8] and weights [N,8] >= 0, of sum 1;
+    times float64 [R] world seconds of the rests; positions [R,M,3] and quats [R,M,4] (unit): the nodes' poses then,
+    frozen, so that no reference frame is evaluated anew in each step and a Gaussian's mean keeps its meaning.
+    """
+
+    rest: Tensor
+    nodes: Tensor
+    weights: Tensor
+    times: Tensor
+    positions: Tensor
+    quats: Tensor
+
+    @classmethod
+    def empty(cls, n_nodes: int, like: Tensor) -> Binding:
+        """No Gaussians yet; dtype and device of `like`."""
+        whole = torch.zeros(0, dtype=torch.int64, device=like.device)
+        times = torch.zeros(0, dtype=torch.float64, device=like.device)
+        return cls(
+            whole,
+            whole.new_zeros(0, NODES),
+            like.new_zeros(0, NODES),
+            times,
+            like.new_zeros(0, n_nodes, 3),
+            like.new_zeros(0, n_nodes, 4),
+        )
+
+    def __len__(self) -> int:
+        return len(self.rest)
+
+    def take(self, index: Tensor | np.ndarray) -> Binding:
+        """The Gaussians at `index` (integers, with repeats, or a mask)."""
+        index = torch.as_tensor(index, device=self.rest.device)
+        return replace(self, rest=self.rest[index], nodes=self.nodes[index], weights=self.weights[index])
+
+    def append(self, nodes: Tensor, weights: Tensor, time: float, positions: Tensor, quats: Tensor) -> Binding:
+        """n more Gaussians, bound at world second `time` to nodes with poses [M,3], [M,4]: one more rest, unless an
+        earlier one is the same."""
+        same = [
+            r
+            for r in range(len(self.times))
+            if torch.equal(self.positions[r], positions) and torch.equal(self.quats[r], quats)
+        ]
+        here = same[0] if same else len(self.times)
+        rest = torch.full((len(nodes),), here, dtype=torch.int64, device=self.rest.device)
+        bound = replace(
+            self,
+            rest=torch.cat([self.rest, rest]),
+            nodes=torch.cat([self.nodes, nodes]),
+            weights=torch.cat([self.weights, weights.to(self.weights)]),
+        )
+        if same:
+            return bound
+        return replace(
+            bound,
+            times=torch.cat([self.times, self.times.new_tensor([time])]),
+            positions=torch.cat([self.positions, positions[None]]),
+            quats=torch.cat([self.quats, quats[None]]),
+        )
+
+    @cached_property
+    def layout(self) -> Layout:
+        """Computed once per binding: parameters change in every step, bindings do not."""
+        rest, nodes = self.rest.cpu().numpy(), self.nodes.cpu().numpy()
+        n_nodes, n_rests = self.positions.shape[1], max(1, len(self.positions))
+        keys, of_slot = np.unique(nodes * n_rests + rest[:, None], return_inverse=True)
+        of_slot = of_slot.reshape(nodes.shape)
+        counts = np.bincount(of_slot.reshape(-1), minlength=len(keys))
+        node = keys // n_rests
+        return Layout(
+            node=node.astype(np.int32),
+            rest=(keys % n_rests).astype(np.int32),
+            of_slot=of_slot.astype(np.int32),
+            starts=np.concatenate([[0], np.cumsum(counts)]).astype(np.int32),
+            slots=np.argsort(of_slot.reshape(-1), kind="stable").astype(np.int32),
+            node_starts=np.searchsorted(node, np.arange(n_nodes + 1)).astype(np.int32),
+        )

@@ -1,0 +1,237 @@
+"""A scaffold from lifted tracks and offsets: pick nodes, solve for their curves, turn them, connect them."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+
+from otsync.types import TrackSet
+from recon.motion import nodes as picking
+from recon.motion.binding import Binding
+from recon.motion.nodes import Grid
+from recon.motion.paths import HermiteSpline
+from recon.motion.rotations import continuous, quaternions
+from recon.motion.scaffold import Scaffold
+from recon.motion.solve import FRAME, Observations, Smoothness, neighbourhood_rotations, solve_curves
+from recon.motion.warp import LINEAR
+
+logger = logging.getLogger("recon.motion")
+
+
+@dataclass(frozen=True)
+class ScaffoldOptions:
+    """How a scaffold is built. Lengths in footprints (the world size of a working pixel), times in seconds.
+
+    Args:
+        unit: spacing of the nodes; None: 7.5, less (down to 2) where that gives fewer than `fewest` nodes, more where
+            it gives more than `most`.
+        second_pick: spacing of the second pick on full curves, as a part of `unit`.
+        spacing: of the knots in time. margin: seconds of knots beyond both ends: the largest believable offset.
+        per_video: one scaffold per video, each on its own clock, as in the paper; else one in world time.
+        neighbours: topological neighbours of a node. reach: D_track beyond which they are none, in units.
+        robust: distance at which a sample counts half, in footprints. shortest: seconds a track must be seen to be
+            picked, or a third of what the longest is.
+        smooth: weights of the solve. blend: "linear" or "dual-quaternion".
+    """
+
+    unit: float | None = None
+    second_pick: float = 0.8
+    fewest: int = 32
+    most: int = 900
+    spacing: float = 4 * FRAME
+    margin: float = 4 * FRAME
+    per_video: bool = False
+    neighbours: int = 10
+    reach: float = 5.0
+    robust: float = 2.3
+    shortest: float = 10 * FRAME
+    smooth: Smoothness = field(default_factory=Smoothness)
+    blend: str = LINEAR
+
+    def __post_init__(self) -> None:
+        if self.unit is not None and not self.unit > 0:
+            raise ValueError(f"unit: expected footprints > 0, or None to choose; found {self.unit}.")
+        if not (0 < self.second_pick <= 1 and self.reach > 0 and self.robust > 0 and self.spacing > 0):
+            raise ValueError("second_pick, reach, robust, spacing: expected numbers > 0, second_pick at most 1.")
+        if not (self.margin >= 0 and self.neighbours >= 1 and 1 <= self.fewest <= self.most):
+            raise ValueError("margin, neighbours, fewest, most: expected margin >= 0, 1 neighbour, fewest <= most.")
+
+
+UNIT, LEAST_UNIT, GROWTH = 7.5, 2.0, 1.25
+
+
+def build_scaffold(
+    tracks: Sequence[TrackSet],
+    offsets: np.ndarray,
+    *,
+    footprint: float,
+    frame_step: float,
+    options: ScaffoldOptions | None = None,
+    rates: np.ndarray | None = None,
+    seed: int = 0,
+) -> Scaffold:
+    """Nodes, curves and rotations from the lifted tracks of V videos: float32 tensors on the CPU, nothing bound yet.
+
+    offsets, rates [V]: world second = rate · own second + offset. footprint: world size of a working pixel at the
+    moving part. frame_step: seconds of one frame of the reference. seed: of the order of tracks seen equally long.
+    """
+    options = options or ScaffoldOptions()
+    if not (np.isfinite(footprint) and footprint > 0):
+        raise ValueError(f"footprint: expected world units per working pixel, > 0; found {footprint}.")
+    offsets = np.asarray(offsets, float)
+    if not options.per_video:
+        grid = Grid.of(tracks, offsets, frame_step, rates)
+        path = HermiteSpline.of(grid.times[0], grid.times[-1], options.spacing, options.margin)
+        return _assemble(path, [_nodes(grid, path, footprint, options, seed)], options)
+    clocks = picking.world_clocks(tracks, offsets, rates)
+    rates = np.ones(len(tracks)) if rates is None else np.asarray(rates, float)
+    usable = [v for v, one in enumerate(tracks) if one.seen.any()]
+    if not usable:
+        raise ValueError("tracks: expected at least one visible sample; found none in any of the videos.")
+    first, last = min(clocks[v][0] for v in usable), max(clocks[v][-1] for v in usable)
+    own = (np.array([first, last])[:, None] - offsets[usable]) / rates[usable]
+    path = HermiteSpline.of(own.min(), own.max(), options.spacing, options.margin)
+    parts = []
+    for v in usable:
+        grid = Grid.of([tracks[v]], np.zeros(1), frame_step / rates[v])
+        parts.append(_nodes(grid, path, footprint, options, seed))
+    scaffold = _assemble(path, parts, options)
+    clock = np.repeat(usable, [part.curves.shape[1] for part in parts])
+    return replace(
+        scaffold,
+        clock=torch.from_numpy(clock),
+        offsets=torch.tensor(offsets, dtype=torch.float64),
+        rates=torch.tensor(rates, dtype=torch.float64),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Nodes:
+    """Nodes of one clock: knots [P,M,3], rotations [P,M,3,3], neighbours [M,K] with weights, spacing."""
+
+    curves: np.ndarray
+    rotations: np.ndarray
+    neighbours: np.ndarray
+    weights: np.ndarray
+    unit: float
+
+
+def _assemble(path: HermiteSpline, parts: Sequence[_Nodes], options: ScaffoldOptions) -> Scaffold:
+    before = np.cumsum([0] + [part.curves.shape[1] for part in parts])
+    knots = torch.from_numpy(np.concatenate([part.curves for part in parts], 1)).float()
+    quats = continuous(quaternions(np.concatenate([part.rotations for part in parts], 1)))
+    edges = np.concatenate([part.neighbours + b for part, b in zip(parts, before, strict=False)])
+    weights = np.concatenate([part.weights for part in parts])
+    return Scaffold(
+        path,
+        knots,
+        torch.from_numpy(quats).float(),
+        torch.from_numpy(edges),
+        torch.from_numpy(weights).float(),
+        float(np.median([part.unit for part in parts])),
+        Binding.empty(knots.shape[1], knots),
+        blend=options.blend,
+    )
+
+
+def _nodes(grid: Grid, path: HermiteSpline, footprint: float, options: ScaffoldOptions, seed: int) -> _Nodes:
+    """Pick, solve, pick again on the full curves, solve again, turn."""
+    picked, unit = _first_pick(grid, footprint, options, seed)
+    fit = _Fit(grid, path, picked, unit, footprint, options)
+    xyz, seen = grid.compared()
+    curves = fit.solve(*picking.neighbours(xyz[picked], seen[picked], options.neighbours), rounds=3)
+    full = fit.on_grid(curves)
+    every = np.ones(full.shape[:2], bool)
+    longest = np.argsort(-grid.seen[picked].sum(1), kind="stable")
+    again = picking.pick(full, every, longest, options.second_pick * unit, len(picked))
+    assert again is not None
+    fit = _Fit(grid, path, picked[again], unit, footprint, options)
+    curves = fit.solve(*picking.neighbours(full[again], every[again], options.neighbours), rounds=2)
+    full = fit.on_grid(curves)
+    neighbours, distances = picking.neighbours(full, every[again], options.neighbours)
+    weights = edge_weights(distances, unit, options.reach)
+    turned = neighbourhood_rotations(curves, neighbours, weights, unit)
+    logger.info("%d nodes of %d tracks, %.3g world units apart", len(again), len(grid), unit)
+    return _Nodes(curves, turned, neighbours, weights, unit)
+
+
+def edge_weights(distances: np.ndarray, unit: float, reach: float = 5.0) -> np.ndarray:
+    """Weights of edges of D_track `distances`: exp(-D²/2(1.5 unit)²), 0 beyond `reach` units."""
+    near = distances < reach * unit
+    return np.where(near, np.exp(-(np.where(near, distances, 0) ** 2) / (2 * (1.5 * unit) ** 2)) + 1e-6, 0.0)
+
+
+def _first_pick(grid: Grid, footprint: float, options: ScaffoldOptions, seed: int) -> tuple[np.ndarray, float]:
+    """Tracks that become nodes, and the spacing in world units at which they were picked."""
+    count = grid.seen.sum(1)
+    step = grid.times[1] - grid.times[0] if len(grid.times) > 1 else FRAME
+    enough = min(options.shortest / step, count.max() / 3)
+    shuffled = np.random.default_rng(seed).permutation(len(grid))
+    order = shuffled[np.argsort(-count[shuffled], kind="stable")]
+    order = order[count[order] >= max(1, enough)]
+    xyz, seen = grid.compared()
+    order = order[seen[order].any(1)]
+
+    def at(unit: float) -> np.ndarray | None:
+        return picking.pick(xyz, seen, order, unit * footprint, options.most)
+
+    unit = options.unit or UNIT
+    picked = at(unit)
+    while picked is None:  # a larger spacing, rather than a part of the scene without nodes
+        unit *= GROWTH
+        picked = at(unit)
+    while options.unit is None and len(picked) < min(options.fewest, len(order)) and unit / GROWTH >= LEAST_UNIT:
+        closer = at(unit / GROWTH)
+        if closer is None:
+            break
+        unit, picked = unit / GROWTH, closer
+    return picked, unit * footprint
+
+
+class _Fit:
+    """The picked tracks' samples, ready to be solved for."""
+
+    def __init__(
+        self,
+        grid: Grid,
+        path: HermiteSpline,
+        picked: np.ndarray,
+        unit: float,
+        footprint: float,
+        options: ScaffoldOptions,
+    ) -> None:
+        self.grid, self.path, self.unit, self.options = grid, path, unit, options
+        self.robust, self.n = options.robust * footprint, len(picked)
+        self.observed = []
+        begin = 0
+        for times, xyz in grid.samples:
+            mine = np.flatnonzero((picked >= begin) & (picked < begin + len(xyz)))
+            if len(mine):
+                self.observed.append(Observations(times, xyz[picked[mine] - begin], mine))
+            begin += len(xyz)
+        stride = -(-len(grid.times) // picking.COMPARED_FRAMES)
+        self.design = path.design(grid.times[::stride])
+
+    def solve(self, neighbours: np.ndarray, distances: np.ndarray, rounds: int) -> np.ndarray:
+        near = distances < 6 * self.unit
+        ties = np.exp(-(distances[near] ** 2) / (2 * (1.5 * self.unit) ** 2))
+        edges = np.stack([np.nonzero(near)[0], neighbours[near]], 1)
+        return solve_curves(
+            self.path,
+            self.observed,
+            edges,
+            ties,
+            self.n,
+            grid=self.grid.times,
+            robust=self.robust,
+            rounds=rounds,
+            smooth=self.options.smooth,
+        )
+
+    def on_grid(self, curves: np.ndarray) -> np.ndarray:
+        """Curves [P,M,3] at the frames at which tracks are compared: float32 [M,G,3] relative to the centre."""
+        return np.einsum("ta,amk->mtk", self.design, curves - self.grid.centre).astype(np.float32)

@@ -1,0 +1,191 @@
+"""Curves in time as weighted sums of a few values: cubic Hermite splines, and samples (the "w/o spline" ablation).
+
+A path is a uniform grid of knots in seconds. At any time it is a sum over four consecutive knots,
+
+    x(t) = Σ_a w_a(t) knots[first + a],   a = 0..3,
+
+whose weights are cubic polynomials in t. Everything else (nodes, Gaussians, fused kernels) asks a path for `first` and
+`w` alone, so that another kind of curve is another object in the same slot.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+WINDOW = 4  # knots under a path's weights at any time
+MAX_KNOTS = 4096  # of one path: a span of nine minutes at the default spacing; beyond it an offset is wrong
+
+
+@dataclass(frozen=True)
+class Path(ABC):
+    """A kind of curve on a uniform grid: `count` knots at start + i * spacing seconds (float64)."""
+
+    start: float
+    spacing: float
+    count: int
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.start) and math.isfinite(self.spacing) and self.spacing > 0):
+            raise ValueError(
+                f"start, spacing: expected finite seconds, spacing > 0; found {self.start}, {self.spacing}."
+            )
+        if not WINDOW <= self.count <= MAX_KNOTS:
+            raise ValueError(
+                f"count: expected {WINDOW}..{MAX_KNOTS} knots; found {self.count}. Check the offsets (in seconds) of "
+                "the videos, or set a wider spacing."
+            )
+
+    @classmethod
+    def of(cls, first: float, last: float, spacing: float, margin: float = 0.0) -> Self:
+        """Knots over first..last seconds and `margin` seconds before and after: the largest believable offset."""
+        if not (math.isfinite(first) and math.isfinite(last) and last >= first and margin >= 0 and spacing > 0):
+            raise ValueError(
+                "first, last, margin, spacing: expected finite seconds, last >= first, margin >= 0, spacing > 0; "
+                f"found {first}, {last}, {margin}, {spacing}."
+            )
+        span = (last - first + 2 * margin) / spacing
+        if span > 2 * MAX_KNOTS:  # before it is rounded: an absurd span has no integer
+            raise ValueError(
+                f"last - first: expected at most {MAX_KNOTS * spacing:.0f} seconds of motion at this spacing; found "
+                f"{last - first:.6g}. Check the offsets (in seconds) of the videos, or set a wider spacing."
+            )
+        # a whole number of intervals within rounding stays that number
+        return cls(float(first - margin), float(spacing), max(WINDOW, math.ceil(span - 1e-6) + 1))
+
+    @property
+    def times(self) -> Float[np.ndarray, " P"]:
+        """Seconds of the knots."""
+        return self.start + self.spacing * np.arange(self.count)
+
+    @abstractmethod
+    def _windows(self, t: np.ndarray | float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """For times [...]: first knot of the window, matrix [...,4,4] of cubics in u, and the knot where u = 0."""
+
+    @abstractmethod
+    def step(self, seconds: float) -> float:
+        """The time difference nearest to `seconds` over which this path may be compared with itself."""
+
+    def basis(self, t: np.ndarray | float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """For times [...]: the first knot int64 [...], weights [...,4], and their derivatives per second [...,4]."""
+        first, matrix, origin = self._windows(t)
+        u = (np.asarray(t, float) - self.start) / self.spacing - origin
+        one = np.ones_like(u)
+        powers = np.stack([one, u, u * u, u * u * u], -1)
+        slopes = np.stack([0 * one, one, 2 * u, 3 * u * u], -1) / self.spacing
+        return first, (matrix @ powers[..., None])[..., 0], (matrix @ slopes[..., None])[..., 0]
+
+    def weights(self, t: Tensor) -> tuple[int | Tensor, Tensor]:
+        """First knot (an int for a single time) and weights [...,4] float64, differentiable in `t`."""
+        t = torch.as_tensor(t, dtype=torch.float64)
+        first, matrix, origin = self._windows(t.detach().cpu().numpy())
+        u = (t - self.start) / self.spacing - torch.as_tensor(origin, dtype=torch.float64, device=t.device)
+        u2 = u * u
+        powers = torch.stack([torch.ones_like(u), u, u2, u2 * u], -1)
+        w = (torch.as_tensor(matrix, device=t.device) @ powers[..., None])[..., 0]
+        return (int(first) if t.ndim == 0 else torch.as_tensor(first, device=t.device)), w
+
+    def at(self, knots: Tensor, t: Tensor | float) -> Tensor:
+        """The curve of `knots` [P,...] at `t`: [...], or [S,...] for S times."""
+        first, w = self.weights(torch.as_tensor(t, dtype=torch.float64, device=knots.device))
+        w = w.to(knots.dtype)
+        if isinstance(first, int):
+            return (w @ knots[first : first + WINDOW].flatten(1)).reshape(knots.shape[1:])
+        window = first[..., None] + torch.arange(WINDOW, device=knots.device)
+        return torch.einsum("...a,...ax->...x", w, knots.flatten(1)[window]).reshape(*first.shape, *knots.shape[1:])
+
+    def design(self, t: Float[np.ndarray, " S"]) -> Float[np.ndarray, "S P"]:
+        """The weights of all knots at S times, dense."""
+        first, w, _ = self.basis(t)
+        matrix = np.zeros((len(first), self.count))
+        np.put_along_axis(matrix, first[:, None] + np.arange(WINDOW), w, 1)
+        return matrix
+
+
+def _hermite_matrices() -> Float[np.ndarray, "5 4 4"]:
+    """Weights of a window's four knots as cubics in u, for the five kinds of interval.
+
+    Kinds: before the first knot, the first interval, an inner one, the last one, after the last knot. u runs from 0 to
+    1 over the interval, whose knots are those numbered 0, 0, 1, 2, 3 in the window. Tangents are central differences of
+    the knots, one-sided at the two ends. Rows: knots of the window; columns: powers of u.
+    """
+    value0, slope0 = np.array([1.0, 0, -3, 2]), np.array([0, 1.0, -2, 1])
+    value1, slope1 = np.array([0, 0, 3.0, -2]), np.array([0, 0, -1.0, 1])
+    knots = np.eye(4)
+    central1, central2 = (knots[2] - knots[0]) / 2, (knots[3] - knots[1]) / 2
+
+    def interval(k: int, leave: np.ndarray, arrive: np.ndarray) -> np.ndarray:
+        parts = ((knots[k], value0), (leave, slope0), (knots[k + 1], value1), (arrive, slope1))
+        return sum((np.outer(rows, cubic) for rows, cubic in parts), np.zeros((4, 4)))
+
+    begin, end = knots[1] - knots[0], knots[3] - knots[2]
+    straight = np.eye(4)[:2]  # the powers 1 and u
+    before = np.outer(knots[0], straight[0]) + np.outer(begin, straight[1])
+    after = np.outer(knots[3], straight[0]) + np.outer(end, straight[1])
+    return np.stack(
+        [before, interval(0, begin, central1), interval(1, central1, central2), interval(2, central2, end), after]
+    )
+
+
+_HERMITE = _hermite_matrices()
+_FIRST_OF_KIND = np.array([0, 0, -1, -2, -3])  # the window's first knot, counted from the knot where u = 0
+_ONE_HOT = np.zeros((4, 4, 4))
+_ONE_HOT[np.arange(4), np.arange(4), 0] = 1  # knot k of the window, whatever u
+
+
+@dataclass(frozen=True)
+class HermiteSpline(Path):
+    """Cubic Hermite spline through its knots, C1, with tangents by finite differences (central; one-sided at the ends).
+
+    Equals scipy.interpolate.CubicHermiteSpline with those tangents. Beyond the ends it goes on in a straight line with
+    the end's tangent, so that the derivative in time, by which offsets are refined, stays alive and bounded there.
+    """
+
+    def _windows(self, t: np.ndarray | float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        s = (np.asarray(t, float) - self.start) / self.spacing
+        last = self.count - 1
+        # the knot where u = 0; an infinite or absurd time is continued like the end
+        i = np.clip(np.nan_to_num(np.floor(s)), -1, last).astype(np.int64)
+        kind = np.where(i < 0, 0, np.where(i == 0, 1, np.where(i < last - 1, 2, np.where(i < last, 3, 4))))
+        origin = np.maximum(i, 0)
+        return origin + _FIRST_OF_KIND[kind], _HERMITE[kind], origin
+
+    def step(self, seconds: float) -> float:
+        return seconds
+
+
+@dataclass(frozen=True)
+class Sampled(Path):
+    """The sample nearest in time, held beyond the ends: the "w/o spline" ablation, without a derivative in time."""
+
+    def _windows(self, t: np.ndarray | float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        s = (np.asarray(t, float) - self.start) / self.spacing
+        nearest = np.clip(np.floor(np.nan_to_num(s) + 0.5), 0, self.count - 1).astype(np.int64)
+        first = np.clip(nearest - 1, 0, self.count - WINDOW)
+        return first, _ONE_HOT[nearest - first], nearest
+
+    def step(self, seconds: float) -> float:
+        return max(1, round(seconds / self.spacing)) * self.spacing
+
+
+def path_arrays(path: Path) -> dict[str, np.ndarray]:
+    """A path as plain arrays, for a checkpoint."""
+    numbers = np.array([path.start, path.spacing, path.count], float)
+    return {"path": np.array(type(path).__name__), "path_knots": numbers}
+
+
+def path_from_arrays(arrays: Mapping[str, np.ndarray]) -> Path:
+    """What :func:`path_arrays` gave; KeyError where it is missing, ValueError where it makes no path."""
+    kinds = {kind.__name__: kind for kind in (HermiteSpline, Sampled)}
+    name, (start, spacing, count) = str(arrays["path"]), np.asarray(arrays["path_knots"], float).reshape(3)
+    if name not in kinds:
+        raise ValueError(f"path: expected one of {sorted(kinds)}; found {name!r}.")
+    return kinds[name](float(start), float(spacing), int(count))

@@ -1,0 +1,124 @@
+"""Motions without a scaffold: every Gaussian on a path of its own (the "w/o scaffold" ablation), and none at all."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from otsync.types import TrackSet
+from recon.motion.nodes import Grid, held
+from recon.motion.paths import Path, path_arrays, path_from_arrays
+from recon.motion.scaffold import Scaffold
+
+
+@dataclass(frozen=True, eq=False)
+class PerGaussian:
+    """N Gaussians, each displaced from its mean along its own path: own_knots [P,N,3] world units. None turns."""
+
+    path: Path
+    own_knots: Tensor
+
+    @classmethod
+    def following(cls, scaffold: Scaffold, means: Tensor, path: Path | None = None) -> PerGaussian:
+        """The paths on which `scaffold` carries its Gaussians of these `means` [N,3]."""
+        path = path or scaffold.path
+        upright = means.new_tensor([1.0, 0, 0, 0]).expand(len(means), 4)
+        with torch.no_grad():
+            carried = [scaffold.warp(means, upright, float(t))[0] - means for t in path.times]
+        return cls(path, torch.stack(carried))
+
+    @classmethod
+    def from_tracks(
+        cls,
+        tracks: Sequence[TrackSet],
+        offsets: np.ndarray,
+        means: Tensor,
+        times: Tensor | np.ndarray,
+        path: Path,
+        *,
+        frame_step: float,
+        rates: np.ndarray | None = None,
+    ) -> PerGaussian:
+        """Each Gaussian takes the displacement of the raw track that is nearest to its mean at its own world second.
+
+        times float64 [N] seconds at which the means [N,3] hold; only tracks seen then are asked (any, where none is),
+        and a track is held still where it was not seen. frame_step: seconds of one frame of the reference.
+        """
+        from scipy.spatial import cKDTree
+
+        grid = Grid.of(tracks, offsets, frame_step, rates)
+        curves, place = held(grid), means.detach().cpu().numpy().astype(float)
+        t = np.asarray(times, float)
+        frame = np.clip(np.rint((t - grid.times[0]) / frame_step).astype(int), 0, len(grid.times) - 1)
+        knot_frames = np.clip(np.rint((path.times - grid.times[0]) / frame_step).astype(int), 0, len(grid.times) - 1)
+        own = np.zeros((path.count, len(place), 3))
+        for f in np.unique(frame):
+            here = np.flatnonzero(frame == f)
+            seen = np.flatnonzero(grid.seen[:, f])
+            seen = seen if len(seen) else np.arange(len(curves))
+            chosen = curves[seen[cKDTree(curves[seen, f]).query(place[here])[1]]]
+            own[:, here] = (chosen[:, knot_frames] - chosen[:, f, None]).transpose(1, 0, 2)
+        return cls(path, torch.as_tensor(own).to(means))
+
+    def parameters(self) -> dict[str, Tensor]:
+        return {"own_knots": self.own_knots}
+
+    def with_parameters(self, parameters: Mapping[str, Tensor]) -> PerGaussian:
+        return replace(self, own_knots=parameters["own_knots"])
+
+    def warp(
+        self, means: Tensor, quats: Tensor, t: Tensor | float, clocks: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Means [N,3] displaced to world second `t`, and the quats as they are. `clocks` are ignored."""
+        return means + self.path.at(self.own_knots, t), quats
+
+    def take(self, index: Tensor | np.ndarray) -> PerGaussian:
+        index = torch.as_tensor(index, device=self.own_knots.device)
+        return replace(self, own_knots=self.own_knots[:, index])
+
+    def to(self, device: torch.device | str) -> PerGaussian:
+        return replace(self, own_knots=self.own_knots.to(device))
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        own = self.own_knots.detach().cpu().numpy()
+        return {"kind": np.array("per-gaussian"), "own_knots": own} | path_arrays(self.path)
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> PerGaussian:
+        try:
+            return cls(path_from_arrays(arrays), torch.from_numpy(np.array(arrays["own_knots"])))
+        except KeyError as error:
+            raise ValueError(f"arrays: expected those of a motion per Gaussian; found no {error}.") from None
+
+
+@dataclass(frozen=True)
+class Static:
+    """Nothing moves, and nothing is computed."""
+
+    def parameters(self) -> dict[str, Tensor]:
+        return {}
+
+    def with_parameters(self, parameters: Mapping[str, Tensor]) -> Static:
+        return self
+
+    def warp(
+        self, means: Tensor, quats: Tensor, t: Tensor | float, clocks: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        return means, quats
+
+    def take(self, index: Tensor | np.ndarray) -> Static:
+        return self
+
+    def to(self, device: torch.device | str) -> Static:
+        return self
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        return {"kind": np.array("static")}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> Static:
+        return cls()

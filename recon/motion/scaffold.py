@@ -1,0 +1,223 @@
+"""The motion scaffold: nodes with splined poses that carry Gaussians bound to them (the paper's Sec. 3)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from recon.motion import warp as warping
+from recon.motion.binding import NODES, Binding
+from recon.motion.paths import WINDOW, Path, path_arrays, path_from_arrays
+from recon.motion.rotations import unit
+
+LEAST_WEIGHT = 1e-6  # before normalisation: a point far from all its nodes still follows them
+
+
+@dataclass(frozen=True, eq=False)
+class Scaffold:
+    """M nodes, each a pose that moves along a path, and the Gaussians bound to them.
+
+    Args:
+        path: the curve in time through the knots.
+        knots [P,M,3] world units, knot_quats [P,M,4] wxyz of any length: learnable.
+        edges int64 [M,K]: topological neighbours, the nearest (by D_track) first.
+        edge_weights [M,K]: 0 where the neighbour is too far to be one.
+        unit: spacing of the nodes, world units; also the sigma of the radial weights by which points are bound.
+        binding: of the Gaussians to the nodes.
+        clock int64 [M] or None: the video on whose own clock each node lives (the paper's scaffold per video); None:
+            all nodes live in world time.
+        offsets, rates float64 [V] or None: of those videos as at building: used where a caller gives no `clocks`.
+        blend: "linear" or "dual-quaternion".
+
+    A node of video u stands, at world time t, where its curve is at its own time (t - offset_u) / rate_u.
+    """
+
+    path: Path
+    knots: Tensor
+    knot_quats: Tensor
+    edges: Tensor
+    edge_weights: Tensor
+    unit: float
+    binding: Binding
+    clock: Tensor | None = None
+    offsets: Tensor | None = None
+    rates: Tensor | None = None
+    blend: str = warping.LINEAR
+
+    def __post_init__(self) -> None:
+        m = self.knots.shape[1]
+        expected = {
+            "knots": (self.path.count, m, 3),
+            "knot_quats": (self.path.count, m, 4),
+            "edges": (m, self.edges.shape[-1]),
+            "edge_weights": (m, self.edges.shape[-1]),
+        }
+        for name, shape in expected.items():
+            found = tuple(getattr(self, name).shape)
+            if found != shape:
+                raise ValueError(f"{name}: expected shape {shape} for {m} nodes on {self.path}; found {found}.")
+        if self.blend not in warping.BLENDS:
+            raise ValueError(f"blend: expected one of {warping.BLENDS}; found {self.blend!r}.")
+        if self.clock is not None and (self.offsets is None or self.rates is None):
+            raise ValueError("offsets, rates: expected those of the videos whose clocks the nodes live on; found none.")
+
+    def __len__(self) -> int:
+        """Number of nodes."""
+        return self.knots.shape[1]
+
+    @property
+    def rest_positions(self) -> Tensor:
+        """Frozen positions of the nodes at the R rests [R,M,3]."""
+        return self.binding.positions
+
+    @property
+    def rest_quats(self) -> Tensor:
+        """Frozen orientations of the nodes at the R rests [R,M,4]."""
+        return self.binding.quats
+
+    def parameters(self) -> dict[str, Tensor]:
+        return {"knots": self.knots, "knot_quats": self.knot_quats}
+
+    def with_parameters(self, parameters: Mapping[str, Tensor]) -> Scaffold:
+        return replace(self, knots=parameters["knots"], knot_quats=parameters["knot_quats"])
+
+    def own_times(self, t: Tensor | float, clocks: Tensor | None = None) -> Tensor:
+        """World second `t` on the clock of every video whose nodes these are: float64 [V], or [1] for world time."""
+        t = torch.as_tensor(t, dtype=torch.float64, device=self.knots.device)
+        if self.clock is None:
+            return t[None]
+        assert self.offsets is not None and self.rates is not None
+        if clocks is None:
+            clocks = self.offsets
+        elif clocks.shape != self.offsets.shape:
+            raise ValueError(
+                f"clocks: expected one offset in seconds per video, {tuple(self.offsets.shape)}; "
+                f"found {tuple(clocks.shape)}."
+            )
+        return (t - clocks.to(torch.float64)) / self.rates
+
+    def nodes(self, t: Tensor | float, clocks: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Positions [M,3] and unit quaternions [M,4] of the nodes at world second `t`; differentiable in everything."""
+        times = self.own_times(t, clocks)
+        if self.clock is None:
+            return self.path.at(self.knots, times[0]), unit(self.path.at(self.knot_quats, times[0]))
+        first, w = self.path.weights(times)
+        w = w.to(self.knots.dtype)[self.clock]  # [M,4]
+        window = torch.as_tensor(first)[self.clock] + torch.arange(WINDOW, device=w.device)[:, None]  # [4,M]
+        every = torch.arange(len(self), device=w.device)
+        positions, quats = (
+            torch.einsum("ma,amx->mx", w, knots[window, every]) for knots in (self.knots, self.knot_quats)
+        )
+        return positions, unit(quats)
+
+    def warp(
+        self, means: Tensor, quats: Tensor, t: Tensor | float, clocks: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Means [N,3] and quats [N,4] of the bound Gaussians at world second `t`; see :func:`recon.motion.warp.blend`.
+
+        clocks float64 [V]: offsets of the videos, for a scaffold per video; ignored by one in world time.
+        """
+        if len(means) != len(self.binding):
+            raise ValueError(f"means: expected the {len(self.binding)} Gaussians bound here; found {len(means)}.")
+        positions, node_quats = self.nodes(t, clocks)
+        return warping.blend(self.binding, positions, node_quats, means, quats, self.blend)
+
+    def bind(
+        self, points: Tensor | np.ndarray, t_rest: float, clocks: Tensor | None = None, *, video: int | None = None
+    ) -> Scaffold:
+        """This scaffold with n more Gaussians, which stand at `points` [n,3] at world second `t_rest`.
+
+        Each is carried by the node nearest to it then, and by that node's seven nearest topological neighbours, with
+        weights exp(-d²/2 unit²) of the distances then. `video`: only nodes on that video's clock, as in the paper's
+        scaffold per video, where a video's Gaussians are seeded into its own.
+        """
+        with torch.no_grad():
+            positions, quats = self.nodes(t_rest, clocks)
+            nodes, weights = self.skin(points, positions, video=video)
+        return replace(self, binding=self.binding.append(nodes, weights, float(t_rest), positions, quats))
+
+    def skin(
+        self, points: Tensor | np.ndarray, positions: Tensor, *, video: int | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Nodes [n,8] and weights [n,8] that carry `points` [n,3] among nodes at `positions` [M,3]."""
+        from scipy.spatial import cKDTree
+
+        place = positions.detach().cpu().numpy().astype(float)
+        where = torch.as_tensor(points).detach().cpu().numpy().astype(float).reshape(-1, 3)
+        if not np.isfinite(where).all():
+            raise ValueError("points: expected finite positions; found nan or infinity. Leave those points out.")
+        among = np.arange(len(self))
+        if video is not None and self.clock is not None:
+            among = np.flatnonzero(self.clock.cpu().numpy() == video)
+            if not len(among):
+                raise ValueError(f"video: expected one that has nodes here; found {video}. It had no usable tracks.")
+        nearest = among[cKDTree(place[among]).query(where)[1]]
+        edges, ties = self.edges.cpu().numpy(), self.edge_weights.cpu().numpy()
+        k = min(NODES - 1, edges.shape[1])
+        nodes = np.tile(nearest[:, None], (1, NODES))  # unused slots: the nearest node, of weight zero
+        nodes[:, 1 : 1 + k] = edges[nearest, :k]
+        open_slot = np.zeros((len(nodes), NODES), bool)
+        open_slot[:, 0] = True
+        open_slot[:, 1 : 1 + k] = ties[nearest, :k] > 0
+        distance2 = ((place[nodes] - where[:, None]) ** 2).sum(-1)
+        # measured from the nearest, as if all were that much closer: far away the exponentials would all vanish
+        excess = distance2 - np.where(open_slot, distance2, np.inf).min(1, keepdims=True)
+        weights = (np.exp(-np.maximum(excess, 0) / (2 * self.unit**2)) + LEAST_WEIGHT) * open_slot
+        weights /= weights.sum(1, keepdims=True)
+        return torch.as_tensor(nodes, device=self.knots.device), torch.as_tensor(weights).to(self.knots)
+
+    def take(self, index: Tensor | np.ndarray) -> Scaffold:
+        """The same nodes with the Gaussians at `index`: for pruning and duplication."""
+        return replace(self, binding=self.binding.take(index))
+
+    def on(self, path: Path) -> Scaffold:
+        """The same motion on another path, sampled at its knots: on :class:`Sampled`, the "w/o spline" ablation."""
+        with torch.no_grad():
+            times = torch.as_tensor(path.times, device=self.knots.device)
+            return replace(
+                self, path=path, knots=self.path.at(self.knots, times), knot_quats=self.path.at(self.knot_quats, times)
+            )
+
+    def to(self, device: torch.device | str) -> Scaffold:
+        """The same scaffold on another device."""
+        moved = {k: v.to(device) for k, v in vars(self).items() if isinstance(v, Tensor)}
+        parts = {k: v.to(device) for k, v in vars(self.binding).items() if isinstance(v, Tensor)}
+        return replace(self, binding=Binding(**parts), **moved)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Everything, as plain arrays: what a checkpoint holds."""
+        parts: dict[str, Any] = {k: v for k, v in vars(self).items() if isinstance(v, Tensor)}
+        parts |= {f"binding_{k}": v for k, v in vars(self.binding).items() if isinstance(v, Tensor)}
+        arrays = {k: v.detach().cpu().numpy() for k, v in parts.items()}
+        named = {"kind": np.array("scaffold"), "blend": np.array(self.blend), "unit": np.array(self.unit)}
+        return named | path_arrays(self.path) | arrays
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> Scaffold:
+        """What :meth:`arrays` gave. ValueError where something is missing or does not fit."""
+        bound = ("rest", "nodes", "weights", "times", "positions", "quats")
+
+        def tensor(name: str) -> Tensor:
+            return torch.from_numpy(np.array(arrays[name]))
+
+        def perhaps(name: str) -> Tensor | None:
+            return tensor(name) if name in arrays else None
+
+        try:
+            return cls(
+                path_from_arrays(arrays),
+                *(tensor(name) for name in ("knots", "knot_quats", "edges", "edge_weights")),
+                unit=float(arrays["unit"]),
+                binding=Binding(*(tensor(f"binding_{name}") for name in bound)),
+                clock=perhaps("clock"),
+                offsets=perhaps("offsets"),
+                rates=perhaps("rates"),
+                blend=str(arrays["blend"]),
+            )
+        except (KeyError, TypeError) as error:
+            raise ValueError(f"arrays: expected those of a scaffold; found no sound {error}.") from None

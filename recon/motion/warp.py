@@ -1,0 +1,44 @@
+"""Carrying Gaussians with nodes: the definition in plain torch, and the choice of the fused kernels for it.
+
+Two phases. Every (rest, node) pair in use has one relative rigid motion, from the node's pose at the rest to its pose
+at t; every Gaussian blends those of its eight nodes. There are ten times fewer pairs than blended motions.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from recon.motion.binding import Binding
+from recon.motion.rotations import conjugate, product, unit
+from recon.raster.projection import rotation_matrices
+
+LINEAR, DUAL_QUATERNION = "linear", "dual-quaternion"
+BLENDS = (LINEAR, DUAL_QUATERNION)
+
+
+def blend(
+    binding: Binding, positions: Tensor, quats_of_nodes: Tensor, means: Tensor, quats: Tensor, how: str
+) -> tuple[Tensor, Tensor]:
+    """Gaussians' means [N,3] and quats [N,4] (any length, which is kept) carried by nodes to poses [M,3], [M,4] (unit).
+
+    linear (linear blend skinning): x = Σ_k w_k [R_k R_k,restᵀ (mean - p_k,rest) + p_k].
+    dual-quaternion (Kavan et al. 2007): the normalised sum of the relative motions as dual quaternions, which is rigid.
+    In both the orientation turns by the normalised Σ_k w_k q_k q_k,rest⁻¹, each with the sign that agrees with the
+    Gaussian's first (nearest) node: q and -q are one rotation.
+    """
+    rest, nodes, w = binding.rest[:, None], binding.nodes, binding.weights.to(means.dtype)
+    p_rest, q_rest = binding.positions.to(means.dtype)[rest, nodes], binding.quats.to(means.dtype)[rest, nodes]
+    turn = product(quats_of_nodes[nodes], conjugate(q_rest))  # [N,8,4]
+    agrees = (turn * turn[:, :1]).sum(-1, keepdim=True).detach() >= 0
+    signed = torch.where(agrees, turn, -turn)
+    whole = (w[..., None] * signed).sum(1)
+    mean_turn = unit(whole)
+    if how == LINEAR:
+        moved = (rotation_matrices(turn) @ (means[:, None] - p_rest)[..., None])[..., 0] + positions[nodes]
+        return (w[..., None] * moved).sum(1), product(mean_turn, quats)
+    shift = positions[nodes] - (rotation_matrices(turn) @ p_rest[..., None])[..., 0]
+    dual = (w[..., None] * product(torch.nn.functional.pad(shift, (1, 0)), signed)).sum(1)  # twice the dual part
+    translation = product(dual, conjugate(whole))[:, 1:] / (whole * whole).sum(-1, keepdim=True)
+    x = (rotation_matrices(mean_turn) @ means[..., None])[..., 0] + translation
+    return x, product(mean_turn, quats)
