@@ -181,6 +181,40 @@ def test_depth_is_relative_robust_and_asks_only_where_both_are_known():
     assert losses.Depth().needs == {"depth"}
 
 
+def test_the_free_scale_is_no_way_for_gradients():
+    """Else the one pixel at the median would carry the scale of all."""
+    given = torch.full((20, 30), 4.0, dtype=torch.float64)
+    ratios = torch.linspace(0.9, 1.3, 600, dtype=torch.float64).reshape(20, 30)
+    depth = (given * ratios)[..., None].requires_grad_()
+    losses.Depth(scale="median")(seen(alpha=torch.ones(20, 30, 1), depth=depth, given_depth=given)).backward()
+    s = ratios.median()
+    e = ratios / s - 1
+    expected = e / 0.05 / (1 + (e / 0.05) ** 2).sqrt() / (s * given) / 600
+    torch.testing.assert_close(depth.grad[..., 0], expected)
+
+
+def test_gradients_are_those_of_finite_differences():
+    g = torch.Generator().manual_seed(0)
+
+    def numbers(*shape):
+        return torch.rand(*shape, generator=g, dtype=torch.float64)
+
+    sightings = losses.Sightings(torch.tensor([[0, 1], [2, 2]]), numbers(2, 3), 20 * numbers(2, 2))
+    still = seen(
+        alpha=0.6 + 0.3 * numbers(3, 4, 1), mask=0.55 * torch.ones(3, 4, dtype=torch.float64), given_depth=1 + numbers(3, 4),
+        given_features=numbers(3, 4, 2), view=(K.double(), W2C.double()), tracks=sightings, footprint=0.1,
+    )  # fmt: skip
+    for loss, name, shape in (
+        (losses.Mask(), "alpha", (3, 4, 1)),
+        (losses.Depth(), "depth", (3, 4, 1)),
+        (losses.Track(), "means", (3, 3)),
+        (losses.Feature(), "features", (3, 4, 2)),
+        (losses.ScaleHinge(), "scales", (5, 3)),
+    ):
+        value = (0.6 + numbers(*shape)).requires_grad_()
+        assert torch.autograd.gradcheck(lambda x, loss=loss, name=name: loss(replace(still, **{name: x})), value), loss
+
+
 def test_robust_is_squared_near_and_absolute_far():
     e = torch.tensor([1e-3, 1e3], dtype=torch.float64)
     torch.testing.assert_close(
@@ -269,3 +303,13 @@ def test_images_of_other_shapes_are_refused(shapes):
     x, y, usable = (None if s is None else torch.zeros(s) for s in shapes)
     with pytest.raises(ValueError, match="x, y, usable"):
         photometric(x, y, usable, 0.2, SMALL)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_on_cuda_the_twin_says_the_same():
+    x, y = images((50, 70, 3))
+    usable = torch.rand(50, 70)
+    here, there = (t.clone().requires_grad_() for t in (x, x.cuda()))
+    losses.Photometric()(seen(rendered=here, image=y, usable=usable)).backward()
+    losses.Photometric()(seen(rendered=there, image=y.cuda(), usable=usable.cuda())).backward()
+    torch.testing.assert_close(there.grad.cpu(), here.grad, rtol=0, atol=1e-4 * float(here.grad.abs().max()))
