@@ -231,3 +231,49 @@ def lifted_tracks(
     if not out:
         raise ValueError("depth: expected depth where things move; no track could be lifted. Check the depth or masks.")
     return tuple(out)
+
+
+def read_footage(
+    scene: Scene, width: int, cache: Any, map: MapLike, progress: Progress
+) -> tuple[Footage, ...]:
+    """Frames, masks and backgrounds of every video at working size."""
+    from otsync.recordings import Stages
+
+    tracking = Stages().tracking
+    measured = [v.name for v, m in zip(scene.videos, scene.masks, strict=True) if m is None]
+    if measured:
+        progress.note(f"no masks given for {', '.join(measured)}: what differs from the median over time counts as moving")
+
+    def one(item: tuple[Video, Any]) -> Footage:
+        video, given = item
+        return footage_of(video, tracking.masks(video, given, cache), width=width)
+
+    return tuple(map(one, list(zip(scene.videos, scene.masks, strict=True))))
+
+
+def world_footprint(tracks: Sequence[TrackSet], footage: Sequence[Footage]) -> float:
+    """World units that a working pixel covers at the median depth of what moves."""
+    focal = {f.name: float(f.K[0, 0]) for f in footage}
+    samples = []
+    for t in tracks:
+        if t.camera is None or t.name not in focal:
+            continue
+        z = t.camera.to_camera(t.positions())[..., 2]
+        samples.append(z[np.isfinite(z) & (z > 0)] / focal[t.name])
+    values = np.concatenate(samples) if samples else np.zeros(0)
+    if not len(values):
+        raise ValueError("tracks: expected tracks in space of the fitted videos, with their cameras; found none.")
+    return float(np.median(values))
+
+
+class SparseDepth(Sequence):
+    """Depth maps of some frames of a video; None for the others."""
+
+    def __init__(self, count: int, maps: dict[int, np.ndarray]):
+        self.count, self.maps = count, maps
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, k: Any) -> np.ndarray | None:
+        return self.maps.get(int(k))
