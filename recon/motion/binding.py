@@ -109,3 +109,9 @@ class Binding:
             slots=np.argsort(of_slot.reshape(-1), kind="stable").astype(np.int32),
             node_starts=np.searchsorted(node, np.arange(n_nodes + 1)).astype(np.int32),
         )
+
+    @cached_property
+    def pair_rests(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rest positions [Q,3] and quats [Q,4] of the layout's pairs: float32."""
+        at = self.layout.rest, self.layout.node
+        return tuple(np.ascontiguousarray(a.cpu().numpy()[at], np.float32) for a in (self.positions, self.quats))

@@ -16,7 +16,7 @@ from recon.motion.nodes import Grid
 from recon.motion.paths import HermiteSpline
 from recon.motion.rotations import continuous, quaternions
 from recon.motion.scaffold import Scaffold
-from recon.motion.solve import FRAME, Observations, Smoothness, neighbourhood_rotations, solve_curves
+from recon.motion.solve import FRAME, Observations, Priors, Smoothness, neighbourhood_rotations, solve_curves
 from recon.motion.warp import LINEAR
 
 logger = logging.getLogger("recon.motion")
@@ -220,17 +220,8 @@ class _Fit:
         near = distances < 6 * self.unit
         ties = np.exp(-(distances[near] ** 2) / (2 * (1.5 * self.unit) ** 2))
         edges = np.stack([np.nonzero(near)[0], neighbours[near]], 1)
-        return solve_curves(
-            self.path,
-            self.observed,
-            edges,
-            ties,
-            self.n,
-            grid=self.grid.times,
-            robust=self.robust,
-            rounds=rounds,
-            smooth=self.options.smooth,
-        )
+        priors = Priors.of(self.path, edges, ties, self.n, self.grid.times, self.options.smooth)
+        return solve_curves(self.path, self.observed, priors, robust=self.robust, rounds=rounds)
 
     def on_grid(self, curves: np.ndarray) -> np.ndarray:
         """Curves [P,M,3] at the frames at which tracks are compared: float32 [M,G,3] relative to the centre."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ import torch
 from torch import Tensor
 
 from recon.motion import warp as warping
+from recon.motion import warp_fused
 from recon.motion.binding import NODES, Binding
 from recon.motion.paths import WINDOW, Path, path_arrays, path_from_arrays
 from recon.motion.rotations import unit
@@ -124,8 +126,16 @@ class Scaffold:
         """
         if len(means) != len(self.binding):
             raise ValueError(f"means: expected the {len(self.binding)} Gaussians bound here; found {len(means)}.")
+        tensors = (means, quats, self.knots, self.knot_quats)
+        if all(x.dtype == torch.float32 and x.device.type == "cpu" for x in tensors):
+            return warp_fused.warp(means, quats, self.own_times(t, clocks), self.knots, self.knot_quats, self._rig)
         positions, node_quats = self.nodes(t, clocks)
         return warping.blend(self.binding, positions, node_quats, means, quats, self.blend)
+
+    @cached_property
+    def _rig(self) -> warp_fused.Rig:
+        clock = np.zeros(len(self), np.int32) if self.clock is None else self.clock.numpy().astype(np.int32)
+        return warp_fused.Rig(self.path, self.binding, clock, self.blend == warping.DUAL_QUATERNION)
 
     def bind(
         self, points: Tensor | np.ndarray, t_rest: float, clocks: Tensor | None = None, *, video: int | None = None
