@@ -82,6 +82,7 @@ class Run:
             found = synchronize_scene(
                 train, route=self.recording.route, reference=reference, cache=cache, map=pool.map, tell=tell,
             )  # fmt: skip
+        progress.seconds |= {f"synchronise: {stage}": s for stage, s in found.seconds.items()}
         print(table(found.offsets))
         found.offsets.save(self.out / "offsets_coarse.json")
         write_json(self.out / "sync.json", {"route": found.route, "why": list(found.why), "seconds": found.seconds})
@@ -93,7 +94,6 @@ class Run:
         try:
             return reconstructed(
                 scene, found.offsets, self.out, options, tracks=lifted, truth=self.truth, progress=progress,
-                before=dict(found.seconds),
             )  # fmt: skip
         except Diverged as error:
             print(f"otsync: {error}", file=sys.stderr)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from otsync.io import Scene
     from otsync.types import Offsets
     from recon.held_out import ViewScore
-    from recon.pipeline import Outcome, Plan
+    from recon.pipeline import Outcome, Plan, Progress
     from recon.result import Result
 
 
@@ -192,7 +192,8 @@ class Eval:
     def run(self) -> int:
         from otsync.files import write_json
         from otsync.types import Offsets
-        from recon.pipeline import evaluate
+        from otsync.priors.cache import Cache
+        from recon.pipeline import Progress, evaluate, offset_figures, true_seconds
         from recon.result import load_result, metrics_of
 
         result = load_result(self.result)
@@ -201,14 +202,15 @@ class Eval:
         names = self.held_out or tuple(v.name for v in result.videos if v.held_out)
         if not names:
             raise ValueError("--held-out: expected names of videos; none was held out of this fit.")
-        views, reason = evaluate(
-            result, scene, names, given, most=self.views, lpips_weights=self.lpips_weights,
-            stages=self.result / "stages", tell=tell,
-        )  # fmt: skip
+        with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+            views, reason = evaluate(
+                result, scene, names, given, most=self.views, lpips_weights=self.lpips_weights,
+                cache=Cache(self.result / "stages"), map=pool.map, progress=Progress(tell),
+            )  # fmt: skip
         print(view_table(views, reason))
         document = metrics_of(views, {}, reason)
         if self.truth is not None:
-            error = offset_errors(result.offsets, self.truth)
+            error = offset_figures(result.offsets, true_seconds(Offsets.load(self.truth), result.offsets))
             print(f"offset error: mean {error['mean_frames']:.3f}, max {error['max_frames']:.3f} frames")
             document["offset_error"] = error
         out = self.out or self.result / "eval.json"
@@ -321,18 +323,19 @@ def opened(path: Path, allow_outside: bool) -> Scene:
 
 def reconstructed(
     scene: Scene, offsets: Offsets, out: Path, options: FitOptions, *, tracks: Any = None, truth: Path | None = None,
-    seconds: dict[str, float] | None = None,
+    progress: Progress | None = None,
 ) -> int:  # fmt: skip
     """Prepare, fit, evaluate, write, and print what came out; the exit code."""
     from otsync.priors.cache import Cache
     from otsync.types import Offsets
-    from recon.pipeline import reconstruct
+    from recon.pipeline import Progress, reconstruct
 
     known = None if truth is None else Offsets.load(truth)
     with ThreadPoolExecutor(options.workers or os.cpu_count() or 1) as pool:
         outcome = reconstruct(
             scene, offsets, out, plan=options.plan(), tracks=tracks, held_out=options.held_out, truth=known,
-            cache=Cache(options.cache or out / "stages"), map=pool.map, tell=tell, seconds=seconds, **options.length(),
+            cache=Cache(options.cache or out / "stages"), map=pool.map, progress=progress or Progress(tell),
+            **options.length(),
         )  # fmt: skip
     print(offset_table(outcome))
     print(view_table(outcome.views, outcome.lpips_reason))
@@ -373,16 +376,6 @@ def view_table(views: tuple[ViewScore, ...], lpips_reason: str = "") -> str:
         cells = "".join(f" {v.mean[k]:10.{d}f}" if np.isfinite(v.mean[k]) else f" {'–':>10}" for k, d in keys)
         lines.append(f"{v.name:{width}}  {'held out' if v.held_out else 'training':9}{cells}  {v.clock.how}")
     return "\n".join(lines + ([f"LPIPS is left out: {lpips_reason}"] if lpips_reason else []))
-
-
-def offset_errors(offsets: Offsets, truth: Path) -> dict[str, Any]:
-    """Mean and largest absolute error in frames, relative to the reference."""
-    from otsync.cli import true_offsets
-    from recon.evaluate import offset_error
-
-    step = 1.0 / float(offsets.fps[offsets.reference])
-    error = offset_error(offsets.seconds, true_offsets(truth, offsets.names), step, reference=offsets.reference)
-    return {"mean_frames": error.mean, "max_frames": error.max, "frames": [float(e) for e in error.errors]}
 
 
 def rendered(

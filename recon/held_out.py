@@ -25,7 +25,8 @@ from recon.lpips import Lpips
 from recon.raster import render
 from recon.stage import colours
 
-How = Literal["given", "refined", "scanned", "fitted"]
+How = Literal["given", "found", "fitted"]
+"""Told from outside, found on the frozen scene, or fitted together with the scene."""
 
 BRIGHTEST = 4.0
 """Gains beyond this or below its inverse are no gains: the static part does not match the camera's view."""
@@ -70,18 +71,24 @@ class ViewScore:
     stats: dict[str, float] = field(default_factory=dict)
 
 
-def view(scene: Gaussians4D, footage: Footage, clock: Clock | None = None, *, find: bool | None = None) -> View:
+def view(
+    scene: Gaussians4D,
+    footage: Footage,
+    clock: Clock | None = None,
+    *,
+    gain: Float[np.ndarray, " 3"] | None = None,
+) -> View:
     """A camera on the scene's clock.
 
     Args:
-        clock: what is known of its clock; None: nothing, all of the scene's span is searched.
-        find: refine the clock on the frozen scene; default: only when it is not known.
+        clock: of the camera; None: not known, all of the scene's span is searched.
+        gain: of the camera; None: found.
     """
-    looking = View(scene, footage, clock or Clock(0.0), np.ones(3), _static_views(scene, footage))
-    looking = looking.with_gain()
-    if clock is None:
-        return looking.scanned()
-    return looking.refined("refined") if find else looking
+    ones = np.ones(3)
+    looking = View(scene, footage, clock or Clock(0.0), ones if gain is None else gain, _static_views(scene, footage))
+    if gain is None:
+        looking = looking.with_gain()
+    return looking.scanned() if clock is None else looking
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,9 +176,9 @@ class View:
                 "cannot be found. Give its offset, or hold out another camera."
             )
         best = min(tried, key=lambda o: (tried[o], abs(o)))
-        return View(self.scene, f, Clock(best, self.clock.rate), self.gain, self.static).refined("scanned")
+        return View(self.scene, f, Clock(best, self.clock.rate), self.gain, self.static).refined()
 
-    def refined(self, how: How) -> View:
+    def refined(self) -> View:
         """With the offset within a frame of the present one at which the motion fits best."""
         frames, step, start = _spread(self.usable(), FINE_FRAMES), self.scene.frame_step, self.clock.seconds
         if len(frames) < 2:
@@ -181,7 +188,7 @@ class View:
                 lambda x: self.disagreement(start + x * step, frames), bounds=(-1.0, 1.0), method="bounded",
                 options={"xatol": TOLERANCE},
             )  # fmt: skip
-        return View(self.scene, self.footage, Clock(start + float(found.x) * step, self.clock.rate, how), self.gain, self.static)
+        return View(self.scene, self.footage, Clock(start + float(found.x) * step, self.clock.rate, "found"), self.gain, self.static)
 
     def score(self, *, most: int = 50, pictures: int = 3, lpips: Lpips | None = None, held_out: bool = True) -> ViewScore:
         """Compare up to ``most`` frames, spread over the clip; ``pictures`` of them are kept."""

@@ -26,9 +26,9 @@ from otsync.files import write_json
 from otsync.io import Scene
 from otsync.io.mend import cut, keep_frames, unreadable
 from otsync.types import Offsets, TrackSet, Video
-from recon.backdrop import Backdrop
 from recon.density import Densify
 from recon.effects import Effect, Gain
+from recon.evaluate import offset_error
 from recon.fit import LOSSES, Loss, Reconstruction, fit
 from recon.footage import Footage, footage_of, working_depth
 from recon.gaussians4d import Gaussians4D, scene_arrays, scene_from_arrays
@@ -36,7 +36,7 @@ from recon.held_out import Clock, ViewScore, view
 from recon.lpips import Lpips
 from recon.motion import ScaffoldOptions, build_scaffold
 from recon.optimize import RATES, without
-from recon.result import FilmedBy, metrics_of, save_run
+from recon.result import FilmedBy, Result, metrics_of, save_run
 
 log = logging.getLogger("recon")
 
@@ -78,7 +78,7 @@ class Prepared:
         clocks: of the held-out videos, where the given offsets tell.
         offsets: of the training videos alone.
         initial: scene before any refinement. gains: (V,3) factors from its colours to each video's.
-        notes: what was lacking, in words.
+        frame: name of the world frame. left_out: videos that have no offset.
     """
 
     footage: tuple[Footage, ...]
@@ -89,7 +89,7 @@ class Prepared:
     initial: Gaussians4D
     gains: np.ndarray
     frame: str
-    notes: tuple[str, ...] = ()
+    left_out: tuple[str, ...] = ()
 
 
 class Progress:
@@ -277,3 +277,260 @@ class SparseDepth(Sequence):
 
     def __getitem__(self, k: Any) -> np.ndarray | None:
         return self.maps.get(int(k))
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What :func:`reconstruct` came to.
+
+    Args:
+        found: the fit. coarse: the offsets it began with, of the same videos. truth: (V,) seconds, where known.
+        views: how well every camera that was compared is shown. left_out: videos without an offset.
+    """
+
+    found: Reconstruction
+    coarse: Offsets
+    views: tuple[ViewScore, ...]
+    left_out: tuple[str, ...] = ()
+    truth: np.ndarray | None = None
+    lpips_reason: str = ""
+
+
+def reconstruct(
+    scene: Scene,
+    offsets: Offsets,
+    out: Path,
+    *,
+    plan: Plan | None = None,
+    tracks: Sequence[TrackSet] | None = None,
+    held_out: Sequence[str] = (),
+    truth: Offsets | None = None,
+    steps: int | None = None,
+    budget: float | None = None,
+    cache: Any = None,
+    map: MapLike = map,
+    progress: Progress | None = None,
+) -> Outcome:
+    """Prepare, fit, evaluate and write the result folder (see :mod:`recon.result`).
+
+    A run that was killed continues from its stages and from ``fit.npz``; given ``steps``, it ends with the same files.
+
+    Args:
+        tracks: in space, of training videos; default: tracked and lifted here.
+        truth: true offsets of at least the training videos. steps, budget: see :func:`recon.fit.fit`.
+    """
+    from otsync.priors.cache import Cache
+
+    plan, progress, cache = plan or Plan(), progress or Progress(), cache or Cache(out / "stages")
+    out.mkdir(parents=True, exist_ok=True)
+    ready = prepare(scene, offsets, tracks, plan=plan, held_out=held_out, cache=cache, map=map, progress=progress)
+    true = None if truth is None else true_seconds(truth, ready.offsets)
+    effects = (Gain(start=ready.gains), *plan.effects)
+    rates = without(RATES, *plan.freeze)
+    with progress.stage("fit"):
+        found = fit(
+            ready.initial, ready.footage, ready.offsets, losses=plan.losses, effects=effects, rates=rates, steps=steps,
+            budget=budget, batch=plan.batch, densify=plan.densify, seed=plan.seed, checkpoint=out / "fit.npz",
+        )  # fmt: skip
+    with progress.stage("views"):
+        held = [view(found.scene, f, ready.clocks.get(f.name)) for f in ready.held_out]
+        gains = found.parameters["gain"].detach().cpu().numpy().astype(float)
+        scores = [v.score(most=plan.views) for v in held]
+        for n in _some(len(ready.footage), SHOWN_TRAINING):
+            clock = Clock(float(found.offsets.seconds[n]), float(found.offsets.rates[n]), "fitted")
+            scores.append(
+                view(found.scene, ready.footage[n], clock, gain=gains[n]).score(most=plan.views // 4, held_out=False)
+            )
+    fitted = [
+        FilmedBy.of(f, Clock(float(found.offsets.seconds[n]), float(found.offsets.rates[n]), "fitted"), gains[n])
+        for n, f in enumerate(ready.footage)
+    ]
+    others = [FilmedBy.of(v.footage, v.clock, v.gain, held_out=True) for v in held]
+    outcome = Outcome(found, ready.offsets, tuple(scores), ready.left_out, true, Lpips().reason)
+    _write(out, outcome, [*fitted, *others], ready, plan, progress)
+    return outcome
+
+
+SHOWN_TRAINING = 2
+"""Training cameras that are compared as well, to show what the held-out ones lack."""
+
+
+def _some(count: int, most: int) -> list[int]:
+    return sorted({int(i) for i in np.linspace(0, count - 1, min(count, most)).round()})
+
+
+def _write(
+    out: Path, outcome: Outcome, videos: Sequence[FilmedBy], ready: Prepared, plan: Plan, progress: Progress
+) -> None:
+    """The result folder; run.json last but for the report, since with it the folder counts as finished."""
+    from recon.report import write_reconstruction_report
+
+    found = outcome.found
+    found.scene.save(out / "scene.npz")
+    found.offsets.save(out / "offsets.json")
+    metrics = metrics_of(outcome.views, found.stats, outcome.lpips_reason)
+    if outcome.truth is not None:
+        metrics["offset_error"] = offset_figures(found.offsets, outcome.truth)
+    write_json(out / "metrics.json", metrics)
+    options = {"width": plan.width, "frames": plan.frames, "seed": plan.seed, "freeze": list(plan.freeze)}
+    save_run(
+        out, videos, options=options, frame=ready.frame, notes=progress.notes, seconds=progress.seconds,
+    )  # fmt: skip
+    write_reconstruction_report(
+        out / "report.html", found, outcome.coarse, [f.name for f in ready.footage], outcome.views,
+        seconds=progress.seconds, notes=progress.notes, truth=outcome.truth, lpips_reason=outcome.lpips_reason,
+    )  # fmt: skip
+
+
+def offset_figures(offsets: Offsets, true: np.ndarray) -> dict[str, Any]:
+    """Mean and largest absolute error in frames, relative to the reference."""
+    step = 1.0 / float(offsets.fps[offsets.reference])
+    error = offset_error(offsets.seconds, true, step, reference=offsets.reference)
+    return {"mean_frames": error.mean, "max_frames": error.max, "frames": [float(e) for e in error.errors]}
+
+
+def true_seconds(truth: Offsets, offsets: Offsets) -> np.ndarray:
+    """True offsets of the videos relative to their reference. ValueError names those that the truth lacks."""
+    missing = [n for n in offsets.names if n not in truth.names]
+    if missing:
+        raise ValueError(f"truth: expected offsets of {', '.join(offsets.names)}; {', '.join(missing)} are not in it.")
+    seconds = np.array([truth.seconds[truth.names.index(n)] for n in offsets.names])
+    return seconds - seconds[offsets.reference]
+
+
+def evaluate(
+    result: Result,
+    scene: Scene,
+    names: Sequence[str],
+    offsets: Offsets | None = None,
+    *,
+    most: int = 50,
+    lpips_weights: Path | None = None,
+    cache: Any = None,
+    map: MapLike = map,
+    progress: Progress | None = None,
+) -> tuple[tuple[ViewScore, ...], str]:
+    """Scores of the named cameras against a finished result, and why LPIPS is missing ("" when it is not).
+
+    Clocks: of training cameras as fitted; of others as ``offsets`` say, else found on the frozen scene.
+    """
+    from otsync.priors.cache import Cache
+
+    progress, cache = progress or Progress(), cache or Cache()
+    lpips = Lpips.load(lpips_weights)
+    part = scene.take(names)
+    frames = result.options.get("frames")
+    if frames is not None:
+        part = cut(part, int(frames[0]), int(frames[1]))
+    part = readable(part, cache, map, progress)
+    trained = {v.name: v for v in result.videos if not v.held_out}
+    scores = []
+    for footage in read_footage(part, int(result.options["width"]), cache, map, progress):
+        if footage.name in trained:
+            own = trained[footage.name]
+            looking = view(result.scene, footage, own.clock, gain=own.gain)
+        else:
+            clock = None
+            if offsets is not None and footage.name in offsets.names:
+                v = offsets.names.index(footage.name)
+                if np.isfinite(offsets.seconds[v]):
+                    clock = Clock(float(offsets.seconds[v]), float(offsets.rates[v]))
+            looking = view(result.scene, footage, clock)
+        scores.append(looking.score(most=most, lpips=lpips, held_out=footage.name not in trained))
+    return tuple(scores), lpips.reason
+
+
+def prepare(
+    scene: Scene,
+    offsets: Offsets,
+    tracks: Sequence[TrackSet] | None = None,
+    *,
+    plan: Plan | None = None,
+    held_out: Sequence[str] = (),
+    cache: Any = None,
+    map: MapLike = map,
+    progress: Progress | None = None,
+) -> Prepared:
+    """Everything that a fit begins with.
+
+    Args:
+        offsets: of the recording's videos. tracks: in space, of training videos; default: tracked and lifted here.
+        held_out: names of videos that nothing here sees but their own footage.
+        cache: an :class:`otsync.priors.cache.Cache`. map: any map-like callable; two threads use two cores.
+    """
+    from otsync.priors.cache import Cache
+
+    plan, progress, cache = plan or Plan(), progress or Progress(), cache or Cache()
+    if plan.frames is not None:
+        scene = cut(scene, *plan.frames)
+    with progress.stage("reading"):
+        scene = readable(scene, cache, map, progress)
+        train, others, offsets, clocks = split(scene, offsets, held_out, progress)
+    if tracks is None:
+        with progress.stage("tracks"):
+            tracks = lifted_tracks(train, offsets, cache, map, progress)
+    with progress.stage("footage"):
+        footage = read_footage(train, plan.width, cache, map, progress)
+        held = () if others is None else read_footage(others, plan.width, cache, map, progress)
+    if not any((f.boxes[:, 2] > f.boxes[:, 0]).any() for f in footage):
+        raise ValueError("scene: expected something that moves; the masks are empty in every frame of every video.")
+    with progress.stage("initial scene"):
+        initial, gains = initial_scene(train, offsets, tuple(tracks), footage, plan, cache, map, progress)
+    left_out = tuple(n for n in scene.names if n not in train.names and n not in held_out)
+    return Prepared(
+        footage, held, clocks, offsets, tuple(tracks), initial, gains, scene.frame, left_out
+    )  # fmt: skip
+
+
+def initial_scene(
+    scene: Scene, offsets: Offsets, tracks: tuple[TrackSet, ...], footage: tuple[Footage, ...], plan: Plan, cache: Any,
+    map: MapLike, progress: Progress,
+) -> tuple[Gaussians4D, np.ndarray]:  # fmt: skip
+    """The scene before any refinement, and the gains (V,3) of the backdrop; kept as one stage."""
+    from otsync import keep
+    from otsync.recordings import Stages
+
+    tracking = Stages().tracking
+    content = [tracking.key(v, m) for v, m in zip(scene.videos, scene.masks, strict=True)]
+    depth = [getattr(v.depth, "digest", lambda: None)() for v in scene.videos]
+    clocks = (np.round(offsets.seconds, 6).tolist(), np.round(offsets.rates, 9).tolist(), offsets.reference)
+    key = (*content, *depth, clocks, [keep.digest(t) for t in tracks], plan.width, plan.scaffold, plan.seed)
+
+    def build() -> dict[str, np.ndarray]:
+        built, gains = _built(scene, offsets, tracks, footage, plan, cache, map, progress)
+        return {"gains": gains, **scene_arrays(built)}
+
+    arrays = cache.arrays("initial", key, build)
+    return scene_from_arrays(arrays), arrays["gains"]
+
+
+def _built(
+    scene: Scene, offsets: Offsets, tracks: tuple[TrackSet, ...], footage: tuple[Footage, ...], plan: Plan, cache: Any,
+    map: MapLike, progress: Progress,
+) -> tuple[Gaussians4D, np.ndarray]:  # fmt: skip
+    from otsync.depth_maps import depth_maps
+    from recon.backdrop import fit_backdrop
+    from recon.seed import moments, seed
+
+    footprint = world_footprint(tracks, footage)
+    frame_step = 1.0 / float(offsets.fps[offsets.reference])
+    at = [offsets.names.index(t.name) for t in tracks]
+    motion = build_scaffold(
+        tracks, offsets.seconds[at], footprint=footprint, frame_step=frame_step, options=plan.scaffold,
+        rates=offsets.rates[at], seed=plan.seed,
+    )  # fmt: skip
+    progress.tell(f"scaffold: {len(motion)} nodes, footprint {footprint:.4g}")
+    worlds = [offsets.rates[v] * f.times + offsets.seconds[v] for v, f in enumerate(footage)]
+    span = (float(min(t[0] for t in worlds)), float(max(t[-1] for t in worlds)))
+    points = np.concatenate([t.positions()[t.seen][:: max(1, int(t.seen.sum()) // 2000)] for t in tracks])
+    backdrop = fit_backdrop(footage, points)
+    times = moments(span, frame_step)
+    wanted = [sorted({int(np.argmin(np.abs(w - t))) for t in times}) for w in worlds]
+    maps = depth_maps(scene, offsets, wanted, width=plan.width, cache=cache, map=map)
+    depth = [
+        working_depth(v, SparseDepth(len(v.frames), dict(zip(k, m, strict=True))), width=plan.width)
+        for v, k, m in zip(scene.videos, wanted, maps, strict=True)
+    ]
+    scene4d = seed(motion, footage, offsets, depth, footprint=footprint, frame_step=frame_step, span=span, times=times)
+    progress.tell(f"seeded {len(scene4d)} Gaussians")
+    return replace(scene4d, static=backdrop.gaussians, near=backdrop.near), backdrop.gains

@@ -25,12 +25,7 @@ SHOWN_VIEWS = 2
 PICTURE = 240
 """Width of a picture, pixels: nine of them are about 60 kB."""
 
-HOW = {
-    "given": "as given",
-    "refined": "refined on the frozen scene",
-    "scanned": "found on the frozen scene",
-    "fitted": "fitted with the scene",
-}
+HOW = {"given": "as given", "found": "found on the frozen scene", "fitted": "fitted with the scene"}
 
 
 def write_reconstruction_report(
