@@ -33,7 +33,7 @@ from recon.gaussians4d import Gaussians4D, scene_arrays, scene_from_arrays
 from recon.losses import ImageLoss, Mask, Photometric, ScaleHinge, Seen
 from recon.optimize import RATES, Adam, Decay, check_rates
 from recon.quiet import one_thread_each, uninterrupted
-from recon.regularizers import ARAP, Acceleration, Draw, Length, MotionLoss, Velocity
+from recon.regularizers import Acceleration, Arap, Draw, Length, MotionLoss, Velocity
 from recon.stage import Clip, compose_over, observer
 from recon.uncertainty import newton_sigma
 
@@ -41,7 +41,7 @@ logger = logging.getLogger("recon")
 
 Loss = ImageLoss | MotionLoss
 
-LOSSES: tuple[Loss, ...] = (Photometric(), Mask(), ScaleHinge(7e-4), ARAP(), Length(), Velocity(), Acceleration())
+LOSSES: tuple[Loss, ...] = (Photometric(), Mask(), ScaleHinge(7e-4), Arap(), Length(), Velocity(), Acceleration())
 """What the study of the paper's scene used; depth, tracks and features enter only at initialisation unless added."""
 
 RECORDS = 200  # rows of history in a fit
@@ -407,8 +407,8 @@ class Run:
         rng = np.random.default_rng([p.seed, 2, self.step])
         draw = Draw(rng, scene.span, scene.frame_step, scene.footprint, values["offsets"])
         parts = [
-            loss.every * loss.weight * loss(scene.motion, scene.dynamic.means, scene.dynamic.quats, draw)
-            for loss in p.motion_losses if self.step % loss.every == 0
+            loss.weight * value for loss in p.motion_losses if self.step % loss.every == 0
+            if (value := loss(scene.motion, scene.dynamic.means, scene.dynamic.quats, draw)) is not None
         ]  # fmt: skip
         total = sum(parts, torch.zeros(()))
         wanted = [values[n] for n in names]
