@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,13 +21,10 @@ from recon.export import Format
 from recon.motion import ScaffoldOptions
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from otsync.io import Scene
     from otsync.types import Offsets
     from recon.held_out import ViewScore
     from recon.pipeline import Outcome, Plan, Progress
-    from recon.result import Result
 
 
 @dataclass(frozen=True)
@@ -52,6 +49,8 @@ class FitOptions:
     densify: Densify | None = None
     """Split what is pulled hardest, drop what is faint; off unless asked for."""
     scaffold: ScaffoldOptions = field(default_factory=ScaffoldOptions)
+    save_every: float = 60.0
+    """Seconds between two savings of the fit, from the last of which a killed run continues."""
     allow_outside: bool = False
     """Let the scene name files outside its folder."""
     cache: Path | None = None
@@ -65,7 +64,7 @@ class FitOptions:
 
         return Plan(
             width=self.width, frames=self.frames, scaffold=self.scaffold, densify=self.densify, freeze=self.freeze,
-            batch=self.batch, seed=self.seed,
+            batch=self.batch, seed=self.seed, save_every=self.save_every,
         )  # fmt: skip
 
     def length(self) -> dict[str, Any]:
@@ -142,6 +141,7 @@ class Render:
     def run(self) -> int:
         from recon.export import check_times, frame_times
         from recon.result import load_result
+        from recon.showing import rendered, stretched
         from recon.video import check_target, write_images
 
         if (self.camera is None) == (self.path is None):
@@ -153,10 +153,10 @@ class Render:
         fps = self.fps or 1.0 / result.scene.frame_step
         times = list(self.times) or frame_times(result.scene, fps).tolist()
         if self.frames is not None:
-            times = times * self.frames if len(times) == 1 else _stretched(result, self.frames)
+            times = times * self.frames if len(self.times) == 1 else stretched(result.scene.span, self.frames)
         check_times(result.scene, times)
-        images = progress(rendered(result, times, self.camera, self.turns, self.width), len(times), "rendering", "image")
-        count = write_images(images, self.out, fps)
+        images = rendered(result, times, self.camera, turns=self.turns, width=self.width)
+        count = write_images(progress(images, len(times), "rendering", "image"), self.out, fps)
         print(f"wrote {count} images to {self.out}")
         return 0
 
@@ -378,41 +378,7 @@ def view_table(views: tuple[ViewScore, ...], lpips_reason: str = "") -> str:
     return "\n".join(lines + ([f"LPIPS is left out: {lpips_reason}"] if lpips_reason else []))
 
 
-def rendered(
-    result: Result, times: list[float], camera: str | None, turns: float, width: int | None
-) -> Iterator[np.ndarray]:
-    """uint8 images of the scene: from a named camera, or from a path around what moves."""
-    import numpy as np
-    import torch
-
-    from recon.orbit import orbit
-    from recon.pipeline import at_width
-
-    if camera is not None:
-        video = result.video(camera)
-        lens, gain = at_width(video.camera, width), video.gain
-        w2c = lens.w2c
-        poses = [w2c if w2c.ndim == 2 else w2c[video.nearest(t)] for t in times]
-    else:
-        lens, gain = at_width(result.videos[0].camera, width), np.ones(3)
-        with torch.no_grad():
-            middle = result.scene.moving(times[len(times) // 2]).means.median(0).values.double().numpy()
-        poses = list(orbit([v.camera for v in result.videos], middle, len(times), turns=turns))
-    for t, pose in zip(times, poses, strict=True):
-        with torch.no_grad():
-            from dataclasses import replace
-
-            image = result.scene.render(replace(lens, w2c=pose), t, depth=None).colors[0]
-        yield (image.numpy() * gain * 255).clip(0, 255).round().astype(np.uint8)
-
-
-def _stretched(result: Result, frames: int) -> list[float]:
-    import numpy as np
-
-    return np.linspace(*result.scene.span, frames).tolist()
-
-
-def progress(items: Iterator[Any], total: int, what: str, unit: str) -> Iterator[Any]:
+def progress(items: Iterable[Any], total: int, what: str, unit: str) -> Iterator[Any]:
     """A bar on a terminal."""
     from tqdm import tqdm
 

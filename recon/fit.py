@@ -105,6 +105,7 @@ def fit(
     densify: Densify | None = None,
     seed: int = 0,
     checkpoint: str | PathLike[str] | None = None,
+    save_every: float = 60.0,
 ) -> Reconstruction:
     """Refine a 4D scene, and the clocks of the videos, from their images.
 
@@ -115,8 +116,8 @@ def fit(
         steps, budget: how long: a number of steps, or wall seconds, which are turned into a number of steps once the
             first ones have shown their speed. Default: 2000 steps.
         batch: images per step, each on its own thread. The result does not depend on the number of threads.
-        checkpoint: file that the fit is kept in, every minute and on Ctrl-C; a fit that was killed continues from it
-            and ends with the same numbers.
+        checkpoint: file that the fit is kept in, every ``save_every`` seconds and on Ctrl-C; a fit that was killed
+            continues from it and ends with the same numbers.
 
     Raises:
         ValueError: for footage, offsets or rates that do not fit together.
@@ -125,7 +126,7 @@ def fit(
     problem = Problem.of(scene, footage, offsets, tuple(losses), tuple(effects), batch, seed)
     total = _steps(steps, budget)
     options = (losses, effects, sorted(rates.items()), steps, budget, batch, densify, seed)
-    keep = Checkpoint(checkpoint, problem.key(*options) if checkpoint is not None else "")
+    keep = Checkpoint(checkpoint, problem.key(*options) if checkpoint is not None else "", save_every)
     run = Run(problem, dict(rates), keep.load(), total)
     due = densify.steps(total) if densify is not None and total else frozenset()
     started, last = time.perf_counter(), time.perf_counter()

@@ -137,21 +137,32 @@ class View:
             yield drawn, f.images[k] / 255.0, (still & (drawn.max(-1) > 0)).astype(float)
 
     def disagreement(self, seconds: float, frames: np.ndarray) -> float:
-        """Squared difference where things move, as a share of that of the scene without what moves; below 1 is good."""
+        """Squared difference where things move, as a share of what it is without what moves; below 1 is good.
+
+        What moves is drawn over the camera's own background where it has one: the search is for a clock, not for a
+        score, and shall not depend on how good the static part is.
+        """
         with_motion, without = 0.0, 0.0
         gain = torch.as_tensor(self.gain, dtype=torch.float32)
         for k in frames:
             x0, y0, x1, y1 = (int(x) for x in self.footage.boxes[k])
             filmed = torch.as_tensor(self.footage.images[k, y0:y1, x0:x1]).float() / 255
-            behind = torch.zeros_like(filmed)
-            if self.static is not None:
-                behind = self.static[k if len(self.static) > 1 else 0][y0:y1, x0:x1] * gain
+            behind = self._behind(int(k))[y0:y1, x0:x1]
             moving = self.scene.moving(self.world(int(k), seconds))
             rgb, alpha = _draw(moving, self.footage, int(k), 0.01 * self.scene.near, (x0, y0, x1, y1))
             drawn = rgb * gain + (1 - alpha) * behind
             with_motion += float((drawn - filmed).square().sum())
             without += float((behind - filmed).square().sum())
         return with_motion / max(without, 1e-9)
+
+    def _behind(self, frame: int) -> Tensor:
+        f = self.footage
+        if f.background is not None:
+            return torch.as_tensor(f.background).float() / 255
+        if self.static is None:
+            return torch.zeros(f.images.shape[1:])
+        gain = torch.as_tensor(self.gain, dtype=torch.float32)
+        return self.static[frame if len(self.static) > 1 else 0] * gain
 
     def usable(self, seconds: float | None = None) -> np.ndarray:
         """Frames that something moves in and whose world time the scene knows."""

@@ -54,7 +54,7 @@ class Plan:
             by themselves.
         freeze: parameter groups that the fit holds, "offsets" for instance.
         batch: images a step, each on a thread of its own.
-        views: frames of every camera that are compared at the end.
+        views: frames of every camera that are compared at the end. save_every: seconds between savings of the fit.
     """
 
     width: int = 320
@@ -67,6 +67,7 @@ class Plan:
     batch: int = 2
     seed: int = 0
     views: int = 50
+    save_every: float = 60.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,9 +152,7 @@ def split(
     missing = [n for n in held_out if n not in scene.names]
     if missing:
         raise ValueError(f"held_out: expected some of {', '.join(scene.names)}; found {', '.join(missing)}.")
-    reference = offsets.names[offsets.reference]
-    known = {n for v, n in enumerate(offsets.names)
-             if np.isfinite(offsets.seconds[v]) and offsets.component[v] == offsets.reference}  # fmt: skip
+    reference, known = offsets.names[offsets.reference], given_clocks(offsets)
     train = [n for n in scene.names if n in known and n not in held_out]
     if reference not in train:
         raise ValueError(
@@ -164,11 +163,17 @@ def split(
         if name not in train and name not in held_out:
             why = "has no offset on the common clock" if name in offsets.names else "is not in the offsets"
             progress.note(f"video {name} is left out: it {why}")
-    clocks = {
-        n: Clock(float(offsets.seconds[v]), float(offsets.rates[v]))
-        for v, n in enumerate(offsets.names) if n in held_out and n in known
-    }  # fmt: skip
+    clocks = {n: clock for n, clock in known.items() if n in held_out}
     return scene.take(train), scene.take(held_out) if held_out else None, only(offsets, train), clocks
+
+
+def given_clocks(offsets: Offsets) -> dict[str, Clock]:
+    """The clocks of the videos that have an offset on the reference's."""
+    return {
+        name: Clock(float(offsets.seconds[v]), float(offsets.rates[v]))
+        for v, name in enumerate(offsets.names)
+        if np.isfinite(offsets.seconds[v]) and offsets.component[v] == offsets.reference
+    }
 
 
 def only(offsets: Offsets, names: Sequence[str]) -> Offsets:
@@ -331,6 +336,7 @@ def reconstruct(
         found = fit(
             ready.initial, ready.footage, ready.offsets, losses=plan.losses, effects=effects, rates=rates, steps=steps,
             budget=budget, batch=plan.batch, densify=plan.densify, seed=plan.seed, checkpoint=out / "fit.npz",
+            save_every=plan.save_every,
         )  # fmt: skip
     with progress.stage("views"):
         held = [view(found.scene, f, ready.clocks.get(f.name)) for f in ready.held_out]
@@ -412,7 +418,7 @@ def evaluate(
 ) -> tuple[tuple[ViewScore, ...], str]:
     """Scores of the named cameras against a finished result, and why LPIPS is missing ("" when it is not).
 
-    Clocks: of training cameras as fitted; of others as ``offsets`` say, else found on the frozen scene.
+    Clocks: as ``offsets`` say, else those of the result, else found on the frozen scene.
     """
     from otsync.priors.cache import Cache
 
@@ -423,20 +429,15 @@ def evaluate(
     if frames is not None:
         part = cut(part, int(frames[0]), int(frames[1]))
     part = readable(part, cache, map, progress)
-    trained = {v.name: v for v in result.videos if not v.held_out}
+    known = {v.name: v for v in result.videos}
     scores = []
     for footage in read_footage(part, int(result.options["width"]), cache, map, progress):
-        if footage.name in trained:
-            own = trained[footage.name]
-            looking = view(result.scene, footage, own.clock, gain=own.gain)
-        else:
-            clock = None
-            if offsets is not None and footage.name in offsets.names:
-                v = offsets.names.index(footage.name)
-                if np.isfinite(offsets.seconds[v]):
-                    clock = Clock(float(offsets.seconds[v]), float(offsets.rates[v]))
-            looking = view(result.scene, footage, clock)
-        scores.append(looking.score(most=most, lpips=lpips, held_out=footage.name not in trained))
+        own = known.get(footage.name)
+        clock, gain = (None, None) if own is None else (own.clock, own.gain)
+        if offsets is not None and (own is None or own.held_out):
+            clock = given_clocks(offsets).get(footage.name, clock)
+        looking = view(result.scene, footage, clock, gain=gain)
+        scores.append(looking.score(most=most, lpips=lpips, held_out=own is None or own.held_out))
     return tuple(scores), lpips.reason
 
 

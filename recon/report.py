@@ -57,7 +57,7 @@ def write_reconstruction_report(
         _offset_rows(found, coarse, truth),
         "<p class=s>In frames of the reference. Before: what the fit began with. Moved: after the common shift of all "
         "videos, which images cannot tell, is taken out. t<sub>world</sub> = rate · t<sub>video</sub> + offset.</p>",
-        "<h2>Convergence</h2>",
+        f"<h2>Convergence</h2><p class=s>{_pace(found)}</p>",
         convergence(found, coarse, videos, truth),
         "<h2>Views</h2>",
         _view_rows(views, lpips_reason),
@@ -117,10 +117,17 @@ def convergence(
             left.legend(fontsize=5, ncols=2)
         known = np.isfinite(history.psnr)
         right.plot(history.step[known], history.psnr[known], color=CHOSEN, lw=1)
-        right.set(xlabel="step", ylabel="PSNR of what moves, training, dB")
-        clock = right.secondary_xaxis("top", functions=_steps_to_seconds(history))
-        clock.set_xlabel("seconds")
+        right.set(xlabel="step", ylabel="PSNR of training boxes, dB")
     return svg(figure, "offsets and PSNR over the fit")
+
+
+def _pace(found: Reconstruction) -> str:
+    steps, seconds = found.stats.get("steps", 0.0), found.stats.get("seconds", np.nan)
+    done = found.history.step[0] if len(found.history.step) else 0
+    text = f"{steps:.0f} steps"
+    if steps and np.isfinite(seconds) and done <= steps:
+        text += f", {seconds:.1f} s in the last session"
+    return text + ". Left: relative to the reference. Right: mean over the images since the last point."
 
 
 def offset_curves(
@@ -138,21 +145,6 @@ def offset_curves(
     return [(name, moved[:, v], v == reference) for v, name in enumerate(videos)]
 
 
-def _steps_to_seconds(history: History):
-    """Forward and inverse maps for a second axis; both grow, as a twin axis needs."""
-    steps = np.concatenate([[0.0], history.step.astype(float)])
-    clock = np.maximum.accumulate(np.concatenate([[0.0], history.seconds])) + 1e-9 * np.arange(len(steps))
-    slope = max(clock[-1], 1e-6) / max(steps[-1], 1.0)
-
-    def forward(x):
-        return np.where(x > steps[-1], clock[-1] + (x - steps[-1]) * slope, np.interp(x, steps, clock)) + np.minimum(x, 0)
-
-    def inverse(s):
-        return np.where(s > clock[-1], steps[-1] + (s - clock[-1]) / slope, np.interp(s, clock, steps)) + np.minimum(s, 0)
-
-    return forward, inverse
-
-
 def _view_rows(views: Sequence[ViewScore], lpips_reason: str) -> str:
     if not views:
         return "<p class=s>No view was compared.</p>"
@@ -163,7 +155,7 @@ def _view_rows(views: Sequence[ViewScore], lpips_reason: str) -> str:
         cells = "".join(f"<td>{number(v.mean.get(key, np.nan), digits)}" for key, (_, digits) in names.items())
         gain = " ".join(f"{g:.3f}" for g in v.gain)
         role = "held out" if v.held_out else "training"
-        rows.append(f"<tr><td>{escape(v.name)}<td class=t>{role}{cells}<td>{len(v.frames)}<td>{gain}<td class=t>{HOW[v.clock.how]}")
+        rows.append(f"<tr><td>{escape(v.name)}<td class=t>{role}{cells}<td>{len(v.frames)}<td style='white-space:nowrap'>{gain}<td class=t>{HOW[v.clock.how]}")
     head = "".join(f"<th>{title}" for title, _ in names.values())
     missing = f" LPIPS: {escape(lpips_reason)}." if lpips_reason else ""
     return (

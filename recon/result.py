@@ -33,20 +33,26 @@ class FilmedBy:
 
     Args:
         camera: at working size, without distortion. gain: factors of R, G, B from the scene's colours to its images.
-        clock: its place in world time. times: first and last second on its own clock.
+        clock: its place in world time. times: (T,) seconds of its frames on its own clock.
     """
 
     name: str
     camera: Camera
     clock: Clock
     gain: np.ndarray
-    times: tuple[float, float]
+    times: np.ndarray
     held_out: bool = False
 
     @classmethod
     def of(cls, footage: Footage, clock: Clock, gain: np.ndarray, held_out: bool = False) -> FilmedBy:
-        times = (float(footage.times[0]), float(footage.times[-1]))
-        return cls(footage.name, footage.camera, clock, gain, times, held_out)
+        return cls(footage.name, footage.camera, clock, gain, footage.times, held_out)
+
+    def pose(self, t: float) -> np.ndarray:
+        """w2c (4,4) at world second ``t``: of the nearest frame where the camera moves."""
+        if self.camera.w2c.ndim == 2:
+            return self.camera.w2c
+        world = self.clock.rate * self.times + self.clock.seconds
+        return self.camera.w2c[int(np.argmin(np.abs(world - t)))]
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +84,7 @@ def save_run(
         camera = {"K": c.K.tolist(), "w2c": c.w2c.tolist(), "width": c.width, "height": c.height, "readout": c.readout}
         clock = {"offset_seconds": v.clock.seconds, "rate": v.clock.rate, "known": v.clock.how}
         rows.append({"name": v.name, "held_out": v.held_out, "camera": camera, "clock": clock,
-                     "gain": [float(g) for g in v.gain], "times": list(v.times)})  # fmt: skip
+                     "gain": [float(g) for g in v.gain], "times": v.times.tolist()})  # fmt: skip
     document = {
         "format": FORMAT, "version": VERSION, "frame": frame, "options": dict(options), "videos": rows,
         "notes": list(notes), "seconds": {k: round(float(s), 2) for k, s in seconds.items()},
@@ -143,5 +149,7 @@ def _filmed_by(row: dict[str, Any]) -> FilmedBy:
     gain = np.array(row["gain"], float)
     if gain.shape != (3,) or not np.isfinite(gain).all():
         raise ValueError(f"gain: expected three numbers; found {row['gain']!r}")
-    first, last = (float(x) for x in row["times"])
-    return FilmedBy(str(row["name"]), camera, clock, gain, (first, last), bool(row["held_out"]))
+    times = np.array(row["times"], float)
+    if times.ndim != 1 or not len(times) or (camera.w2c.ndim == 3 and len(times) != len(camera.w2c)):
+        raise ValueError(f"times: expected one second per frame; found shape {times.shape}")
+    return FilmedBy(str(row["name"]), camera, clock, gain, times, bool(row["held_out"]))
