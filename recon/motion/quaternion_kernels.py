@@ -47,7 +47,12 @@ def unit(q):
 def unit_backward(q, n, g):
     """Gradient of the quaternion whose unit is q, n being one over its length, from that of the unit."""
     radial = dot4(g, q)  # the normalisation forgets the length
-    return (g[0] - radial * q[0]) * n, (g[1] - radial * q[1]) * n, (g[2] - radial * q[2]) * n, (g[3] - radial * q[3]) * n
+    return (
+        (g[0] - radial * q[0]) * n,
+        (g[1] - radial * q[1]) * n,
+        (g[2] - radial * q[2]) * n,
+        (g[3] - radial * q[3]) * n,
+    )
 
 
 @inline

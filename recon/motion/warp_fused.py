@@ -28,13 +28,19 @@ class Rig:
     dual: bool
 
 
-def warp(means: Tensor, quats: Tensor, times: Tensor, knots: Tensor, knot_quats: Tensor, rig: Rig) -> tuple[Tensor, Tensor]:
+def warp(
+    means: Tensor, quats: Tensor, times: Tensor, knots: Tensor, knot_quats: Tensor, rig: Rig
+) -> tuple[Tensor, Tensor]:
     """As :func:`recon.motion.warp.blend` after the nodes' poses at own times float64 [V]; differentiable in all five."""
     return _Warp.apply(means, quats, times, knots, knot_quats, rig)
 
 
 def _array(t: Tensor) -> np.ndarray:
     return t.detach().contiguous().numpy()
+
+
+def _flat(t: Tensor) -> np.ndarray:
+    return _array(t).reshape(-1)
 
 
 def _parts(n: int, least: int) -> list[tuple[int, int]]:
@@ -47,18 +53,18 @@ class _Warp(torch.autograd.Function):
     def forward(ctx, means, quats, times, knots, knot_quats, rig):
         n, layout, bound = len(means), rig.binding.layout, rig.binding
         first, weights, slopes = rig.path.basis(times.detach().numpy())
-        curves = (_array(knots), _array(knot_quats), rig.clock, first, weights)
+        curves = (_array(knots), _array(knot_quats), rig.clock)
         pairs = (*bound.pair_rests, layout.node_starts)
-        rows = np.empty((len(layout.node), kernels.ROW), np.float32)
-        for_each(kernels.relative, _parts(knots.shape[1], 64), curves, pairs, rig.dual, rows)
+        rows = np.zeros(len(layout.node) * kernels.ROW, np.float32)
+        for_each(kernels.relative, _parts(knots.shape[1], 64), curves, (first, weights), pairs, rig.dual, rows)
         slots = (layout.of_slot, _array(bound.weights))
-        signed, total = np.empty((n, NODES), np.float32), np.empty((n, kernels.ROW), np.float32)
-        moved = np.empty((n, 3), np.float32), np.empty((n, 4), np.float32)
-        gaussians = _array(means), _array(quats)
+        signed, total = np.empty((n, NODES), np.float32), np.empty(n * kernels.ROW, np.float32)
+        moved = np.empty(3 * n, np.float32), np.empty(4 * n, np.float32)
+        gaussians = _flat(means), _flat(quats)
         for_each(kernels.carry, _parts(n, 1024), slots, rows, rig.dual, *gaussians, signed, total, *moved)
         ctx.save_for_backward(means, quats, knots, knot_quats)
         ctx.rig, ctx.basis, ctx.kept = rig, (first, weights, slopes), (signed, total)
-        return torch.from_numpy(moved[0]), torch.from_numpy(moved[1])
+        return torch.from_numpy(moved[0]).view(n, 3), torch.from_numpy(moved[1]).view(n, 4)
 
     @staticmethod
     @once_differentiable
@@ -66,18 +72,29 @@ class _Warp(torch.autograd.Function):
         means, quats, knots, knot_quats = (_array(t) for t in ctx.saved_tensors)
         (first, weights, slopes), (signed, total), rig = ctx.basis, ctx.kept, ctx.rig
         n, m, layout, bound, dual = len(means), knots.shape[1], rig.binding.layout, rig.binding, rig.dual
-        outgoing = np.empty((n, 3), np.float32), np.empty((n, 4), np.float32)
-        g_total = np.empty((n, kernels.ROW), np.float32)
-        incoming = (_array(g_means), _array(g_quats))
-        for_each(kernels.lift, _parts(n, 1024), total, dual, means, quats, incoming, outgoing, g_total)
-        g_rows = np.empty((len(layout.node), kernels.ROW), np.float32)
+        outgoing = np.empty(3 * n, np.float32), np.empty(4 * n, np.float32)
+        g_total = np.zeros(n * kernels.ROW, np.float32)
+        incoming = (_flat(g_means), _flat(g_quats))
+        for_each(
+            kernels.lift,
+            _parts(n, 1024),
+            total,
+            dual,
+            means.reshape(-1),
+            quats.reshape(-1),
+            incoming,
+            outgoing,
+            g_total,
+        )
+        g_rows = np.empty(len(layout.node) * kernels.ROW, np.float32)
         using = (layout.starts, layout.slots, _array(bound.weights), signed)
-        for_each(kernels.gather, _parts(len(g_rows), 256), *using, dual, g_total, g_rows)
+        for_each(kernels.gather, _parts(len(layout.node), 256), *using, dual, g_total, g_rows)
         g_knots, g_knot_quats = np.zeros_like(knots), np.zeros_like(knot_quats)
         g_times = np.empty(m)
-        curves = (knots, knot_quats, rig.clock, first, weights)
+        curves = (knots, knot_quats, rig.clock)
         pairs = (*bound.pair_rests, layout.node_starts)
         outputs = (g_knots, g_knot_quats, g_times)
-        for_each(kernels.lower, _parts(m, 64), curves, slopes, pairs, dual, g_rows, *outputs)
+        for_each(kernels.lower, _parts(m, 64), curves, (first, weights), slopes, pairs, dual, g_rows, *outputs)
         g_own = np.bincount(rig.clock, g_times, minlength=len(first))
-        return *(torch.from_numpy(a) for a in (*outgoing, g_own, g_knots, g_knot_quats)), None
+        gaussians = (torch.from_numpy(a).view(n, -1) for a in outgoing)
+        return *gaussians, *(torch.from_numpy(a) for a in (g_own, g_knots, g_knot_quats)), None

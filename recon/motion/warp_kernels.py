@@ -9,18 +9,18 @@ backward: lift      Gaussian by Gaussian: gradients of mean and orientation, and
 Every output has one owner, who sums in a fixed order: results do not depend on the threads.
 
 A row is, for linear blending, the rotation's nine entries, the shift and the quaternion (wxyz): 16 floats. For dual
-quaternions it is the quaternion and twice the dual part: 8 floats, in 16 as well. The last LANES-independent part is
-written with plain loops over a row, which LLVM turns into vector instructions.
+quaternions it is the quaternion and twice the dual part: 8 floats, in a row of 16 as well. Rows, means and quats are
+flat; a row is read as one vector, or as a head and a tail where vectors are shorter.
 
-Arguments that belong together travel as tuples: curves = (knots [P,M,3], knot_quats [P,M,4], clock [M], first [V],
-weights [V,4]), pairs = (rest positions [Q,3], rest quats [Q,4], node_starts [M+1]), slots = (pair of each slot [N,8],
-weights [N,8]).
+Arguments that belong together travel as tuples: curves and moment as in :mod:`recon.motion.pose_kernels`, pairs = (rest
+positions [Q,3], rest quats [Q,4], node_starts [M+1]), slots = (pair of each slot [N,8], weights [N,8]).
 """
 
 from __future__ import annotations
 
 import numpy as np
 
+from recon.motion.pose_kernels import along_time, lower_orientation, lower_position, orientation, position
 from recon.motion.quaternion_kernels import (
     conjugate,
     dot4,
@@ -33,53 +33,42 @@ from recon.motion.quaternion_kernels import (
     unit,
     unit_backward,
 )
+from recon.raster.cpu import simd
+from recon.raster.cpu.simd import LANES
 from recon.raster.cpu.threads import kernel
 
 F32, F64 = np.float32, np.float64
 ROW = 16
 SHIFT, QUAT = 9, 12  # where they begin in a row of linear blending
 REAL, DUAL = 0, 4  # and in one of dual quaternions
-WINDOW = 4
+TAIL = ROW - LANES  # where the last vector of a row begins: 0 where one vector holds it all
 
 _kernel = kernel(fastmath={"contract", "reassoc", "nsz"})
 
 
 @_kernel
-def _four(array, i, at):
-    return array[i, at], array[i, at + 1], array[i, at + 2], array[i, at + 3]
+def _four(flat, i):
+    return flat[i], flat[i + 1], flat[i + 2], flat[i + 3]
 
 
 @_kernel
-def _three(array, i, at):
-    return array[i, at], array[i, at + 1], array[i, at + 2]
+def _three(flat, i):
+    return flat[i], flat[i + 1], flat[i + 2]
 
 
 @_kernel
-def _nine(array, i):
+def _nine(flat, i):
     return (
-        array[i, 0], array[i, 1], array[i, 2],
-        array[i, 3], array[i, 4], array[i, 5],
-        array[i, 6], array[i, 7], array[i, 8],
-    )  # fmt: skip
-
-
-@_kernel
-def _pose(curves, m):
-    """Position, and orientation before normalisation, of node m."""
-    knots, quats, clock, first, weights = curves
-    v = clock[m]
-    px, py, pz = 0.0, 0.0, 0.0
-    a, b, c, d = 0.0, 0.0, 0.0, 0.0
-    for k in range(WINDOW):
-        p, w = first[v] + k, weights[v, k]
-        px += w * knots[p, m, 0]
-        py += w * knots[p, m, 1]
-        pz += w * knots[p, m, 2]
-        a += w * quats[p, m, 0]
-        b += w * quats[p, m, 1]
-        c += w * quats[p, m, 2]
-        d += w * quats[p, m, 3]
-    return (px, py, pz), (a, b, c, d)
+        flat[i],
+        flat[i + 1],
+        flat[i + 2],
+        flat[i + 3],
+        flat[i + 4],
+        flat[i + 5],
+        flat[i + 6],
+        flat[i + 7],
+        flat[i + 8],
+    )
 
 
 @_kernel
@@ -89,18 +78,18 @@ def _rest(pairs, j):
 
 
 @_kernel
-def _put(row, i, at, values):
+def _put(flat, i, values):
     for k, value in enumerate(values):
-        row[i, at + k] = value
+        flat[i + k] = value
 
 
 @_kernel
-def relative(begin, end, curves, pairs, dual, rows):
+def relative(begin, end, curves, moment, pairs, dual, rows):
     """Rows [Q,16] of the pairs of nodes begin..end."""
     node_starts = pairs[2]
     for m in range(begin, end):
-        p, raw = _pose(curves, m)
-        q, _ = unit(raw)
+        p = position(curves, moment, m)
+        q, _ = orientation(curves, moment, m)
         for j in range(node_starts[m], node_starts[m + 1]):
             p_rest, q_rest = _rest(pairs, j)
             turn = product(q, conjugate(q_rest))
@@ -108,36 +97,49 @@ def relative(begin, end, curves, pairs, dual, rows):
             moved = turned(R, p_rest)
             shift = p[0] - moved[0], p[1] - moved[1], p[2] - moved[2]
             if dual:
-                _put(rows, j, REAL, turn)
-                _put(rows, j, DUAL, product((0.0, shift[0], shift[1], shift[2]), turn))
+                _put(rows, j * ROW + REAL, turn)
+                _put(rows, j * ROW + DUAL, product((0.0, shift[0], shift[1], shift[2]), turn))
             else:
-                _put(rows, j, 0, R)
-                _put(rows, j, SHIFT, shift)
-                _put(rows, j, QUAT, turn)
+                _put(rows, j * ROW, R)
+                _put(rows, j * ROW + SHIFT, shift)
+                _put(rows, j * ROW + QUAT, turn)
 
 
 @_kernel
-def _sum_rows(n, slots, rows, at, length, width, signed, total):
+def _sum_rows(n, slots, rows, at, dual, signed, total):
     """Row n of `total`: the weighted sum of the rows of its slots, `at` saying where in them the quaternion begins.
 
-    signed [N,8]: the weights with the signs that bring the quaternions into the first one's hemisphere. The first
-    `length` entries are summed with the weights, the others up to `width` with the signed ones.
+    signed [N,8]: the weights with the signs that bring the quaternions into the first one's hemisphere. Dual
+    quaternions are summed with these; of other rows only the quaternion is.
     """
     of_slot, weights = slots
-    nearest = of_slot[n, 0]
-    for c in range(width):
-        total[n, c] = 0
+    nearest = _four(rows, of_slot[n, 0] * ROW + at)
+    crossed = False
+    head = tail = simd.spread(F32(0))
     for k in range(8):
-        j, w = of_slot[n, k], weights[n, k]
-        agree = F32(0)
-        for c in range(at, at + 4):
-            agree += rows[j, c] * rows[nearest, c]
-        s = w if agree >= 0 else -w
+        begin, w = of_slot[n, k] * ROW, weights[n, k]
+        s = w if dot4(nearest, _four(rows, begin + at)) >= 0 else -w
         signed[n, k] = s
-        for c in range(length):
-            total[n, c] += w * rows[j, c]
-        for c in range(length, width):
-            total[n, c] += s * rows[j, c]
+        if dual:
+            head = head + s * simd.load(rows, begin)
+        else:
+            head = head + w * simd.load(rows, begin)
+            tail = tail + w * simd.load(rows, begin + TAIL)
+            crossed |= s < 0
+    if not dual:
+        simd.store(total, n * ROW + TAIL, tail)
+    simd.store(total, n * ROW, head)
+    if crossed:
+        for k in range(8):
+            if signed[n, k] < 0:  # seldom: two neighbours turned apart by half a turn since the rest
+                _add_twice(total, n, signed[n, k], rows, of_slot[n, k])
+
+
+@_kernel
+def _add_twice(total, i, w, rows, j):
+    """To the quaternion of row i twice w times that of row j: what was added with the wrong sign becomes right."""
+    for c in range(QUAT, ROW):
+        total[i * ROW + c] += 2 * w * rows[j * ROW + c]
 
 
 @_kernel
@@ -152,18 +154,18 @@ def _dual_motion(b, e):
 def carry(begin, end, slots, rows, dual, means, quats, signed, total, moved_means, moved_quats):
     """Means [N,3] and quats [N,4] of Gaussians begin..end; keeps their summed rows and signed weights for backward."""
     for n in range(begin, end):
-        mean = _three(means, n, 0)
+        mean = _three(means, 3 * n)
         if dual:
-            _sum_rows(n, slots, rows, REAL, 0, 8, signed, total)
-            u, _, shift = _dual_motion(_four(total, n, REAL), _four(total, n, DUAL))
+            _sum_rows(n, slots, rows, REAL, dual, signed, total)
+            u, _, shift = _dual_motion(_four(total, n * ROW + REAL), _four(total, n * ROW + DUAL))
             x = turned(rotation(u), mean)
         else:
-            _sum_rows(n, slots, rows, QUAT, QUAT, ROW, signed, total)
-            u, _ = unit(_four(total, n, QUAT))
-            x, shift = turned(_nine(total, n), mean), _three(total, n, SHIFT)
+            _sum_rows(n, slots, rows, QUAT, dual, signed, total)
+            u, _ = unit(_four(total, n * ROW + QUAT))
+            x, shift = turned(_nine(total, n * ROW), mean), _three(total, n * ROW + SHIFT)
         for c in range(3):
-            moved_means[n, c] = x[c] + shift[c]
-        _put(moved_quats, n, 0, product(u, _four(quats, n, 0)))
+            moved_means[3 * n + c] = x[c] + shift[c]
+        _put(moved_quats, 4 * n, product(u, _four(quats, 4 * n)))
 
 
 @_kernel
@@ -173,11 +175,11 @@ def lift(begin, end, total, dual, means, quats, incoming, outgoing, g_total):
     incoming = gradients of the moved means [N,3] and quats [N,4]; outgoing = of the means and quats.
     """
     for n in range(begin, end):
-        mean, quat = _three(means, n, 0), _four(quats, n, 0)
-        g_x, g_q = _three(incoming[0], n, 0), _four(incoming[1], n, 0)
+        mean, quat = _three(means, 3 * n), _four(quats, 4 * n)
+        g_x, g_q = _three(incoming[0], 3 * n), _four(incoming[1], 4 * n)
         g_u = product(g_q, conjugate(quat))
         if dual:
-            b, e = _four(total, n, REAL), _four(total, n, DUAL)
+            b, e = _four(total, n * ROW + REAL), _four(total, n * ROW + DUAL)
             u, length, shift = _dual_motion(b, e)
             R = rotation(u)
             turn = rotation_backward(u, outer(g_x, mean))
@@ -189,49 +191,57 @@ def lift(begin, end, total, dual, means, quats, incoming, outgoing, g_total):
             through = product(conjugate(g_c), e)
             radial = -2 * per * (shift[0] * g_x[0] + shift[1] * g_x[1] + shift[2] * g_x[2])
             for c in range(4):
-                g_total[n, REAL + c] = g_b[c] + through[c] + radial * b[c]
-            _put(g_total, n, DUAL, product(g_c, b))
+                g_total[n * ROW + REAL + c] = g_b[c] + through[c] + radial * b[c]
+            _put(g_total, n * ROW + DUAL, product(g_c, b))
         else:
-            u, length = unit(_four(total, n, QUAT))
-            R = _nine(total, n)
-            _put(g_total, n, 0, outer(g_x, mean))
-            _put(g_total, n, SHIFT, g_x)
-            _put(g_total, n, QUAT, unit_backward(u, length, g_u))
-        _put(outgoing[0], n, 0, turned_back(R, g_x))
-        _put(outgoing[1], n, 0, product(conjugate(u), g_q))
+            u, length = unit(_four(total, n * ROW + QUAT))
+            R = _nine(total, n * ROW)
+            _put(g_total, n * ROW, outer(g_x, mean))
+            _put(g_total, n * ROW + SHIFT, g_x)
+            _put(g_total, n * ROW + QUAT, unit_backward(u, length, g_u))
+        _put(outgoing[0], 3 * n, turned_back(R, g_x))
+        _put(outgoing[1], 4 * n, product(conjugate(u), g_q))
 
 
 @_kernel
 def gather(begin, end, starts, slot_list, weights, signed, dual, g_total, g_rows):
     """Gradients of rows begin..end of the pairs: over the slots of each, in order."""
     for j in range(begin, end):
-        for c in range(ROW):
-            g_rows[j, c] = 0
+        head = tail = simd.spread(F32(0))
+        crossed = False
         for i in range(starts[j], starts[j + 1]):
             slot = slot_list[i]
             n, k = slot >> 3, slot & 7
             w, s = weights[n, k], signed[n, k]
             if dual:
-                for c in range(8):
-                    g_rows[j, c] += s * g_total[n, c]
+                head = head + s * simd.load(g_total, n * ROW)
             else:
-                for c in range(QUAT):
-                    g_rows[j, c] += w * g_total[n, c]
-                for c in range(QUAT, ROW):
-                    g_rows[j, c] += s * g_total[n, c]
+                head = head + w * simd.load(g_total, n * ROW)
+                tail = tail + w * simd.load(g_total, n * ROW + TAIL)
+                crossed |= s < 0
+        if not dual:
+            simd.store(g_rows, j * ROW + TAIL, tail)
+        simd.store(g_rows, j * ROW, head)
+        if crossed:
+            for i in range(starts[j], starts[j + 1]):
+                n, k = slot_list[i] >> 3, slot_list[i] & 7
+                if signed[n, k] < 0:
+                    _add_twice(g_rows, j, signed[n, k], g_total, n)
 
 
 @_kernel
 def _row_backward(g_rows, j, dual, turn, shift):
     """Gradients of rotation, shift and quaternion of pair j, in float64, from that of its row."""
     if dual:
-        g_real, g_dual = _four(g_rows, j, REAL), _four(g_rows, j, DUAL)
+        g_real, g_dual = _four(g_rows, j * ROW + REAL), _four(g_rows, j * ROW + DUAL)
         # dual = (0, shift) turn
         g_shift = product((F64(g_dual[0]), F64(g_dual[1]), F64(g_dual[2]), F64(g_dual[3])), conjugate(turn))
-        through = product((0.0, -shift[0], -shift[1], -shift[2]), (F64(g_dual[0]), F64(g_dual[1]), F64(g_dual[2]), F64(g_dual[3])))
+        through = product(
+            (0.0, -shift[0], -shift[1], -shift[2]), (F64(g_dual[0]), F64(g_dual[1]), F64(g_dual[2]), F64(g_dual[3]))
+        )
         g_turn = g_real[0] + through[0], g_real[1] + through[1], g_real[2] + through[2], g_real[3] + through[3]
         return (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0), (g_shift[1], g_shift[2], g_shift[3]), g_turn
-    G, s, q = _nine(g_rows, j), _three(g_rows, j, SHIFT), _four(g_rows, j, QUAT)
+    G, s, q = _nine(g_rows, j * ROW), _three(g_rows, j * ROW + SHIFT), _four(g_rows, j * ROW + QUAT)
     return (
         (F64(G[0]), F64(G[1]), F64(G[2]), F64(G[3]), F64(G[4]), F64(G[5]), F64(G[6]), F64(G[7]), F64(G[8])),
         (F64(s[0]), F64(s[1]), F64(s[2])),
@@ -240,12 +250,11 @@ def _row_backward(g_rows, j, dual, turn, shift):
 
 
 @_kernel
-def lower(begin, end, curves, slopes, pairs, dual, g_rows, g_knots, g_knot_quats, g_times):
+def lower(begin, end, curves, moment, slopes, pairs, dual, g_rows, g_knots, g_knot_quats, g_times):
     """Gradients of knots, and of each node's own time [M], for nodes begin..end. slopes [V,4]: dw/dt."""
-    knots, quats, clock, first, weights = curves
     for m in range(begin, end):
-        p, raw = _pose(curves, m)
-        q, length = unit(raw)
+        p = position(curves, moment, m)
+        q, length = orientation(curves, moment, m)
         x0, x1, x2 = 0.0, 0.0, 0.0
         q0, q1, q2, q3 = 0.0, 0.0, 0.0, 0.0
         for j in range(pairs[2][m], pairs[2][m + 1]):
@@ -270,15 +279,7 @@ def lower(begin, end, curves, slopes, pairs, dual, g_rows, g_knots, g_knot_quats
             )
             x0, x1, x2 = x0 + g_shift[0], x1 + g_shift[1], x2 + g_shift[2]
             q0, q1, q2, q3 = q0 + g_q[0], q1 + g_q[1], q2 + g_q[2], q3 + g_q[3]
-        g_p, g_raw = (x0, x1, x2), unit_backward(q, length, (q0, q1, q2, q3))
-        v = clock[m]
-        g_time = 0.0
-        for k in range(WINDOW):
-            i, w = first[v] + k, weights[v, k]
-            along = g_p[0] * knots[i, m, 0] + g_p[1] * knots[i, m, 1] + g_p[2] * knots[i, m, 2]
-            g_time += slopes[v, k] * (along + dot4(g_raw, (quats[i, m, 0], quats[i, m, 1], quats[i, m, 2], quats[i, m, 3])))
-            for c in range(3):
-                g_knots[i, m, c] = w * g_p[c]
-            for c in range(4):
-                g_knot_quats[i, m, c] = w * g_raw[c]
-        g_times[m] = g_time
+        g_p = x0, x1, x2
+        lower_position(curves, moment, m, g_p, g_knots)
+        g_raw = lower_orientation(curves, moment, m, q, length, (q0, q1, q2, q3), g_knot_quats)
+        g_times[m] = along_time(curves, slopes, moment[0], m, g_p, g_raw)

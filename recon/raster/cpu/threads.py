@@ -5,6 +5,7 @@ Numba's own `parallel=True` is not used: its default layer aborts the process wh
 
 from __future__ import annotations
 
+import functools
 import logging
 import os
 import pathlib
@@ -121,14 +122,19 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
 
 _folder = pathlib.Path(__file__).parent
-_sources = tuple((p.name, p.stat().st_mtime_ns, p.stat().st_size) for p in sorted(_folder.glob("*.py")))
+
+
+@functools.cache
+def _stamps(folder: pathlib.Path) -> tuple[tuple[str, int, int], ...]:
+    return tuple((p.name, p.stat().st_mtime_ns, p.stat().st_size) for p in sorted(folder.glob("*.py")))
 
 
 def _tie_to_sources(dispatcher: Any) -> None:
-    """Make the cached code of one kernel stale when any file of this folder changes.
+    """Make the cached code of one kernel stale when any file of its folder, or of this one, changes.
 
     Numba compares the kernel's own file only, but kernels compile in the constants and functions of the others.
     """
     file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
     if file is not None and hasattr(file, "_source_stamp"):
-        file._source_stamp = (file._source_stamp, _sources)
+        own = pathlib.Path(dispatcher.py_func.__code__.co_filename).parent
+        file._source_stamp = (file._source_stamp, _stamps(_folder), _stamps(own))
