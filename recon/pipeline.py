@@ -499,7 +499,8 @@ def initial_scene(
 
     def build() -> dict[str, np.ndarray]:
         built, gains = _built(scene, offsets, tracks, footage, plan, cache, map, progress)
-        return {"gains": gains, **scene_arrays(built)}
+        # in the layout that a file gives back: sums over another one differ in their last bits
+        return {k: np.ascontiguousarray(v) for k, v in {"gains": gains, **scene_arrays(built)}.items()}
 
     arrays = cache.arrays("initial", key, build)
     return scene_from_arrays(arrays), arrays["gains"]

@@ -36,9 +36,11 @@ def keep_frames(scene: Scene, index: Sequence[Sequence[int]]) -> Scene:
         if camera.w2c.ndim == 3:
             camera = replace(camera, w2c=camera.w2c[at])
         depth = None if video.depth is None else _some(video.depth, picks)
-        videos.append(
-            replace(video, frames=_some(video.frames, picks), camera=camera, timestamps=video.times[at], depth=depth)
-        )
+        times = video.times[at]
+        # few frames that are left of many have another rate than the video: then their times alone tell it
+        thinned = video.fps is not None and len(at) > 1 and float(np.median(np.diff(times))) > 1.5 / video.fps
+        frames, fps = _some(video.frames, picks), None if thinned else video.fps
+        videos.append(replace(video, frames=frames, camera=camera, fps=fps, timestamps=times, depth=depth))
         masks.append(None if mask is None else _some(mask, picks))
     return replace(scene, videos=tuple(videos), masks=tuple(masks))
 
