@@ -500,7 +500,7 @@ def initial_scene(
     def build() -> dict[str, np.ndarray]:
         built, gains = _built(scene, offsets, tracks, footage, plan, cache, map, progress)
         # in the layout that a file gives back: sums over another one differ in their last bits
-        return {k: np.ascontiguousarray(v) for k, v in {"gains": gains, **scene_arrays(built)}.items()}
+        return {k: np.array(v, order="C") for k, v in {"gains": gains, **scene_arrays(built)}.items()}
 
     arrays = cache.arrays("initial", key, build)
     return scene_from_arrays(arrays), arrays["gains"]
