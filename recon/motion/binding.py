@@ -113,5 +113,9 @@ class Binding:
     @cached_property
     def pair_rests(self) -> tuple[np.ndarray, np.ndarray]:
         """Rest positions [Q,3] and quats [Q,4] of the layout's pairs: float32."""
-        at = self.layout.rest, self.layout.node
-        return tuple(np.ascontiguousarray(a.cpu().numpy()[at], np.float32) for a in (self.positions, self.quats))
+        rests, nodes = self.layout.rest, self.layout.node
+
+        def of_pairs(poses: Tensor) -> np.ndarray:
+            return np.ascontiguousarray(poses.cpu().numpy()[rests, nodes], np.float32)
+
+        return of_pairs(self.positions), of_pairs(self.quats)

@@ -46,7 +46,7 @@ class ScaffoldOptions:
     margin: float = 4 * FRAME
     per_video: bool = False
     neighbours: int = 10
-    reach: float = 5.0
+    reach: float = picking.REACH
     robust: float = 2.3
     shortest: float = 10 * FRAME
     smooth: Smoothness = field(default_factory=Smoothness)
@@ -153,16 +153,10 @@ def _nodes(grid: Grid, path: HermiteSpline, footprint: float, options: ScaffoldO
     curves = fit.solve(*picking.neighbours(full[again], every[again], options.neighbours), rounds=2)
     full = fit.on_grid(curves)
     neighbours, distances = picking.neighbours(full, every[again], options.neighbours)
-    weights = edge_weights(distances, unit, options.reach)
+    weights = picking.edge_weights(distances, unit, options.reach)
     turned = neighbourhood_rotations(curves, neighbours, weights, unit)
     logger.info("%d nodes of %d tracks, %.3g world units apart", len(again), len(grid), unit)
     return _Nodes(curves, turned, neighbours, weights, unit)
-
-
-def edge_weights(distances: np.ndarray, unit: float, reach: float = 5.0) -> np.ndarray:
-    """Weights of edges of D_track `distances`: exp(-D²/2(1.5 unit)²), 0 beyond `reach` units."""
-    near = distances < reach * unit
-    return np.where(near, np.exp(-(np.where(near, distances, 0) ** 2) / (2 * (1.5 * unit) ** 2)) + 1e-6, 0.0)
 
 
 def _first_pick(grid: Grid, footprint: float, options: ScaffoldOptions, seed: int) -> tuple[np.ndarray, float]:

@@ -19,6 +19,7 @@ from recon.motion.paths import MAX_KNOTS
 
 logger = logging.getLogger("recon.motion")
 
+REACH = 5.0  # units of D_track at which neighbours end
 TOP = 3  # D_track is the third largest distance
 BRIDGE_FRAMES = 2.5  # of the video's own: a longer gap is not interpolated
 MAX_FRAMES = 4 * MAX_KNOTS  # of a grid
@@ -164,3 +165,9 @@ def neighbours(
     index[:, :found] = np.argsort(D, axis=1, kind="stable")[:, :found]
     distance[:, :found] = np.take_along_axis(D, index[:, :found], 1)
     return np.where(np.isfinite(distance), index, np.arange(m)[:, None]), distance
+
+
+def edge_weights(distances: np.ndarray, unit: float, reach: float = REACH) -> np.ndarray:
+    """Weights of edges of D_track `distances`: exp(-D²/2(1.5 unit)²), 0 beyond `reach` units."""
+    near = distances < reach * unit
+    return np.where(near, np.exp(-(np.where(near, distances, 0) ** 2) / (2 * (1.5 * unit) ** 2)) + 1e-6, 0.0)
