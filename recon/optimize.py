@@ -75,7 +75,9 @@ class Adam:
             name: rate * (footprint if name in IN_FOOTPRINTS else frame_step if name in IN_FRAMES else 1.0)
             for name, rate in rates.items()
         }
-        self.groups = {name: groups[name].detach().clone().requires_grad_() for name in self.rates}
+        # torch's fused CPU kernel walks parameters and gradients as flat memory: strides of their own would scramble them
+        self.groups = {name: groups[name].detach().clone(memory_format=torch.contiguous_format).requires_grad_()
+                       for name in self.rates}  # fmt: skip
         self._adam = torch.optim.Adam(
             [{"params": [p], "lr": self.rates[name], "name": name} for name, p in self.groups.items()],
             betas=self.BETAS, eps=1e-15, fused=True,
@@ -85,7 +87,8 @@ class Adam:
         """One step with every rate times ``factor``. A group without a gradient stands still."""
         for group in self._adam.param_groups:
             group["lr"] = self.rates[group["name"]] * factor
-            self.groups[group["name"]].grad = gradients.get(group["name"])
+            gradient = gradients.get(group["name"])
+            self.groups[group["name"]].grad = None if gradient is None else gradient.contiguous()
         self._adam.step()
 
     def moments(self) -> dict[str, Tensor]:
