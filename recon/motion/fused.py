@@ -99,7 +99,7 @@ class _Warp(torch.autograd.Function):
         outputs = np.zeros_like(knots), np.zeros_like(knot_quats), np.empty(m)
         for_each(kernels.lower, _parts(m, LEAST_NODES), curves, moment, slopes, pairs, dual, g_rows, *outputs)
         g_own = np.bincount(rig.clock, outputs[2], minlength=len(slopes))
-        of_gaussians = (torch.from_numpy(a).view(n, -1) for a in outgoing)
+        of_gaussians = (torch.from_numpy(a).view(n, d) for a, d in zip(outgoing, (3, 4), strict=True))
         return *of_gaussians, *(torch.from_numpy(a) for a in (g_own, *outputs[:2])), None
 
 
