@@ -45,6 +45,8 @@ class FitOptions:
     """Parameter groups that stay as they are: offsets, gain, knots, ..."""
     batch: int = 2
     """Images a step, each on a thread of its own."""
+    backdrop_steps: int = 1500
+    """Steps of the fit of the static part, before anything moves."""
     seed: int = 0
     densify: Densify | None = None
     """Split what is pulled hardest, drop what is faint; off unless asked for."""
@@ -64,7 +66,8 @@ class FitOptions:
 
         return Plan(
             width=self.width, frames=self.frames, scaffold=self.scaffold, densify=self.densify, freeze=self.freeze,
-            batch=self.batch, seed=self.seed, save_every=self.save_every,
+            batch=self.batch, seed=self.seed, backdrop_steps=self.backdrop_steps,
+            save_every=self.save_every,
         )  # fmt: skip
 
     def length(self) -> dict[str, Any]:

@@ -21,16 +21,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from otsync.files import write_json
 from otsync.io import Scene
 from otsync.io.mend import cut, keep_frames, unreadable
 from otsync.types import Offsets, TrackSet, Video
+from recon.backdrop import StaticFit, fit_backdrop, with_backdrop
 from recon.density import Densify
+from recon.depth import working_depth
 from recon.effects import Effect, Gain
 from recon.evaluate import offset_error
 from recon.fit import LOSSES, Loss, Reconstruction, fit
-from recon.footage import Footage, footage_of, working_depth
+from recon.footage import Footage, footage_of
 from recon.gaussians4d import Gaussians4D, scene_arrays, scene_from_arrays
 from recon.held_out import Clock, ViewScore, view
 from recon.lpips import Lpips
@@ -54,7 +57,8 @@ class Plan:
             by themselves.
         freeze: parameter groups that the fit holds, "offsets" for instance.
         batch: images a step, each on a thread of its own.
-        views: frames of every camera that are compared at the end. save_every: seconds between savings of the fit.
+        views: frames of every camera that are compared at the end. backdrop_steps: of the fit of the static part.
+        save_every: seconds between savings of the fit.
     """
 
     width: int = 320
@@ -67,6 +71,7 @@ class Plan:
     batch: int = 2
     seed: int = 0
     views: int = 50
+    backdrop_steps: int = 1500
     save_every: float = 60.0
 
 
@@ -271,19 +276,6 @@ def world_footprint(tracks: Sequence[TrackSet], footage: Sequence[Footage]) -> f
     return float(np.median(values))
 
 
-class SparseDepth(Sequence):
-    """Depth maps of some frames of a video; None for the others."""
-
-    def __init__(self, count: int, maps: dict[int, np.ndarray]):
-        self.count, self.maps = count, maps
-
-    def __len__(self) -> int:
-        return self.count
-
-    def __getitem__(self, k: Any) -> np.ndarray | None:
-        return self.maps.get(int(k))
-
-
 @dataclass(frozen=True, eq=False)
 class Outcome:
     """What :func:`reconstruct` came to.
@@ -327,11 +319,11 @@ def reconstruct(
     from otsync.priors.cache import Cache
 
     plan, progress, cache = plan or Plan(), progress or Progress(), cache or Cache(out / "stages")
+    rates = without(RATES, *plan.freeze)  # says what is wrong before the work
     out.mkdir(parents=True, exist_ok=True)
     ready = prepare(scene, offsets, tracks, plan=plan, held_out=held_out, cache=cache, map=map, progress=progress)
     true = None if truth is None else true_seconds(truth, ready.offsets)
     effects = (Gain(start=ready.gains), *plan.effects)
-    rates = without(RATES, *plan.freeze)
     with progress.stage("fit"):
         found = fit(
             ready.initial, ready.footage, ready.offsets, losses=plan.losses, effects=effects, rates=rates, steps=steps,
@@ -475,43 +467,100 @@ def prepare(
         held = () if others is None else read_footage(others, plan.width, cache, map, progress)
     if not any((f.boxes[:, 2] > f.boxes[:, 0]).any() for f in footage):
         raise ValueError("scene: expected something that moves; the masks are empty in every frame of every video.")
+    with progress.stage("backdrop"):
+        static = backdrop_of_scene(train, tracks, footage, plan, cache, progress)
     with progress.stage("initial scene"):
-        initial, gains = initial_scene(train, offsets, tuple(tracks), footage, plan, cache, map, progress)
+        initial = initial_scene(train, offsets, tuple(tracks), footage, static, plan, cache, map, progress)
+    gains = np.ones((len(footage), 3)) if static is None else static.gains
+    if static is not None:
+        footage = tuple(
+            f if f.background is None else with_backdrop(static, f, gains[v]) for v, f in enumerate(footage)
+        )
     left_out = tuple(n for n in scene.names if n not in train.names and n not in held_out)
     return Prepared(
         footage, held, clocks, offsets, tuple(tracks), initial, gains, scene.frame, left_out
     )  # fmt: skip
 
 
-def initial_scene(
-    scene: Scene, offsets: Offsets, tracks: tuple[TrackSet, ...], footage: tuple[Footage, ...], plan: Plan, cache: Any,
-    map: MapLike, progress: Progress,
-) -> tuple[Gaussians4D, np.ndarray]:  # fmt: skip
-    """The scene before any refinement, and the gains (V,3) of the backdrop; kept as one stage."""
+def content_key(scene: Scene, tracks: Sequence[TrackSet]) -> tuple[Any, ...]:
+    """What the pixels, masks, poses, depth maps and tracks are, for the cache."""
     from otsync import keep
+    from otsync.priors.cache import digest_of
     from otsync.recordings import Stages
 
     tracking = Stages().tracking
-    content = [tracking.key(v, m) for v, m in zip(scene.videos, scene.masks, strict=True)]
-    depth = [getattr(v.depth, "digest", lambda: None)() for v in scene.videos]
-    clocks = (np.round(offsets.seconds, 6).tolist(), np.round(offsets.rates, 9).tolist(), offsets.reference)
-    key = (*content, *depth, clocks, [keep.digest(t) for t in tracks], plan.width, plan.scaffold, plan.seed)
+    rows = []
+    for video, masks in zip(scene.videos, scene.masks, strict=True):
+        c, depth = video.camera, "none"
+        if video.depth is not None:
+            own = getattr(video.depth, "digest", None)
+            depth = own() if own is not None else digest_of(*[np.asarray(z) for z in video.depth])
+        lens = None if c.distortion is None else c.distortion
+        rows.append(digest_of(tracking.key(video, masks), depth, video.times, c.K, c.w2c, lens, c.width, c.height))
+    return (*rows, *(keep.digest(t) for t in tracks))
+
+
+def backdrop_of_scene(
+    scene: Scene, tracks: Sequence[TrackSet], footage: Sequence[Footage], plan: Plan, cache: Any, progress: Progress
+) -> StaticFit | None:
+    """Static Gaussians fitted to what the cameras see behind the things that move, kept; None where nothing shows."""
+    from recon.gaussians import Gaussians
 
     def build() -> dict[str, np.ndarray]:
-        built, gains = _built(scene, offsets, tracks, footage, plan, cache, map, progress)
+        lifted = [t.positions()[t.seen] for t in tracks]
+        points = np.concatenate([p[:: max(1, len(p) // POINTS)] for p in lifted])
+        depth = [None if v.depth is None else working_depth(v, width=plan.width) for v in scene.videos]
+        found = fit_backdrop(
+            footage, depth=None if all(d is None for d in depth) else depth, points=points, steps=plan.backdrop_steps,
+            seed=plan.seed,
+        )  # fmt: skip
+        parts = {n: getattr(found.gaussians, n).numpy() for n in GAUSSIAN}
+        return {**parts, "gains": found.gains, "near": np.array(found.near), "psnr": found.psnr}
+
+    key = (*content_key(scene, tracks), plan.width, plan.backdrop_steps, plan.seed)
+    try:
+        kept = cache.arrays("backdrop", key, build)
+    except ValueError as error:
+        progress.note(f"no static part: {error}")
+        return None
+    gaussians = Gaussians(*(torch.from_numpy(np.array(kept[n])) for n in GAUSSIAN))
+    progress.tell(f"backdrop: {len(gaussians)} Gaussians, {np.nanmean(kept['psnr']):.2f} dB")
+    return StaticFit(gaussians, kept["gains"], float(kept["near"]), kept["psnr"])
+
+
+POINTS = 2000
+"""Positions of what moves, per video, that the backdrop takes its scale from."""
+
+GAUSSIAN = ("means", "quats", "log_scales", "opacity_logits", "sh")
+
+
+def initial_scene(
+    scene: Scene, offsets: Offsets, tracks: tuple[TrackSet, ...], footage: tuple[Footage, ...],
+    static: StaticFit | None, plan: Plan, cache: Any, map: MapLike, progress: Progress,
+) -> Gaussians4D:  # fmt: skip
+    """The scene before any refinement: a scaffold through the tracks, and what the depth maps show of it; kept."""
+    clocks = (np.round(offsets.seconds, 6).tolist(), np.round(offsets.rates, 9).tolist(), offsets.reference)
+    gains = np.ones((len(footage), 3)) if static is None else static.gains
+    key = (*content_key(scene, tracks), clocks, gains.tolist(), plan.width, plan.scaffold, plan.seed)
+
+    def build() -> dict[str, np.ndarray]:
+        built = seeded(scene, offsets, tracks, footage, gains, plan, cache, map, progress)
         # in the layout that a file gives back: sums over another one differ in their last bits
-        return {k: np.array(v, order="C") for k, v in {"gains": gains, **scene_arrays(built)}.items()}
+        return {k: np.array(v, order="C") for k, v in scene_arrays(built).items()}
 
-    arrays = cache.arrays("initial", key, build)
-    return scene_from_arrays(arrays), arrays["gains"]
+    found = scene_from_arrays(cache.arrays("initial", key, build))
+    progress.tell(f"initial scene: {len(found)} moving Gaussians")
+    if static is None:
+        return found
+    return replace(found, static=static.gaussians, near=static.near)
 
 
-def _built(
-    scene: Scene, offsets: Offsets, tracks: tuple[TrackSet, ...], footage: tuple[Footage, ...], plan: Plan, cache: Any,
-    map: MapLike, progress: Progress,
-) -> tuple[Gaussians4D, np.ndarray]:  # fmt: skip
+def seeded(
+    scene: Scene, offsets: Offsets, tracks: tuple[TrackSet, ...], footage: tuple[Footage, ...], gains: np.ndarray,
+    plan: Plan, cache: Any, map: MapLike, progress: Progress,
+) -> Gaussians4D:  # fmt: skip
+    """Build what :func:`initial_scene` keeps."""
     from otsync.depth_maps import depth_maps
-    from recon.backdrop import fit_backdrop
     from recon.seed import moments, seed
 
     footprint = world_footprint(tracks, footage)
@@ -521,18 +570,14 @@ def _built(
         tracks, offsets.seconds[at], footprint=footprint, frame_step=frame_step, options=plan.scaffold,
         rates=offsets.rates[at], seed=plan.seed,
     )  # fmt: skip
-    progress.tell(f"scaffold: {len(motion)} nodes, footprint {footprint:.4g}")
+    progress.tell(f"scaffold: {len(motion)} nodes of {sum(len(t) for t in tracks)} tracks, footprint {footprint:.4g}")
     worlds = [offsets.rates[v] * f.times + offsets.seconds[v] for v, f in enumerate(footage)]
     span = (float(min(t[0] for t in worlds)), float(max(t[-1] for t in worlds)))
-    points = np.concatenate([t.positions()[t.seen][:: max(1, int(t.seen.sum()) // 2000)] for t in tracks])
-    backdrop = fit_backdrop(footage, points)
     times = moments(span, frame_step)
     wanted = [sorted({int(np.argmin(np.abs(w - t))) for t in times}) for w in worlds]
     maps = depth_maps(scene, offsets, wanted, width=plan.width, cache=cache, map=map)
     depth = [
-        working_depth(v, SparseDepth(len(v.frames), dict(zip(k, m, strict=True))), width=plan.width)
+        working_depth(v, dict(zip(k, m, strict=True)).get, width=plan.width)
         for v, k, m in zip(scene.videos, wanted, maps, strict=True)
     ]
-    scene4d = seed(motion, footage, offsets, depth, footprint=footprint, frame_step=frame_step, span=span, times=times)
-    progress.tell(f"seeded {len(scene4d)} Gaussians")
-    return replace(scene4d, static=backdrop.gaussians, near=backdrop.near), backdrop.gains
+    return seed(motion, footage, offsets, depth, footprint=footprint, frame_step=frame_step, span=span, times=times)

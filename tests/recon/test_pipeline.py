@@ -24,7 +24,7 @@ from recon.result import load_result
 from .worlds import CAMERAS, FRAMES, SIZE, capture, write_world
 
 STEP = 1 / 30
-QUICK = Plan(width=SIZE[0], views=4)
+QUICK = Plan(width=SIZE[0], views=4, backdrop_steps=60)
 
 
 @pytest.fixture(scope="module")

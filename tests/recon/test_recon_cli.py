@@ -36,7 +36,7 @@ def world(tmp_path_factory):
 
 def fit(world: Path, out: Path, *more: str, steps: int = 30) -> int:
     return main(["fit", str(world), "--offsets", str(world / "start.json"), "--out", str(out), "--width", str(SIZE[0]),
-                 "--steps", str(steps), *more])  # fmt: skip
+                 "--steps", str(steps), "--backdrop-steps", "60", *more])  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -157,7 +157,7 @@ def test_offsets_that_are_not_to_be_trusted_end_in_one(world, tmp_path, capsys):
     document["videos"][1] |= {"offset_seconds": None, "offset_frames": None, "status": "no_match", "flags": ["no_match"]}
     (tmp_path / "o.json").write_text(json.dumps(document))
     code = main(["fit", str(world), "--offsets", str(tmp_path / "o.json"), "--out", str(tmp_path / "r"), "--width", "96",
-                 "--steps", "3", "--held-out", "held0"])  # fmt: skip
+                 "--backdrop-steps", "9", "--steps", "3", "--held-out", "held0"])  # fmt: skip
     told = capsys.readouterr().err
     assert code == 1 and "cam1 is left out" in told and "not to be trusted: cam2" in told
     assert load_result(tmp_path / "r").offsets.names == ("cam0", "cam2")
@@ -190,7 +190,7 @@ def test_every_help_has_an_example(capsys):
 
 def command(world: Path, out: Path) -> list[str]:
     return [sys.executable, "-m", "recon.cli", "fit", str(world), "--offsets", str(world / "start.json"), "--out", str(out),
-            "--width", str(SIZE[0]), "--steps", "200", "--save-every", "0.5", "--held-out", "held0"]  # fmt: skip
+            "--width", str(SIZE[0]), "--backdrop-steps", "60", "--steps", "200", "--save-every", "0.5", "--held-out", "held0"]  # fmt: skip
 
 
 @pytest.mark.slow
