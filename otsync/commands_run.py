@@ -51,11 +51,12 @@ class Run:
         try:
             from recon.cli import FitOptions, opened, reconstructed, tell
             from recon.fit import Diverged
-            from recon.pipeline import Progress, cut, readable
+            from recon.prepare import Progress, readable
         except ModuleNotFoundError as error:
             raise ValueError(f"run: needs {error.name}. Install it: pip install 'otsync[recon,video]'.") from None
         from .cli import table
         from .files import write_json
+        from .io.mend import cut
         from .priors.cache import Cache
         from .recordings import synchronize_scene
         from .report.frames import write_recording_report
@@ -67,7 +68,9 @@ class Run:
         options.length()  # before the work, not after it
         scene = opened(self.scene, self.allow_outside or self.recording.allow_outside)
         if self.recording.cameras:
-            scene = scene.take([*self.recording.cameras, *(n for n in self.held_out if n not in self.recording.cameras)])
+            scene = scene.take(
+                [*self.recording.cameras, *(n for n in self.held_out if n not in self.recording.cameras)]
+            )
         scene.take(self.held_out)  # names that are not there
         cache, progress = Cache(self.recording.cache or self.out / "stages"), Progress(tell)
         with ThreadPoolExecutor(self.recording.workers or os.cpu_count() or 1) as pool:

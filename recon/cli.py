@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from otsync.io import Scene
     from otsync.types import Offsets
     from recon.held_out import ViewScore
-    from recon.pipeline import Outcome, Plan, Progress
+    from recon.pipeline import Outcome
+    from recon.prepare import Plan, Progress
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ class FitOptions:
 
     def plan(self) -> Plan:
         """The pipeline's form of this."""
-        from recon.pipeline import Plan
+        from recon.prepare import Plan
 
         return Plan(
             width=self.width, frames=self.frames, scaffold=self.scaffold, densify=self.densify, freeze=self.freeze,
@@ -194,9 +195,10 @@ class Eval:
 
     def run(self) -> int:
         from otsync.files import write_json
-        from otsync.types import Offsets
         from otsync.priors.cache import Cache
-        from recon.pipeline import Progress, evaluate, offset_figures, true_seconds
+        from otsync.types import Offsets
+        from recon.pipeline import evaluate, offset_figures, true_seconds
+        from recon.prepare import Progress
         from recon.result import load_result, metrics_of
 
         result = load_result(self.result)
@@ -253,7 +255,8 @@ class Export:
         if self.at is not None and not single:
             raise ValueError(f"--at: expected with ply or splat; found {self.format}, which holds all times.")
         low, high = result.scene.span
-        times = [0.5 * (low + high) if self.at is None else self.at] if single else frame_times(result.scene, self.fps)
+        middle = 0.5 * (low + high) if self.at is None else self.at
+        times = [middle] if single else frame_times(result.scene, self.fps).tolist()
         names = {"ply": "scene.ply", "splat": "scene.splat", "ply-sequence": "sequence", "checkpoint": "scene4d.npz",
                  "tracks": "tracks.npz"}  # fmt: skip
         out = self.out or self.result / names[self.format]
@@ -331,7 +334,8 @@ def reconstructed(
     """Prepare, fit, evaluate, write, and print what came out; the exit code."""
     from otsync.priors.cache import Cache
     from otsync.types import Offsets
-    from recon.pipeline import Progress, reconstruct
+    from recon.pipeline import reconstruct
+    from recon.prepare import Progress
 
     known = None if truth is None else Offsets.load(truth)
     with ThreadPoolExecutor(options.workers or os.cpu_count() or 1) as pool:
@@ -361,7 +365,9 @@ def offset_table(outcome: Outcome) -> str:
     for v, name in enumerate(offsets.names):
         values = [coarse.frames[v], offsets.frames[v], offsets.sigma[v] * fps]
         values += [true[v] * fps, offsets.frames[v] - true[v] * fps] if true is not None else []
-        cells = [f"{x:{w}.3f}" if np.isfinite(x) else "–".rjust(w) for x, w in zip(values, (9, 9, 8, 9, 8), strict=False)]
+        cells = [
+            f"{x:{w}.3f}" if np.isfinite(x) else "–".rjust(w) for x, w in zip(values, (9, 9, 8, 9, 8), strict=False)
+        ]
         lines.append(f"{name:{width}}  {' '.join(cells)}" + ("  reference" if v == offsets.reference else ""))
     return "\n".join(lines)
 

@@ -31,7 +31,9 @@ def frame_times(scene: Gaussians4D, fps: float | None = None) -> np.ndarray:
         raise ValueError(f"fps: expected frames per second above 0; found {fps}.")
     count = int((scene.span[1] - scene.span[0]) / step + 1e-6) + 1
     if count > MAX_FRAMES:
-        raise ValueError(f"fps: expected at most {MAX_FRAMES} frames; the span {scene.span} at {1 / step:g} has {count}.")
+        raise ValueError(
+            f"fps: expected at most {MAX_FRAMES} frames; the span {scene.span} at {1 / step:g} has {count}."
+        )
     return scene.span[0] + step * np.arange(count)
 
 
@@ -65,9 +67,7 @@ def scene_tracks(scene: Gaussians4D, times: Sequence[float], name: str = "scene"
     frame: name of the world frame that the recording declares. Features are the Gaussians' own, where lifted.
     """
     features = None if scene.features is None else scene.features.detach().cpu().numpy()
-    return TrackSet(
-        scene.tracks(times), features=features, timestamps=np.asarray(times, float), name=name, frame=frame
-    )
+    return TrackSet(scene.tracks(times), features=features, timestamps=np.asarray(times, float), name=name, frame=frame)
 
 
 def export(

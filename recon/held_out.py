@@ -199,9 +199,17 @@ class View:
                 lambda x: self.disagreement(start + x * step, frames), bounds=(-1.0, 1.0), method="bounded",
                 options={"xatol": TOLERANCE},
             )  # fmt: skip
-        return View(self.scene, self.footage, Clock(start + float(found.x) * step, self.clock.rate, "found"), self.gain, self.static)
+        return View(
+            self.scene,
+            self.footage,
+            Clock(start + float(found.x) * step, self.clock.rate, "found"),
+            self.gain,
+            self.static,
+        )
 
-    def score(self, *, most: int = 50, pictures: int = 3, lpips: Lpips | None = None, held_out: bool = True) -> ViewScore:
+    def score(
+        self, *, most: int = 50, pictures: int = 3, lpips: Lpips | None = None, held_out: bool = True
+    ) -> ViewScore:
         """Compare up to ``most`` frames, spread over the clip; ``pictures`` of them are kept."""
         f = self.footage
         low, high = self.scene.span
@@ -214,7 +222,9 @@ class View:
                 f"found {t[0]:.3f} to {t[-1]:.3f}. Check its offset."
             )
         chosen = _spread(inside, most)
-        kept = set(_spread(chosen, pictures + 2)[1:-1].tolist() if len(chosen) > pictures + 1 else chosen[:pictures].tolist())
+        kept = set(
+            _spread(chosen, pictures + 2)[1:-1].tolist() if len(chosen) > pictures + 1 else chosen[:pictures].tolist()
+        )
         rows, shown = [], []
         with torch.no_grad():
             for k in chosen.tolist():

@@ -101,9 +101,7 @@ def _offset_rows(found: Reconstruction, coarse: Offsets, truth: np.ndarray | Non
     return f"<div class=scroll><table><tr>{head}<th class=t>status before the fit{''.join(rows)}</table></div>"
 
 
-def convergence(
-    found: Reconstruction, coarse: Offsets, videos: Sequence[str], truth: np.ndarray | None = None
-) -> str:
+def convergence(found: Reconstruction, coarse: Offsets, videos: Sequence[str], truth: np.ndarray | None = None) -> str:
     """Left: every camera's offset against steps, relative to the reference. Right: PSNR of the training boxes."""
     history, step = found.history, found.scene.frame_step
     figure, (left, right) = axes_of(7.2, 2.7, 2)
@@ -155,7 +153,9 @@ def _view_rows(views: Sequence[ViewScore], lpips_reason: str) -> str:
         cells = "".join(f"<td>{number(v.mean.get(key, np.nan), digits)}" for key, (_, digits) in names.items())
         gain = " ".join(f"{g:.3f}" for g in v.gain)
         role = "held out" if v.held_out else "training"
-        rows.append(f"<tr><td>{escape(v.name)}<td class=t>{role}{cells}<td>{len(v.frames)}<td style='white-space:nowrap'>{gain}<td class=t>{HOW[v.clock.how]}")
+        rows.append(
+            f"<tr><td>{escape(v.name)}<td class=t>{role}{cells}<td>{len(v.frames)}<td style='white-space:nowrap'>{gain}<td class=t>{HOW[v.clock.how]}"
+        )
     head = "".join(f"<th>{title}" for title, _ in names.values())
     missing = f" LPIPS: {escape(lpips_reason)}." if lpips_reason else ""
     return (
@@ -208,5 +208,3 @@ def _numbers(found: Reconstruction, seconds: Mapping[str, float]) -> str:
         f"<table>{stages}</table><table>{stats}{nodes}</table>"
         f"<p class=s>otsync {__version__}, Python {platform.python_version()}, {platform.machine()}.</p>"
     )
-
-

@@ -1,9 +1,9 @@
 """The folder that a reconstruction is kept in, and reading it back.
 
-    scene.npz      the 4D scene          offsets.json   the refined clocks
-    run.json       cameras, clocks and colour gains of every video, options, wall times, notes
-    metrics.json   figures of the views  report.html    all of it to look at
-    fit.npz        where the fit stood   stages/        what led there, from which a killed run continues
+scene.npz      the 4D scene          offsets.json   the refined clocks
+run.json       cameras, clocks and colour gains of every video, options, wall times, notes
+metrics.json   figures of the views  report.html    all of it to look at
+fit.npz        where the fit stood   stages/        what led there, from which a killed run continues
 """
 
 from __future__ import annotations
@@ -144,7 +144,9 @@ def load_result(folder: str | os.PathLike[str]) -> Result:
 def _filmed_by(row: dict[str, Any]) -> FilmedBy:
     c = row["camera"]
     readout = None if c["readout"] is None else float(c["readout"])
-    camera = Camera(np.array(c["K"], float), np.array(c["w2c"], float), int(c["width"]), int(c["height"]), None, readout)
+    camera = Camera(
+        np.array(c["K"], float), np.array(c["w2c"], float), int(c["width"]), int(c["height"]), None, readout
+    )
     clock = Clock(float(row["clock"]["offset_seconds"]), float(row["clock"]["rate"]), str(row["clock"]["known"]))  # type: ignore[arg-type]
     gain = np.array(row["gain"], float)
     if gain.shape != (3,) or not np.isfinite(gain).all():

@@ -109,7 +109,8 @@ def _mark(ax, pair: Alignment, truth: float | None) -> None:
         ax.axvline(pair.frames, color=CHOSEN, lw=1, label="chosen")
     if truth is not None:
         ax.axvline(truth * pair.fps, color=TRUTH, lw=1, ls=":", label="true")
-    ax.legend(fontsize=6)
+    if ax.get_legend_handles_labels()[0]:
+        ax.legend(fontsize=6)
 
 
 def residual_bars(labels: Sequence[str], frames: np.ndarray, trusted: Sequence[bool]) -> str:

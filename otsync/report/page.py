@@ -165,7 +165,9 @@ def _pair_details(offsets: Offsets, tracks: Sequence[TrackSet] | None, truth: Se
     for (i, j), p in shown:
         cost, path, origin = _cost_map(p, (i, j), offsets.matches, tracks)
         true = None if truth is None else float(truth[j] - truth[i])
-        parts.append(f"<h3>{escape(offsets.names[i])} – {escape(offsets.names[j])}: {status_words(p.status, p.flags)}</h3>")
+        parts.append(
+            f"<h3>{escape(offsets.names[i])} – {escape(offsets.names[j])}: {status_words(p.status, p.flags)}</h3>"
+        )
         parts.append(figures.pair_figure(p, cost, path, origin, true))
     if len(shown) < len(offsets.alignments):
         parts.append(f"<p class=s>{len(offsets.alignments) - len(shown)} further pairs stand in the table only.</p>")

@@ -49,7 +49,9 @@ def test_a_known_clock_is_taken_as_it_is(truth):
 def test_the_gain_comes_from_what_is_static(truth):
     f = capture().held_out[0]
     gain = np.array([0.9, 1.0, 0.8])
-    dim = replace(f, images=np.rint(f.images * gain).astype(np.uint8), background=np.rint(f.background * gain).astype(np.uint8))
+    dim = replace(
+        f, images=np.rint(f.images * gain).astype(np.uint8), background=np.rint(f.background * gain).astype(np.uint8)
+    )
     np.testing.assert_allclose(view(truth, dim, Clock(0.0)).gain, view(truth, f, Clock(0.0)).gain * gain, rtol=0.01)
     # people of another colour change nothing
     moved = replace(f, images=np.where(f.masks[..., None] > 25, 255 - f.images, f.images))

@@ -14,11 +14,11 @@ from otsync.io import open_scene
 from otsync.io.mend import cut, keep_frames, unreadable
 from otsync.priors.cache import Cache
 from otsync.types import Offsets, Status, TrackSet
-from recon import pipeline
 from recon.capture import clocks
 from recon.footage import footage_of
 from recon.gaussians4d import Gaussians4D
-from recon.pipeline import Plan, Progress, only, prepare, readable, reconstruct, split, world_footprint
+from recon.pipeline import reconstruct
+from recon.prepare import Plan, Progress, lifted_tracks, only, prepare, readable, split, world_footprint
 from recon.result import load_result
 
 from .worlds import CAMERAS, FRAMES, SIZE, capture, write_world
@@ -134,7 +134,9 @@ def test_frozen_offsets_stay(world, start, done, tmp_path):
     )
     np.testing.assert_array_equal(outcome.found.offsets.seconds, np.zeros(CAMERAS))
     with pytest.raises(ValueError, match="groups: expected some of"):
-        reconstruct(open_scene(world), start, tmp_path, plan=replace(QUICK, freeze=("clocks",)), held_out=("held0",), steps=3)
+        reconstruct(
+            open_scene(world), start, tmp_path, plan=replace(QUICK, freeze=("clocks",)), held_out=("held0",), steps=3
+        )
 
 
 def test_bad_frames_are_left_out_and_named(world, start, tmp_path):
@@ -199,14 +201,16 @@ def test_videos_without_a_common_clock_are_left_out(world):
     assert train.names == ("cam0", "cam2") == own.names and held.names == ("held0",)
     assert known["held0"].seconds == 0 and own.reference == 0
     assert "cam1 is left out: it has no offset" in progress.notes[0]
-    with pytest.raises(ValueError, match="the reference .cam0. among the videos to fit"):
+    with pytest.raises(ValueError, match=r"the reference .cam0. among the videos to fit"):
         split(open_scene(world), offsets, ("cam0",), progress)
     with pytest.raises(ValueError, match="held_out: expected some of"):
         split(open_scene(world), offsets, ("nobody",), progress)
 
 
 def test_some_offsets_keep_their_differences():
-    offsets = replace(clocks(("a", "b", "c"), np.array([0.0, 0.2, -0.4]), 30), reference=1, component=np.array([1, 1, 1]))
+    offsets = replace(
+        clocks(("a", "b", "c"), np.array([0.0, 0.2, -0.4]), 30), reference=1, component=np.array([1, 1, 1])
+    )
     some = only(offsets, ("c", "b"))
     assert some.names == ("c", "b") and some.reference == 1 and some.between(0, 1) == offsets.between(2, 1)
 
@@ -239,12 +243,14 @@ def test_nothing_that_moves_is_said(world, start, tmp_path):
 def test_too_few_cameras_without_depth_say_what_is_lacking(world, start):
     scene = open_scene(world)
     flat = replace(scene, videos=tuple(replace(v, depth=None) for v in scene.videos))
-    with pytest.raises(ValueError, match="depth: none was given for cam0, cam1, cam2.*3 videos are fewer than the 5"):
+    with pytest.raises(ValueError, match=r"depth: none was given for cam0, cam1, cam2.*3 videos are fewer than the 5"):
         prepare(flat, start, plan=QUICK, held_out=("held0",))
 
 
 def test_one_camera_with_depth_is_a_scene(world, start, tmp_path):
-    outcome = reconstruct(open_scene(world).take(["cam0", "held0"]), start, tmp_path, plan=QUICK, held_out=("held0",), steps=4)
+    outcome = reconstruct(
+        open_scene(world).take(["cam0", "held0"]), start, tmp_path, plan=QUICK, held_out=("held0",), steps=4
+    )
     assert outcome.found.offsets.names == ("cam0",) and len(outcome.found.scene) > 100
     assert isinstance(Gaussians4D.load(tmp_path / "scene.npz"), Gaussians4D)
 
@@ -264,4 +270,4 @@ def test_stages_are_shared_with_the_synchronisation_before(done, world, monkeypa
     monkeypatch.setattr(ChainedFlow, "__call__", lambda *args: pytest.fail("tracked again"))
     scene = open_scene(world)
     train, _, offsets, _ = split(scene, Offsets.load(world / "start.json"), ("held0",), Progress())
-    pipeline.lifted_tracks(train, offsets, Cache(done[1] / "stages"), map, Progress())
+    lifted_tracks(train, offsets, Cache(done[1] / "stages"), map, Progress())

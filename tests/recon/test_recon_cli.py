@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from itertools import pairwise
 from pathlib import Path
 
 import av
@@ -59,7 +60,9 @@ def test_fit_writes_offsets_scene_metrics_and_report(world, result, tmp_path, ca
 
 
 def test_a_camera_is_rendered_to_images_and_to_a_video(result, tmp_path):
-    assert main(["render", str(result), "--camera", "held0", "--times", "0.1", "0.3", "--out", str(tmp_path / "im")]) == 0
+    assert (
+        main(["render", str(result), "--camera", "held0", "--times", "0.1", "0.3", "--out", str(tmp_path / "im")]) == 0
+    )
     images = [np.asarray(Image.open(p)) for p in sorted((tmp_path / "im").iterdir())]
     assert [i.shape for i in images] == [(SIZE[1], SIZE[0], 3)] * 2
     filmed = capture().held_out[0].images[[3, 9]].astype(float)
@@ -77,7 +80,7 @@ def test_a_path_goes_around_a_frozen_moment(result, tmp_path):
     args = ["render", str(result), "--path", "orbit", "--times", "0.2", "--frames", "5", "--out", str(tmp_path / "o")]
     assert main(args) == 0
     images = [np.asarray(Image.open(p)).astype(float) for p in sorted((tmp_path / "o").iterdir())]
-    assert len(images) == 5 and all(np.abs(a - b).mean() > 1 for a, b in zip(images, images[1:], strict=False))
+    assert len(images) == 5 and all(np.abs(a - b).mean() > 1 for a, b in pairwise(images))
 
 
 def test_exports_are_written_where_asked(result, tmp_path, capsys):
@@ -125,7 +128,9 @@ def test_eval_repeats_the_figures_of_the_run(world, result, tmp_path, capsys):
         (["fit", "WORLD", "--offsets", "WORLD/start.json", "--freeze", "nothing", "--held-out", "held0"], "groups: expected"),
     ],
 )  # fmt: skip
-def test_bad_arguments_exit_with_two_and_say_what_was_expected(world, result, tmp_path, monkeypatch, capsys, args, says):
+def test_bad_arguments_exit_with_two_and_say_what_was_expected(
+    world, result, tmp_path, monkeypatch, capsys, args, says
+):
     monkeypatch.chdir(tmp_path)
     swapped = [a.replace("RESULT", str(result)).replace("WORLD", str(world)) for a in args]
     code = main(swapped)
@@ -154,7 +159,12 @@ def test_a_damaged_result_is_named(result, tmp_path, capsys):
 def test_offsets_that_are_not_to_be_trusted_end_in_one(world, tmp_path, capsys):
     document = json.loads((world / "start.json").read_text())
     document["videos"][2] |= {"status": "weak", "flags": ["weak"]}
-    document["videos"][1] |= {"offset_seconds": None, "offset_frames": None, "status": "no_match", "flags": ["no_match"]}
+    document["videos"][1] |= {
+        "offset_seconds": None,
+        "offset_frames": None,
+        "status": "no_match",
+        "flags": ["no_match"],
+    }
     (tmp_path / "o.json").write_text(json.dumps(document))
     code = main(["fit", str(world), "--offsets", str(tmp_path / "o.json"), "--out", str(tmp_path / "r"), "--width", "96",
                  "--backdrop-steps", "9", "--steps", "3", "--held-out", "held0"])  # fmt: skip

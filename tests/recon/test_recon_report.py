@@ -29,8 +29,14 @@ def coarse() -> Offsets:
 def history(rows: int = 30, videos: int = 3) -> History:
     rng = np.random.default_rng(0)
     drift = np.linspace(0, 0.5, rows)[:, None] * STEP
-    offsets = np.array([0.0, 2.0, -1.0])[:videos] * STEP + drift + np.linspace(0, 1, rows)[:, None] * np.array([0, 0.3, -0.2])[:videos] * STEP
-    return History(np.arange(1, rows + 1) * 10, np.linspace(0, 9, rows), rng.random(rows), 20 + np.arange(rows) / 4, offsets)
+    offsets = (
+        np.array([0.0, 2.0, -1.0])[:videos] * STEP
+        + drift
+        + np.linspace(0, 1, rows)[:, None] * np.array([0, 0.3, -0.2])[:videos] * STEP
+    )
+    return History(
+        np.arange(1, rows + 1) * 10, np.linspace(0, 9, rows), rng.random(rows), 20 + np.arange(rows) / 4, offsets
+    )
 
 
 def reconstruction(coarse: Offsets) -> Reconstruction:
@@ -39,11 +45,16 @@ def reconstruction(coarse: Offsets) -> Reconstruction:
 
 
 def score(name: str, held_out: bool, pictures: int = 3) -> ViewScore:
-    frames = tuple({"psnr": 25.0 + k, "ssim": 0.9, "lpips": np.nan, "mask_psnr": np.nan if k else 21.0, "mask_ssim": 0.8} for k in range(6))
+    frames = tuple(
+        {"psnr": 25.0 + k, "ssim": 0.9, "lpips": np.nan, "mask_psnr": np.nan if k else 21.0, "mask_ssim": 0.8}
+        for k in range(6)
+    )
     rng = np.random.default_rng(1)
     shown = tuple((rng.integers(0, 255, (90, 160, 3), dtype=np.uint8),) * 2 for _ in range(pictures))
     mean = {"psnr": 27.5, "ssim": 0.9, "lpips": np.nan, "mask_psnr": 21.0, "mask_ssim": 0.8}
-    return ViewScore(name, Clock(0.1, 1.0, "found"), np.array([1, 0.9, 1.1]), np.arange(6) / 6, frames, mean, shown, True, held_out)
+    return ViewScore(
+        name, Clock(0.1, 1.0, "found"), np.array([1, 0.9, 1.1]), np.arange(6) / 6, frames, mean, shown, True, held_out
+    )
 
 
 def test_the_page_is_one_small_file_without_a_script(coarse, tmp_path):
@@ -56,14 +67,24 @@ def test_the_page_is_one_small_file_without_a_script(coarse, tmp_path):
     assert len(page) < 400_000
     assert "<script" not in page and not re.search(r"""(src|href)=["']?(?!data:|#)[a-z]+:""", page)
     assert "&lt;c&gt;" in page and "it has &lt;no&gt; offset" in page and "<c>" not in page
-    for text in ("27.50", "21.00", "no weights given", "found on the frozen scene", "held out", "training", "300 steps"):
+    for text in (
+        "27.50",
+        "21.00",
+        "no weights given",
+        "found on the frozen scene",
+        "held out",
+        "training",
+        "300 steps",
+    ):
         assert text in page, text
     assert page.count("<img") == 2 and page.count("<svg") == 2
 
 
 def test_the_page_is_the_same_for_the_same_fit(coarse, tmp_path):
     for name in ("one", "two"):
-        write_reconstruction_report(tmp_path / name, reconstruction(coarse), coarse, ["a", "b", "<c>"], [score("h", True)])
+        write_reconstruction_report(
+            tmp_path / name, reconstruction(coarse), coarse, ["a", "b", "<c>"], [score("h", True)]
+        )
     assert (tmp_path / "one").read_text() == (tmp_path / "two").read_text()
 
 
