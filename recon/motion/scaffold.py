@@ -188,6 +188,15 @@ class Scaffold:
         weights /= weights.sum(1, keepdims=True)
         return torch.as_tensor(nodes, device=self.knots.device), torch.as_tensor(weights).to(self.knots)
 
+    def shifted(self, by: float, clocks: Tensor | None = None) -> Scaffold:
+        """The same motion, `by` seconds later. Nodes on videos' own clocks keep them; `clocks` are their new offsets."""
+        binding = replace(self.binding, times=self.binding.times + by)
+        if self.clock is None:
+            return replace(self, path=replace(self.path, start=self.path.start + by), binding=binding)
+        assert self.offsets is not None
+        offsets = self.offsets + by if clocks is None else clocks.detach().to(self.offsets)
+        return replace(self, offsets=offsets, binding=binding)
+
     def take(self, index: Tensor | np.ndarray) -> Scaffold:
         """The same nodes with the Gaussians at `index`: for pruning and duplication."""
         return replace(self, binding=self.binding.take(index))

@@ -63,9 +63,7 @@ def test_freezing_what_has_no_rate_is_a_mistake():
 
 def test_strides_of_parameters_and_gradients_do_not_matter():
     value, pull = torch.randn(4, 3), torch.randn(4, 3)
-    plain, strided = (
-        Adam({"means": v}, {"means": 0.1}, 1.0, 1.0) for v in (value, value.T.contiguous().T)
-    )
+    plain, strided = (Adam({"means": v}, {"means": 0.1}, 1.0, 1.0) for v in (value, value.T.contiguous().T))
     for _ in range(3):
         plain.step({"means": pull}, 1.0)
         strided.step({"means": pull.T.contiguous().T}, 1.0)
