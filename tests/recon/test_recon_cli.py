@@ -240,3 +240,39 @@ def test_ctrl_c_exits_with_130_and_says_how_to_go_on(world, tmp_path):
     run.send_signal(signal.SIGINT)
     _, told = run.communicate(timeout=60)
     assert run.returncode == 130 and b"continues from here" in told and b"Traceback" not in told
+
+
+def test_run_says_what_it_cannot_do(world, tmp_path, capsys):
+    base = ["run", str(world), "--out", str(tmp_path / "r"), "--steps", "3"]
+    for more, says in (
+        (["--held-out", "cam1", "cam2", "held0"], "expected at least two videos; found 1"),
+        (["--held-out", "nobody"], "expected some of cam0"),
+        (["--held-out", "held0", "--reference", "held0"], "--reference: expected one of cam0, cam1, cam2"),
+        (["--budget", "9"], "expected one of them"),
+        (["--frames", "5", "5"], "expected first < stop"),
+        (["--recording.route", "stereo", "--held-out", "held0"], "3 videos are fewer than the 5"),
+    ):
+        assert otsync([*base, *more]) == 2, more
+        assert says in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_run_goes_from_a_recording_to_a_scene_and_better_offsets(tmp_path, capsys):
+    """Offsets of several frames, found from the tracks, then refined from the images to hundredths."""
+    world, out = tmp_path / "world", tmp_path / "run"
+    assert main(["simulate", str(world), "--frames", "60", "--max-offset", "6", "--seed", "4"]) == 0
+    args = ["run", str(world), "--out", str(out), "--held-out", "held0", "--width", "160", "--steps", "500",
+            "--truth", str(world / "truth.json")]  # fmt: skip
+    assert otsync(args) in (0, 1)  # a coarse answer may be flagged
+    told = capsys.readouterr()
+    truth, coarse, found = (Offsets.load(p) for p in (world / "truth.json", out / "offsets_coarse.json", out / "offsets.json"))
+    assert coarse.names == found.names == ("cam0", "cam1", "cam2", "cam3", "cam4")
+    before, after = (np.abs(o.frames - truth.frames[:5])[1:] for o in (coarse, found))
+    assert np.abs(truth.frames[:5]).max() > 3 and before.max() < 1.5
+    assert after.mean() < 0.08 and after.max() < 0.16 and after.mean() < before.mean()
+    metrics = json.loads((out / "metrics.json").read_text())
+    view = metrics["views"][0]
+    assert view["clock"] == "found" and abs(view["offset_seconds"]) * 30 < 0.15
+    assert "route tracks" in told.err and (out / "sync.html").exists() and (out / "report.html").exists()
+    assert otsync(args) in (0, 1)  # everything is there: the same again, at once
+    assert json.loads((out / "metrics.json").read_text()) == metrics
