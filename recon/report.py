@@ -174,7 +174,7 @@ def views_over_time(views: Sequence[ViewScore]) -> str:
             values = np.array([frame[key] for frame in v.frames])
             if np.isfinite(values).any():
                 ax.plot(v.times, values, style, lw=1, color=color, label=v.name if style == "-" else None)
-    ax.set(xlabel="world seconds", ylabel="PSNR, dB (dashed: what moves)")
+    ax.set(xlabel="world seconds (dashed: what moves)", ylabel="PSNR, dB")
     if len(views) <= 10:
         ax.legend(fontsize=6, ncols=2)
     return svg(figure, "PSNR over time")
