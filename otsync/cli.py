@@ -1,4 +1,4 @@
-"""The command line: ``otsync demo | simulate | match | init | check | sync | bench``, over the same dataclasses as the library.
+"""The command line: ``otsync demo | simulate | match | init | check | sync | run | bench``, over the same dataclasses as the library.
 
 Exit codes: 0 done; 1 an answer was refused (its status is printed); 2 bad arguments or files; 130 interrupted.
 """
@@ -17,6 +17,7 @@ from . import __version__
 from .align import DTW, ConstantShift, LikelihoodScan
 from .anchored import AnchoredFGW
 from .commands_recordings import Check, Init, RecordingOptions, sync_recording
+from .commands_run import Run
 from .graph import Graph
 from .match import (
     EntropicFGW,
@@ -286,6 +287,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "init": Init,
     "check": Check,
     "sync": Sync,
+    "run": Run,
     "bench": Bench,
 }
 
