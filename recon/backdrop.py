@@ -194,9 +194,7 @@ def unchanging(footage: Footage, threshold: int = 14) -> tuple[UInt8[np.ndarray,
     return median.astype(np.uint8), changed.mean(0) <= 0.02
 
 
-def seeds(
-    stills: Sequence[Still], around: Surroundings, near: float, sh_degree: int = 0
-) -> tuple[Gaussians, Tensor]:
+def seeds(stills: Sequence[Still], around: Surroundings, near: float, sh_degree: int = 0) -> tuple[Gaussians, Tensor]:
     """(discs on the surfaces that the pictures show, one a voxel; the least standard deviation [N] of each)."""
     points, normals, colors = [], [], []
     for still in stills:
@@ -270,7 +268,9 @@ def underlay(fine: Discs, around: Surroundings) -> Discs:
 
     at, color, normal = mean(fine.at), mean(fine.color), mean(fine.normal)
     length = np.linalg.norm(normal, axis=1, keepdims=True)
-    normal = np.where(length > 0.3, normal / np.maximum(length, 1e-12), fine.normal[np.unique(inverse, return_index=True)[1]])
+    normal = np.where(
+        length > 0.3, normal / np.maximum(length, 1e-12), fine.normal[np.unique(inverse, return_index=True)[1]]
+    )
     behind = at - BEHIND * side * normal
     # rays from the middle to everywhere
     k = np.arange(FILLERS) + 0.5
