@@ -265,7 +265,9 @@ def test_run_goes_from_a_recording_to_a_scene_and_better_offsets(tmp_path, capsy
             "--truth", str(world / "truth.json")]  # fmt: skip
     assert otsync(args) in (0, 1)  # a coarse answer may be flagged
     told = capsys.readouterr()
-    truth, coarse, found = (Offsets.load(p) for p in (world / "truth.json", out / "offsets_coarse.json", out / "offsets.json"))
+    truth, coarse, found = (
+        Offsets.load(p) for p in (world / "truth.json", out / "offsets_coarse.json", out / "offsets.json")
+    )
     assert coarse.names == found.names == ("cam0", "cam1", "cam2", "cam3", "cam4")
     before, after = (np.abs(o.frames - truth.frames[:5])[1:] for o in (coarse, found))
     assert np.abs(truth.frames[:5]).max() > 3 and before.max() < 1.5
