@@ -93,11 +93,8 @@ class Run:
         for name, flags in zip(found.offsets.names, found.offsets.flags, strict=True):
             for flag in flags:
                 print(f"{name}: {flag.code}: {flag}", file=sys.stderr)
-        lifted = tuple(t for t in found.tracks if t.xyz is not None and len(t)) or None
         try:
-            return reconstructed(
-                scene, found.offsets, self.out, options, tracks=lifted, truth=self.truth, progress=progress,
-            )  # fmt: skip
+            return reconstructed(scene, found.offsets, self.out, options, truth=self.truth, progress=progress)
         except Diverged as error:
             print(f"otsync: {error}", file=sys.stderr)
             return 1

@@ -6,7 +6,7 @@ Everything is kept as uint8: 150 frames of 320 x 180 are 26 MB, their masks 9 MB
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -141,31 +141,6 @@ def footage_of(
         background=background, background_seen=seen, boxes=boxes_of(soft, bad, lens.size),
         readout=video.camera.readout, bad=bad,
     )  # fmt: skip
-
-
-def working_depth(
-    video: Video, depth: Sequence[Any] | None = None, *, width: int = 320, frames: slice | None = None
-) -> Callable[[int], Float[np.ndarray, "h w"] | None]:
-    """Depth of the frames of :func:`footage_of`, as a function frame -> (h,w) z in world units, 0 where unknown.
-
-    Args:
-        depth: maps of every frame of the video, (H,W) of any size; None: the video's own.
-
-    The nearest sample is taken, never a mean: between a body and the wall behind it there is nothing.
-    """
-    depth = video.depth if depth is None else depth
-    if depth is None:
-        raise ValueError(f"depth of {video.name!r}: expected depth maps; found none. Estimate depth, or give a folder.")
-    if len(depth) != len(video.frames):
-        raise ValueError(f"depth of {video.name!r}: expected {len(video.frames)} maps; found {len(depth)}.")
-    lens = Lens.of(video.camera, width)
-    picks = range(len(video.frames))[frames or slice(None)]
-
-    def at(frame: int) -> Float[np.ndarray, "h w"] | None:
-        given = depth[picks[frame]]
-        return None if given is None else lens.pick(np.asarray(given, np.float32))
-
-    return at
 
 
 def boxes_of(

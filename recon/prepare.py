@@ -189,11 +189,15 @@ def only(offsets: Offsets, names: Sequence[str]) -> Offsets:
     )  # fmt: skip
 
 
+MANY: dict[str, Any] = {"count": 700, "min_life": 10, "apart": 4.0}
+"""Tracks for a scaffold: more and shorter ones than synchronisation asks for, since every limb must have some."""
+
+
 def lifted_tracks(scene: Scene, offsets: Offsets, cache: Any, map: MapLike, progress: Progress) -> tuple[TrackSet, ...]:
     """Tracks in space of every video that has some: by given depth, else by hull and stereo at the offsets."""
     from otsync import recordings
 
-    stages = recordings.Stages()
+    stages = replace(recordings.Stages(), selection=recordings.Selection(**MANY))
     raw = recordings.track_all(scene, stages, cache, map, progress.tell)
     flat: list[TrackSet | None] = []
     for video, found in zip(scene.videos, raw, strict=True):
@@ -428,4 +432,6 @@ def seeded(
         working_depth(v, dict(zip(k, m, strict=True)).get, width=plan.width)
         for v, k, m in zip(scene.videos, wanted, maps, strict=True)
     ]
-    return seed(motion, footage, offsets, depth, footprint=footprint, frame_step=frame_step, span=span, times=times)
+    return seed(
+        motion, footage, offsets, depth, footprint=footprint, frame_step=frame_step, span=span, times=times, gains=gains,
+    )  # fmt: skip

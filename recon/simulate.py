@@ -356,17 +356,18 @@ def _body(b: int, rng: np.random.Generator) -> tuple[Parts, Callable[[np.ndarray
 
 
 def _room(rng: np.random.Generator) -> Gaussians:
-    """A floor and a round wall, blotchy."""
+    """A floor and a round wall of flat, overlapping discs, blotchy."""
     angle = rng.uniform(0, 2 * np.pi, 2500)
     floor = np.stack([*rng.uniform(-RADIUS, RADIUS, (2, 1500)), np.zeros(1500)], 1)
     wall = np.stack([RADIUS * np.sin(angle), RADIUS * np.cos(angle), rng.uniform(0, HEIGHT, 2500)], 1)
     at = np.concatenate([floor, wall])
-    colors = 0.5 + 0.15 * np.sin(2.3 * at) @ rng.standard_normal((3, 3)) + 0.1 * rng.standard_normal(at.shape)
-    n = len(at)
-    return Gaussians.from_colors(
-        torch.as_tensor(at, dtype=torch.float32), torch.tensor([1.0, 0, 0, 0]).repeat(n, 1), torch.full((n, 3), 0.1),
-        torch.full((n,), 0.95), torch.as_tensor(colors.clip(0, 1), dtype=torch.float32),
-    )  # fmt: skip
+    colors = 0.5 + 0.15 * np.sin(2.3 * at) @ rng.standard_normal((3, 3)) + 0.06 * rng.standard_normal(at.shape)
+    quats = np.zeros((len(at), 4))
+    quats[:1500, 0] = 1
+    quats[1500:] = np.stack([np.cos(-angle / 2), 0 * angle, 0 * angle, np.sin(-angle / 2)], 1)  # x along, y through
+    scales = np.concatenate([np.tile([0.14, 0.14, 0.01], (1500, 1)), np.tile([0.14, 0.01, 0.14], (2500, 1))])
+    arrays = (at, quats, scales, np.full(len(at), 0.95), colors.clip(0, 1))
+    return Gaussians.from_colors(*(torch.as_tensor(a, dtype=torch.float32) for a in arrays))
 
 
 def _camera(c: int, cameras: int, held_out: int, size: tuple[int, int], seed: int) -> Camera:

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import uniform_filter
 from scipy.optimize import minimize
 
-from recon.footage import Footage
+from recon.stills import Still
 
 AGREEMENT = 0.75
 """A surface is believed when colours on it differ by less than this share of what they differ overall."""
@@ -93,38 +93,38 @@ class Surroundings:
 
 
 def surroundings(
-    footage: Sequence[Footage],
+    stills: Sequence[Still],
     points: Float[np.ndarray, "N 3"] | None = None,
     floor: Floor | None = None,
 ) -> Surroundings:
-    """Find floor and shell from the backgrounds of static cameras.
+    """Find floor and shell from pictures of the background.
 
     Args:
-        points: of what moves, anywhere in time: they tell the scale of a scene that one camera filmed, and what the floor lies under.
+        points: of what moves, anywhere in time: they tell the scale of a scene that one camera filmed, and what the
+            floor lies under.
         floor: when it is known.
     """
-    focus, distance = look_at(footage, points)
-    views = [View.of(f) for f in footage]
-    if floor is None and len(footage) > 1:
-        floor = find_floor(views, up_axis(footage), focus, distance, points)
+    focus, distance = look_at(stills, points)
+    views = [View.of(s) for s in stills]
+    if floor is None and len(stills) > 1:
+        floor = find_floor(views, up_axis(stills), focus, distance, points)
     return Surroundings(floor, find_shell(views, focus, distance, floor), focus, distance)
 
 
 def look_at(
-    footage: Sequence[Footage], points: Float[np.ndarray, "N 3"] | None = None
+    stills: Sequence[Still], points: Float[np.ndarray, "N 3"] | None = None
 ) -> tuple[Float[np.ndarray, " 3"], float]:
     """The point that is nearest to all optical axes, and the cameras' median distance from it.
 
     Parallel axes meet nowhere: then, and for a single camera, the median of ``points`` is taken. ValueError without.
     """
-    centers, axes = _poses(footage)
+    centers, axes = np.stack([s.center for s in stills]), np.stack([s.w2c[2, :3] for s in stills])
     focus = None
-    if len(footage) > 1:
-        across = np.eye(3) - axes[:, :, None] * axes[:, None]  # projections onto the planes across the axes
-        if np.linalg.svd(across.sum(0))[1][-1] > 0.02 * len(footage):
-            focus = np.linalg.solve(across.sum(0), np.einsum("vij,vj->i", across, centers))
-            if np.median(((focus - centers) * axes).sum(1)) <= 0:
-                focus = None
+    across = np.eye(3) - axes[:, :, None] * axes[:, None]  # projections onto the planes across the axes
+    if np.linalg.svd(across.sum(0))[1][-1] > 0.02 * len(stills):
+        focus = np.linalg.solve(across.sum(0), np.einsum("vij,vj->i", across, centers))
+        if np.median(((focus - centers) * axes).sum(1)) <= 0:
+            focus = None
     if focus is None:
         if points is None or not len(points):
             raise ValueError(
@@ -135,15 +135,15 @@ def look_at(
     return focus, float(np.median(np.linalg.norm(focus - centers, axis=1)))
 
 
-def up_axis(footage: Sequence[Footage]) -> Float[np.ndarray, " 3"]:
+def up_axis(stills: Sequence[Still]) -> Float[np.ndarray, " 3"]:
     """The direction that is up in the images of most cameras, at right angles to their horizontals as far as can be.
 
     Cameras around a scene are pitched towards it, which the horizontals do not show; a few that stand side by side
     have but one horizontal, and the images' vertical decides.
     """
-    w2c = np.stack([f.pose(0) for f in footage])
+    w2c = np.stack([s.w2c for s in stills])
     across, up = w2c[:, 0, :3], -w2c[:, 1, :3].mean(0)
-    moment = across.T @ across / len(footage) - 0.1 * np.outer(up, up)
+    moment = across.T @ across / len(stills) - 0.1 * np.outer(up, up)
     axis = np.linalg.eigh(moment)[1][:, 0]
     return axis * np.sign(axis @ up)
 
@@ -178,21 +178,22 @@ def find_floor(
     scores = [disagreement(views, at(h, np.zeros(2))) for h in heights]
     best = int(np.argmin(scores))
     step = heights[1] - heights[0]
-    found = minimize(
-        lambda x: disagreement(views, at(heights[best] + x[0] * step, x[1:] * 0.01)), np.zeros(3),
-        method="Nelder-Mead", options={"maxfev": 120, "initial_simplex": np.vstack([np.zeros(3), np.eye(3)])},
-    )  # fmt: skip
-    if not found.fun < AGREEMENT:
-        return None
+
+    def cost(x: np.ndarray) -> float:
+        """Of a height and a tilt; few cameras would else agree on a tilt that suits a stain."""
+        return disagreement(views, at(heights[best] + x[0] * step, x[1:] * 0.01)) + 0.02 * float((x[1:] ** 2).sum()) / 9
+
+    start = np.vstack([np.zeros(3), np.eye(3)])
+    found = minimize(cost, start[0], method="Nelder-Mead", options={"maxfev": 160, "initial_simplex": start})
     height, tilt = heights[best] + found.x[0] * step, found.x[1:] * 0.01
+    if not disagreement(views, at(height, tilt)) < AGREEMENT:
+        return None
     normal = up - tilt @ frame
     normal /= np.linalg.norm(normal)
     return Floor(normal, float(at(height, tilt)[0] @ normal))
 
 
-def find_shell(
-    views: Sequence[View], focus: Float[np.ndarray, " 3"], distance: float, floor: Floor | None
-) -> Shell:
+def find_shell(views: Sequence[View], focus: Float[np.ndarray, " 3"], distance: float, floor: Floor | None) -> Shell:
     """The sphere on which the cameras agree best about what is not floor; a wide one where none convinces.
 
     Centres tried: that of the sphere through the cameras (they hang on a dome), the focus, and the cameras' own middle
@@ -202,22 +203,26 @@ def find_shell(
     origin = np.concatenate([np.broadcast_to(v.center, v.rays.shape) for v in views])
     rays = np.concatenate([v.rays for v in views])
     below = np.full(len(rays), np.inf) if floor is None else floor.hit(origin, rays)
-    best = Shell(focus, 2.5 * distance)
-    least = AGREEMENT
+    wide = Shell(focus, 2.5 * distance)
     if len(views) < 2:
-        return best
+        return wide
+
+    def cost(shell: Shell) -> float:
+        away = shell.hit(origin, rays)
+        ok = np.isfinite(away) & (away < below)
+        return disagreement(views, origin[ok] + away[ok, None] * rays[ok]) if ok.mean() > 0.02 else 1.0
+
+    tried: list[tuple[float, Shell]] = []
     for middle in (_sphere(centers, focus, distance), focus, centers.mean(0)):
-        nearest = np.linalg.norm(centers - middle, axis=1).max()
-        for radius in np.geomspace(max(nearest, 0.5 * distance), 8 * distance, 48):
-            shell = Shell(middle, float(radius))
-            away = shell.hit(origin, rays)
-            ok = np.isfinite(away) & (away < below)
-            if ok.mean() < 0.02:
-                continue
-            score = disagreement(views, origin[ok] + away[ok, None] * rays[ok])
-            if score < least:
-                best, least = shell, score
-    return best
+        least = max(np.linalg.norm(centers - middle, axis=1).max(), 0.5 * distance)
+        radii = np.geomspace(least, 8 * distance, 20)
+        costs = [cost(Shell(middle, float(r))) for r in radii]
+        i = int(np.argmin(costs))
+        around = np.geomspace(radii[max(i - 1, 0)], radii[min(i + 1, len(radii) - 1)], 9)
+        tried += [(c, Shell(middle, float(r))) for r, c in zip(radii, costs, strict=True)]
+        tried += [(cost(shell), shell) for shell in (Shell(middle, float(r)) for r in around)]
+    score, best = min(tried, key=lambda pair: pair[0])
+    return best if score < AGREEMENT else wide
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,15 +237,10 @@ class View:
     rays: Float[np.ndarray, "N 3"]
 
     @classmethod
-    def of(cls, footage: Footage) -> View:
-        assert footage.background is not None and footage.background_seen is not None
-        width, height = footage.size
-        blurred = uniform_filter(footage.background.astype(np.float32) / 255, (5, 5, 0))
-        step = max(1, width // 40)
-        v, u = np.mgrid[step // 2 : height : step, step // 2 : width : step].reshape(2, -1)
-        keep = footage.background_seen[v, u]
-        center, rays = pixel_rays(footage, u[keep], v[keep])
-        return cls(np.log(blurred + 0.02), footage.background_seen, footage.K, footage.w2c, center, rays)
+    def of(cls, still: Still) -> View:
+        blurred = uniform_filter(still.image.astype(np.float32) / 255, (5, 5, 0))
+        u, v = still.pixels(max(1, still.size[0] // 32))
+        return cls(np.log(blurred + 0.02), still.where, still.K, still.w2c, still.center, still.rays(u, v))
 
     def look(self, points: Float[np.ndarray, "N 3"]) -> tuple[Float[np.ndarray, "N 3"], Bool[np.ndarray, " N"]]:
         """(log colours, which are in view) of points."""
@@ -275,22 +275,6 @@ def disagreement(views: Sequence[View], points: Float[np.ndarray, "N 3"]) -> flo
     within = (np.abs(colors - mean) * weight * np.sqrt(count / (count - 1))).sum()
     overall = np.median(colors[ok[:, twice]], 0)
     return float(within / max((np.abs(colors - overall) * weight).sum(), 1e-12))
-
-
-def pixel_rays(
-    footage: Footage, u: np.ndarray, v: np.ndarray
-) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, "N 3"]]:
-    """(camera centre, unit directions in the world) of the pixels in columns ``u`` and rows ``v`` of a static camera."""
-    w2c = footage.pose(0)
-    local = np.stack([u + 0.5, v + 0.5, np.ones(len(u))], 1) @ np.linalg.inv(footage.K).T
-    world = local @ w2c[:3, :3]
-    return -w2c[:3, :3].T @ w2c[:3, 3], world / np.linalg.norm(world, axis=1, keepdims=True)
-
-
-def _poses(footage: Sequence[Footage]) -> tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, "V 3"]]:
-    """Centres and optical axes, of the first frame where cameras move."""
-    w2c = np.stack([f.pose(0) for f in footage])
-    return -np.einsum("vji,vj->vi", w2c[:, :3, :3], w2c[:, :3, 3]), w2c[:, 2, :3]
 
 
 def _sphere(

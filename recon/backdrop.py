@@ -1,0 +1,459 @@
+"""The static part of a scene: Gaussians fitted once to what fixed cameras see behind the things that move.
+
+The background needs no synchronisation, so it is fitted before any motion and then stays as it is. Seeds come from
+depth where it is given, else from a floor and a shell (:mod:`recon.surroundings`).
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from scipy.spatial import cKDTree
+from torch import Tensor
+from tqdm import tqdm
+
+from recon.depth import Depths
+from recon.footage import Footage
+from recon.gaussians import Gaussians
+from recon.raster import render, sh
+from recon.ssim import SMALL, photometric
+from recon.stills import Still, stills_of
+from recon.surroundings import Floor, Surroundings, surroundings
+
+log = logging.getLogger("recon.backdrop")
+
+NEAR = 0.22
+"""Near plane, as a share of the cameras' distance from the scene: what is seen from one side only must not stand before
+the eyes of another camera (with .01 m a held-out camera was blacked out: 6 dB)."""
+
+RATES: Mapping[str, float] = {
+    "means": 0.2,
+    "quats": 3e-3,
+    "log_scales": 8e-3,
+    "opacity_logits": 0.03,
+    "sh": 0.018,
+    "gains": 2e-3,
+}
+"""Adam's steps at the start; means in footprints. Slower means stay on the seeds' surface, which is only a guess."""
+
+HOLD, LAST = 0.3, 0.03
+"""Rates are constant for this share of the steps, then fall exponentially to this factor at the end."""
+
+STRIDE, VOXEL = 80, 2.6
+"""Rays per image width that seeds are cast along; spacing of seeds in pixels of the camera that is nearest."""
+
+OPACITY = 0.82
+
+COARSE, BEHIND, FILLERS = 5.0, 0.15, 1500
+"""The layer below: its spacing relative to the seeds', how far behind them it lies in its own spacings, and how many
+discs cover the whole sphere of directions where no camera looked."""
+
+THICKNESS = 0.2
+"""Of a seed along the surface's normal, relative to its width."""
+
+SHARPEST = 0.4
+"""Least standard deviation of a Gaussian, in pixels of the nearest camera: a held-out camera may come closer, and would
+see the gaps between finer ones (the smoothing filter of Mip-Splatting, Yu et al. 2024)."""
+
+
+@dataclass(frozen=True, eq=False)
+class StaticFit:
+    """A fitted background.
+
+    Args:
+        gaussians: on the CPU, without a graph.
+        gains: (V,3) factors of every video's colours relative to the Gaussians'; 1 for videos that took no part.
+        near: near plane to render with, world units.
+        psnr: (V,) dB over the seen background of every video, gains applied; nan for videos that took no part.
+        floor: found or given, or None.
+        stats: seconds, steps, seeds, loss.
+    """
+
+    gaussians: Gaussians
+    gains: Float[np.ndarray, "V 3"]
+    near: float
+    psnr: Float[np.ndarray, " V"]
+    floor: Floor | None = None
+    stats: dict[str, float] = field(default_factory=dict)
+
+
+def fit_backdrop(
+    footage: Sequence[Footage],
+    *,
+    depth: Sequence[Depths | None] | None = None,
+    points: Float[np.ndarray, "N 3"] | None = None,
+    floor: Floor | None = None,
+    steps: int | None = None,
+    budget: float | None = None,
+    sh_degree: int = 0,
+    rates: Mapping[str, float] = RATES,
+    seed: int = 0,
+    device: torch.device | str = "cpu",
+    progress: bool = True,
+) -> StaticFit:
+    """Fit static Gaussians to the backgrounds of the videos.
+
+    Args:
+        depth: per video, maps that include the background, of some frames at least; None: not known.
+        points: some positions of what moves, (N,3): scale and floor of a scene that cameras alone do not tell.
+        floor: the ground plane, when it is known; else it is searched for.
+        steps, budget: how long: a number of steps, or wall seconds. Default: 1500 steps.
+        sh_degree: of the view-dependent colour. With 14 cameras degree 1 fits them better, new views worse.
+        rates: a group without one is frozen.
+
+    The result depends on the seed, not on the number of threads (with ``budget`` on the machine's speed as well).
+    Raises ValueError when no video has a background: give masks; FloatingPointError when the fit diverges.
+    """
+    total = _total(steps, budget)
+    unknown = sorted(set(rates) - set(RATES))
+    if unknown:
+        raise ValueError(f"rates: expected some of {', '.join(RATES)}; found {', '.join(unknown)}.")
+    stills = stills_of(footage, depth)
+    if not stills or not any(s.where.any() for s in stills):
+        raise ValueError(
+            "footage: expected a video whose background shows; found none. Give masks, which tell it from what moves."
+        )
+    started = time.perf_counter()
+    around = surroundings(_some(stills, 32), points, floor)
+    near = NEAR * around.distance
+    start, sharpest = seeds(stills, around, near, sh_degree)
+    log.info("backdrop: %d seeds, near plane %.3g", len(start), near)
+    fit = _Fit(start, sharpest.to(device), stills, len(footage), near, around, rates, seed, device)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # torch's pool would compete with the rasterizer's
+    try:
+        loss = fit.run(total, budget, progress)
+    finally:
+        torch.set_num_threads(threads)
+    gains, scores = fit.result(len(footage))
+    stats = {"seconds": time.perf_counter() - started, "steps": fit.step, "seeds": len(start), "loss": loss}
+    return StaticFit(fit.gaussians().detach(), gains, near, scores, around.floor, stats)
+
+
+def colour_gain(
+    rendered: Float[np.ndarray, "h w 3"], image: Float[np.ndarray, "h w 3"], mask: np.ndarray | None = None
+) -> Float[np.ndarray, " 3"]:
+    """The factor per channel by which ``rendered`` is nearest to ``image`` (least squares), both uint8 or 0..1.
+
+    mask: (h,w) weights of pixels. For a camera that no fit saw give its static part only, never people.
+    """
+    x, y = (_unit(a) for a in (rendered, image))
+    w = np.ones(x.shape[:2]) if mask is None else np.asarray(mask, float)
+    if not (w > 0).any():
+        raise ValueError("mask: expected some pixels of the static part; found none.")
+    down = np.einsum("hw,hwc->c", w, x * x)
+    return np.where(down > 1e-9, np.einsum("hw,hwc->c", w, x * y) / np.maximum(down, 1e-9), 1.0)
+
+
+def backdrop_of(
+    fit: StaticFit, footage: Footage, gain: Float[np.ndarray, " 3"] | None = None, frame: int = 0
+) -> Float[np.ndarray, "h w 3"]:
+    """What the camera of ``footage`` sees of the static scene, float32 in 0..1, times ``gain``."""
+    with torch.no_grad():
+        w2c, K = (torch.as_tensor(a, dtype=torch.float32)[None] for a in (footage.pose(frame), footage.K))
+        seen = _render(fit.gaussians, w2c, K, footage.size, fit.near)[0].numpy()
+    return (seen if gain is None else seen * np.asarray(gain, np.float32)).clip(0, 1)
+
+
+def with_backdrop(
+    fit: StaticFit, footage: Footage, gain: Float[np.ndarray, " 3"] | None = None, *, everywhere: bool = False
+) -> Footage:
+    """``footage`` of a fixed camera with the static scene as its background where its own was never seen.
+
+    Args:
+        gain: of the camera; None: fitted on the part of its background that was seen.
+        everywhere: take nothing from the video itself: how a held-out camera is rendered.
+    """
+    if footage.w2c.ndim != 2:
+        raise ValueError(f"footage {footage.name!r}: expected a fixed camera; found a moving one. Render it jointly.")
+    background, seen = footage.background, footage.background_seen
+    if background is None or seen is None:
+        background, seen = unchanging(footage)
+    if gain is None:
+        gain = colour_gain(backdrop_of(fit, footage), background, seen) if seen.any() else np.ones(3)
+    own = np.zeros_like(seen) if everywhere or footage.background is None else seen
+    rendered = np.rint(255 * backdrop_of(fit, footage, gain)).astype(np.uint8)
+    return replace(
+        footage, background=np.where(own[..., None], background, rendered), background_seen=np.ones_like(seen)
+    )
+
+
+def unchanging(footage: Footage, threshold: int = 14) -> tuple[UInt8[np.ndarray, "h w 3"], np.ndarray]:
+    """(median image, where at most 2 % of the frames differ from it by ``threshold``) of a fixed camera without masks."""
+    good = np.flatnonzero(~footage.bad)
+    images = footage.images[good[np.unique(np.linspace(0, len(good) - 1, min(50, len(good))).round().astype(int))]]
+    median = np.median(images, 0).astype(np.int16)
+    changed = np.stack([np.abs(image - median).max(-1) > threshold for image in images])
+    return median.astype(np.uint8), changed.mean(0) <= 0.02
+
+
+def seeds(stills: Sequence[Still], around: Surroundings, near: float, sh_degree: int = 0) -> tuple[Gaussians, Tensor]:
+    """(discs on the surfaces that the pictures show, one a voxel; the least standard deviation [N] of each)."""
+    points, normals, colors = [], [], []
+    for still in stills:
+        u, v = still.pixels(max(1, round(still.size[0] / STRIDE)))
+        directions = still.rays(u, v)
+        away, normal = around.cast(np.broadcast_to(still.center, directions.shape), directions)
+        at = still.center + np.where(np.isfinite(away), away, 0)[:, None] * directions
+        known = np.isfinite(away)
+        if still.depth is not None:
+            z = still.depth[v, u]
+            given = z > 0
+            at[given] = still.lift(u[given], v[given], z[given])
+            normal = np.where(given[:, None], still_normals(still, u, v), normal)
+            known |= given
+        keep = known & ((at - still.center) @ still.w2c[2, :3] > near)
+        points.append(at[keep])
+        normals.append(normal[keep])
+        colors.append(still.image[v, u][keep] / 255)
+    at, normal, color = (np.concatenate(a) for a in (points, normals, colors))
+    pixel = _nearest_pixel(stills, at, near)
+    # voxels of a power of two times the smallest, so that far things are not seeded finer than they are seen
+    base = np.percentile(pixel, 1)
+    level = np.maximum(np.floor(np.log2(pixel / base) + 0.5), 0)
+    side = VOXEL * base * 2.0**level
+    cell = np.concatenate([level[:, None], np.floor(at / side[:, None])], 1).astype(np.int64)
+    first = np.sort(np.unique(cell, axis=0, return_index=True)[1])
+    fine = Discs(at[first], normal[first], color[first], 0.45 * side[first], pixel[first], OPACITY)
+    return Discs.join([fine, underlay(fine, around)]).gaussians(sh_degree)
+
+
+@dataclass(frozen=True, eq=False)
+class Discs:
+    """Flat seeds: positions, normals and colours [N,3]; widths and the size of the nearest camera's pixel [N]."""
+
+    at: Float[np.ndarray, "N 3"]
+    normal: Float[np.ndarray, "N 3"]
+    color: Float[np.ndarray, "N 3"]
+    width: Float[np.ndarray, " N"]
+    pixel: Float[np.ndarray, " N"]
+    opacity: float | Float[np.ndarray, " N"]
+
+    @staticmethod
+    def join(groups: Sequence[Discs]) -> Discs:
+        parts = [{**vars(g), "opacity": np.broadcast_to(g.opacity, len(g.at))} for g in groups]
+        return Discs(**{name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
+
+    def gaussians(self, sh_degree: int) -> tuple[Gaussians, Tensor]:
+        """(the Gaussians, their least standard deviation [N])."""
+        scales = self.width[:, None] * np.array([1, 1, THICKNESS])
+        coefficients = np.zeros((len(self.at), (sh_degree + 1) ** 2, 3))
+        coefficients[:, 0] = (self.color - 0.5) / sh.C0
+        opacity = np.broadcast_to(self.opacity, len(self.at))
+        arrays = (self.at, _facing(self.normal), np.log(scales), np.log(opacity / (1 - opacity)), coefficients)
+        gaussians = Gaussians(*(torch.as_tensor(np.ascontiguousarray(a), dtype=torch.float32) for a in arrays))
+        return gaussians, torch.as_tensor(SHARPEST * self.pixel, dtype=torch.float32)
+
+
+def underlay(fine: Discs, around: Surroundings) -> Discs:
+    """Coarse opaque discs a little behind the fine ones, and on floor and shell where no camera looked.
+
+    New views look through the gaps that the cameras did not see, and past what they saw: into black, without these.
+    """
+    side = COARSE * np.median(fine.width) / 0.45
+    cell, inverse, count = np.unique(
+        np.floor(fine.at / side).astype(np.int64), axis=0, return_inverse=True, return_counts=True
+    )
+    inverse = inverse.ravel()
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        return np.stack([np.bincount(inverse, column, len(cell)) for column in values.T], 1) / count[:, None]
+
+    at, color, normal = mean(fine.at), mean(fine.color), mean(fine.normal)
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    normal = np.where(
+        length > 0.3, normal / np.maximum(length, 1e-12), fine.normal[np.unique(inverse, return_index=True)[1]]
+    )
+    behind = at - BEHIND * side * normal
+    # rays from the middle to everywhere
+    k = np.arange(FILLERS) + 0.5
+    polar, turn = np.arccos(1 - 2 * k / FILLERS), np.pi * (1 + 5**0.5) * k
+    rays = np.stack([np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)], 1)
+    away, facing = around.cast(np.broadcast_to(around.focus, rays.shape), rays)
+    known = np.isfinite(away)
+    far = around.focus + (away[known] * 1.05)[:, None] * rays[known]
+    width = away[known] * (4 * np.pi / FILLERS) ** 0.5
+    near, which = cKDTree(at).query(far, k=min(8, len(at)))
+    near, which = near.reshape(len(far), -1), which.reshape(len(far), -1)
+    empty = near[:, 0] > 1.5 * width
+    weight = 1 / (near[empty] + 1e-9)
+    guess = (color[which[empty]] * weight[..., None]).sum(1) / weight.sum(1, keepdims=True)
+    return Discs(
+        np.concatenate([behind, far[empty]]), np.concatenate([normal, facing[known][empty]]),
+        np.concatenate([color, guess]), np.concatenate([np.full(len(at), 0.6 * side), width[empty]]),
+        np.full(len(at) + int(empty.sum()), np.median(fine.pixel)), 0.98,
+    )  # fmt: skip
+
+
+def still_normals(still: Still, u: np.ndarray, v: np.ndarray) -> Float[np.ndarray, "N 3"]:
+    """Surface normals from the depths around pixels, towards the camera; towards it altogether where they are unknown."""
+    assert still.depth is not None
+    width, height = still.size
+    reach = max(2, width // 80)
+
+    def at(du: int, dv: int) -> tuple[np.ndarray, np.ndarray]:
+        x, y = (u + du).clip(0, width - 1), (v + dv).clip(0, height - 1)
+        assert still.depth is not None
+        z = still.depth[y, x]
+        return still.lift(x, y, z), z > 0
+
+    (left, a), (right, b), (up, c), (down, d) = at(-reach, 0), at(reach, 0), at(0, -reach), at(0, reach)
+    normal = np.cross(down - up, right - left)  # image axes x right, y down: this looks back at the camera
+    length = np.linalg.norm(normal, axis=1)
+    back = -still.rays(u, v)
+    good = a & b & c & d & (length > 0)
+    normal = normal / np.maximum(length, 1e-12)[:, None]
+    return np.where((good & ((normal * back).sum(1) > 0.1))[:, None], normal, back)
+
+
+class _Fit:
+    """A background fit under way."""
+
+    def __init__(
+        self, start: Gaussians, sharpest: Tensor, stills: Sequence[Still], videos: int, near: float,
+        around: Surroundings, rates: Mapping[str, float], seed: int, device: torch.device | str,
+    ):  # fmt: skip
+        self.sharpest, self.near, self.stills, self.seed, self.step = sharpest, near, stills, seed, 0
+        footprint = around.distance / float(np.median([s.K[0, 0] for s in stills]))
+        values = {**vars(start), "gains": torch.zeros(videos, 3)}
+        self.groups = {name: value.to(device).clone() for name, value in values.items()}
+        self.rates = {n: r * (footprint if n == "means" else 1.0) for n, r in rates.items() if self.groups[n].numel()}
+        for name in self.rates:
+            self.groups[name].requires_grad_()
+        self.adam = torch.optim.Adam(
+            [{"params": [self.groups[n]], "lr": r, "name": n} for n, r in self.rates.items()],
+            betas=(0.9, 0.99), eps=1e-15, fused=True,
+        )  # fmt: skip
+        self.views = [
+            (
+                *(torch.as_tensor(a, dtype=torch.float32, device=device)[None] for a in (s.w2c, s.K)),
+                torch.as_tensor(s.image, device=device),
+                torch.as_tensor(s.where, device=device),
+            )
+            for s in stills
+        ]
+
+    def gaussians(self) -> Gaussians:
+        """The Gaussians as they are drawn, no sharper than they were seen."""
+        g = self.groups
+        scales = torch.logaddexp(2 * g["log_scales"], 2 * self.sharpest.log()[:, None]) / 2
+        return Gaussians(g["means"], g["quats"], scales, g["opacity_logits"], g["sh"])
+
+    def see(self, i: int) -> tuple[Tensor, Tensor, Tensor]:
+        """(rendered, filmed, where) of still i."""
+        w2c, K, image, where = self.views[i]
+        still = self.stills[i]
+        seen = _render(self.gaussians(), w2c, K, still.size, self.near)[0] * (1 + self.groups["gains"][still.video])
+        return seen, image.to(seen) / 255, where.to(seen)
+
+    def run(self, total: int | None, budget: float | None, progress: bool) -> float:
+        """All steps; the mean loss of the last tenth."""
+        rng = np.random.default_rng([self.seed, 2])
+        order: list[int] = []
+        recent: list[float] = []
+        began = time.perf_counter()
+        with tqdm(total=total, desc="backdrop", unit="step", disable=None if progress else True) as bar:
+            while total is None or self.step < total:
+                if not order:
+                    order = rng.permutation(len(self.views)).tolist()
+                recent.append(self.one_step(order.pop(), 0.0 if total is None else self.step / total))
+                bar.update()
+                if total is None and self.step == 10:
+                    began = time.perf_counter()  # what comes before is compilation and warming up
+                if total is None and self.step == 30:
+                    assert budget is not None
+                    total = max(30, int(20 * budget / (time.perf_counter() - began)))
+                    bar.total = total
+                if self.step % 50 == 0:
+                    bar.set_postfix_str(f"loss {np.mean(recent[-50:]):.4f}", refresh=False)
+        return float(np.mean(recent[-max(1, len(recent) // 10) :])) if recent else math.nan
+
+    def one_step(self, i: int, progress: float) -> float:
+        """One picture, one step of Adam; the loss."""
+        seen, image, where = self.see(i)
+        loss = photometric(seen, image, where, 0.2, SMALL)
+        if loss is None:  # nothing of the background shows in this picture
+            self.step += 1
+            return 0.0
+        # gains and colours share one freedom: keep the mean gain near 1
+        total = loss + 0.01 * self.groups["gains"].square().sum()
+        value = float(total.detach())
+        if not math.isfinite(value):
+            raise FloatingPointError(f"backdrop: the loss is no number at step {self.step}: lower the rates")
+        self.adam.zero_grad(set_to_none=True)
+        total.backward()
+        factor = LAST ** max(0.0, (progress - HOLD) / (1 - HOLD))
+        for group in self.adam.param_groups:
+            group["lr"] = self.rates[group["name"]] * factor
+        self.adam.step()
+        self.step += 1
+        return value
+
+    def result(self, videos: int) -> tuple[np.ndarray, np.ndarray]:
+        """(gains [V,3], PSNR [V])."""
+        error, weight = np.zeros(videos), np.zeros(videos)
+        with torch.no_grad():
+            for i, still in enumerate(self.stills):
+                seen, image, where = self.see(i)
+                error[still.video] += float(((seen.clamp(0, 1) - image).square().mean(-1) * where).sum())
+                weight[still.video] += float(where.sum())
+        with np.errstate(divide="ignore", invalid="ignore"):
+            scores = -10 * np.log10(error / weight)
+        gains = 1 + self.groups["gains"].detach().cpu().numpy().astype(float)
+        gains[weight == 0] = 1
+        return gains, np.where(weight > 0, scores, np.nan)
+
+
+def _render(gaussians: Gaussians, w2c: Tensor, K: Tensor, size: tuple[int, int], near: float) -> Tensor:
+    """Colours [1,h,w,3]."""
+    degree = gaussians.sh_degree or None
+    colors = gaussians.sh if degree else (sh.C0 * gaussians.sh[:, 0] + 0.5).clamp_min(0)
+    splats = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, colors)
+    return render(*splats, w2c, K, *size, near_plane=near, depth=None, sh_degree=degree).colors
+
+
+def _nearest_pixel(stills: Sequence[Still], points: Float[np.ndarray, "N 3"], near: float) -> Float[np.ndarray, " N"]:
+    """World size of a pixel at each point, in the picture that shows it largest."""
+    size = np.full(len(points), np.inf)
+    for still in stills:
+        cam = points @ still.w2c[:3, :3].T + still.w2c[:3, 3]
+        z = np.maximum(cam[:, 2], 1e-9)
+        uv = cam[:, :2] / z[:, None] * still.K[[0, 1], [0, 1]] + still.K[:2, 2]
+        seen = (cam[:, 2] > near) & (uv > 0).all(1) & (uv < still.size).all(1)
+        size = np.where(seen, np.minimum(size, z / still.K[0, 0]), size)
+    return np.where(np.isfinite(size), size, np.median(size[np.isfinite(size)]) if np.isfinite(size).any() else 1.0)
+
+
+def _facing(normals: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 4"]:
+    """Quaternions wxyz that turn z to the normals."""
+    x, y, z = normals.T
+    quats = np.stack([1 + z, -y, x, np.zeros_like(z)], 1)
+    quats[np.linalg.norm(quats, axis=1) < 1e-3] = 0, 1, 0, 0  # half a turn about x
+    return quats / np.linalg.norm(quats, axis=1, keepdims=True)
+
+
+def _some(stills: list[Still], most: int) -> list[Still]:
+    """At most so many, spread over all."""
+    return [stills[i] for i in np.unique(np.linspace(0, len(stills) - 1, min(most, len(stills))).round().astype(int))]
+
+
+def _unit(image: np.ndarray) -> np.ndarray:
+    values = np.asarray(image)
+    return values / 255 if values.dtype == np.uint8 else values.astype(float)
+
+
+def _total(steps: int | None, budget: float | None) -> int | None:
+    if steps is not None and budget is not None:
+        raise ValueError("steps, budget: expected one of them; found both.")
+    if budget is not None and not (math.isfinite(budget) and budget > 0):
+        raise ValueError(f"budget: expected seconds above 0; found {budget}.")
+    if steps is not None and steps < 0:
+        raise ValueError(f"steps: expected 0 or more; found {steps}.")
+    return None if budget is not None else 1500 if steps is None else steps
