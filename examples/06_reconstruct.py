@@ -34,7 +34,9 @@ def main(out: Path = Path("out/reconstruct"), steps: int = 700, seed: int = 1) -
         truth=truth, steps=steps, progress=Progress(print),
     )  # fmt: skip
     offsets = outcome.found.offsets
-    for name, before, after, true in zip(offsets.names, outcome.coarse.frames, offsets.frames, outcome.truth, strict=True):
+    for name, before, after, true in zip(
+        offsets.names, outcome.coarse.frames, offsets.frames, outcome.truth, strict=True
+    ):
         print(f"{name}: {before:6.3f} -> {after:6.3f} frames (true {true * 30:6.3f})")
     for view in outcome.views:
         print(f"{view.name}: {view.mean['psnr']:.2f} dB, {view.mean['mask_psnr']:.2f} dB where things move")

@@ -240,6 +240,15 @@ def lifted_tracks(scene: Scene, offsets: Offsets, cache: Any, map: MapLike, prog
     return tuple(out)
 
 
+def without_depth(scene: Scene) -> set[str]:
+    """Names of videos that came without depth and for which none can be measured."""
+    from otsync.recordings import Stages
+
+    static = [v.name for v in scene.videos if v.camera.w2c.ndim == 2]
+    measured = set(static) if len(static) >= Stages().stereo.min_views else set()
+    return {v.name for v in scene.videos if v.depth is None} - measured
+
+
 def read_footage(scene: Scene, width: int, cache: Any, map: MapLike, progress: Progress) -> tuple[Footage, ...]:
     """Frames, masks and backgrounds of every video at working size."""
     from otsync.recordings import Stages
@@ -413,7 +422,11 @@ def seeded(
     worlds = [offsets.rates[v] * f.times + offsets.seconds[v] for v, f in enumerate(footage)]
     span = (float(min(t[0] for t in worlds)), float(max(t[-1] for t in worlds)))
     times = moments(span, frame_step)
-    wanted = [sorted({int(np.argmin(np.abs(w - t))) for t in times}) for w in worlds]
+    blind = without_depth(scene)
+    wanted = [
+        [] if v.name in blind else sorted({int(np.argmin(np.abs(w - t))) for t in times})
+        for v, w in zip(scene.videos, worlds, strict=True)
+    ]
     maps = depth_maps(scene, offsets, wanted, width=plan.width, cache=cache, map=map)
     depth = [
         working_depth(v, dict(zip(k, m, strict=True)).get, width=plan.width)

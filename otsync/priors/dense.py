@@ -58,7 +58,9 @@ class DenseStereo:
         wanted: dict[int, list[tuple[int, int]]] = {}
         for v, chosen in enumerate(frames):
             for k in sorted(set(chosen)):
-                wanted.setdefault(self._moment(rig, v, k), []).append((v, k))
+                s = self._moment(rig, v, k)
+                if s is not None:
+                    wanted.setdefault(s, []).append((v, k))
 
         def moment(item: tuple[int, list[tuple[int, int]]]) -> dict[str, np.ndarray]:
             s, views = item
@@ -67,11 +69,14 @@ class DenseStereo:
         found: dict[tuple[int, int], np.ndarray] = {}
         for (_, views), maps in zip(wanted.items(), map(moment, wanted.items()), strict=True):
             found |= {(v, k): maps[f"depth{v}_{k}"] for v, k in views}
-        sizes = [self.size(f) for f in rig.frames]
-        return [
-            np.stack([found[v, k] for k in chosen]) if len(chosen) else np.zeros((0, h, w), np.float32)
-            for v, (chosen, (w, h)) in enumerate(zip(frames, sizes, strict=True))
-        ]
+        out = []
+        for v, chosen in enumerate(frames):
+            w, h = self.size(rig.frames[v])
+            empty = np.zeros((h, w), np.float32)
+            out.append(
+                np.stack([found.get((v, k), empty) for k in chosen]) if len(chosen) else np.zeros((0, h, w), np.float32)
+            )
+        return out
 
     def size(self, frames: WorkingFrames) -> tuple[int, int]:
         """Width and height of a video's maps."""
@@ -79,11 +84,16 @@ class DenseStereo:
         scale = min(1.0, self.width / w)
         return max(1, round(w * scale)), max(1, round(h * scale))
 
-    def _moment(self, rig: Rig, v: int, k: int) -> int:
-        """The row of the rig in which video v shows its frame k."""
+    def _moment(self, rig: Rig, v: int, k: int) -> int | None:
+        """The row of the rig in which video v shows its frame k; None for one between two moments.
+
+        At fractional offsets the first and last frames may lie beyond the grid, and of two frames that are equally
+        near to a moment only one is shown.
+        """
         if not 0 <= k < len(rig.frames[v]):
             raise ValueError(f"frames[{v}]: expected indices below {len(rig.frames[v])}; found {k}.")
-        return int(np.flatnonzero(rig.index[:, v] == k)[0])
+        rows = np.flatnonzero(rig.index[:, v] == k)
+        return int(rows[0]) if len(rows) else None
 
     def _moment_maps(self, rig: Rig, space: Space, s: int, views: list[tuple[int, int]]) -> dict[str, np.ndarray]:
         present = np.flatnonzero(rig.index[s] >= 0)

@@ -41,7 +41,7 @@ class ScaffoldOptions:
     unit: float | None = None
     second_pick: float = 0.8
     fewest: int = 32
-    most: int = 900
+    most: int = 1800
     spacing: float = 4 * FRAME
     margin: float = 4 * FRAME
     per_video: bool = False

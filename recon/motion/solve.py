@@ -12,7 +12,7 @@ from scipy import sparse
 from recon.motion.paths import HermiteSpline
 
 FRAME = 1 / 30  # seconds: the study's frame, in which its weights are given
-TOLERANCE = 1e-7  # of the energy norm, relative to the solution's own
+TOLERANCE, ROUGH = 1e-7, 1e-4  # of the energy norm, relative to the solution's own; ROUGH between reweightings
 MAX_ITERATIONS = 2000
 LEAST_INERTIA = 0.05  # squared units: a neighbourhood with less of it hardly tells how it turns
 RIDGE = 1e-9  # towards the mean of a node's samples: decides nothing but keeps blocks invertible
@@ -105,7 +105,8 @@ def solve_curves(
             outer = (B[:, :, None] * B[:, None]).reshape(len(B), -1)
             blocks[o.node] += (w @ outer).reshape(-1, P, P)
             right[o.node] += B.T @ (w[..., None] * x)
-        knots = _conjugate_gradients(blocks, laplacian, rate.T @ rate, right, knots)
+        tolerance = ROUGH if k < rounds - 1 else TOLERANCE
+        knots = _conjugate_gradients(blocks, laplacian, rate.T @ rate, right, knots, tolerance)
         if k < rounds - 1:
             weights = [
                 w / (1 + (np.linalg.norm(B @ knots[o.node] - x, axis=2) / robust) ** 2)
@@ -173,6 +174,7 @@ def _conjugate_gradients(
     velocity: Float[np.ndarray, "P P"],
     right: Float[np.ndarray, "M P 3"],
     x: Float[np.ndarray, "M P 3"],
+    tolerance: float,
 ) -> Float[np.ndarray, "M P 3"]:
     """Solve (diag(blocks) + laplacian ⊗ velocity) x = right from the guess `x`, the three coordinates side by side.
 
@@ -193,7 +195,7 @@ def _conjugate_gradients(
     residual = right - system(x)
     towards = step = inverse @ residual
     energy = dot(residual, towards)
-    enough = TOLERANCE**2 * dot(right, inverse @ right)
+    enough = tolerance**2 * dot(right, inverse @ right)
     for _ in range(MAX_ITERATIONS):
         if (energy <= enough).all():
             break

@@ -247,6 +247,16 @@ def test_too_few_cameras_without_depth_say_what_is_lacking(world, start):
         prepare(flat, start, plan=QUICK, held_out=("held0",))
 
 
+def test_a_video_without_depth_only_adds_its_images(world, start, tmp_path):
+    scene = open_scene(world)
+    videos = tuple(replace(v, depth=None) if v.name == "cam2" else v for v in scene.videos)
+    progress = Progress()
+    ready = prepare(replace(scene, videos=videos), start, plan=QUICK, held_out=("held0",), progress=progress)
+    assert [t.name for t in ready.tracks] == ["cam0", "cam1"] and len(ready.footage) == 3
+    assert "no tracks in space from cam2: 3 videos are fewer" in " ".join(progress.notes)
+    assert len(ready.initial) > 100
+
+
 def test_one_camera_with_depth_is_a_scene(world, start, tmp_path):
     outcome = reconstruct(
         open_scene(world).take(["cam0", "held0"]), start, tmp_path, plan=QUICK, held_out=("held0",), steps=4
