@@ -115,7 +115,7 @@ def material_of(
             )
     held = scene.take(protocol.held_out) if protocol.held_out else None
     if held is not None:
-        train = replace(train, videos=(*train.videos, *held.videos), masks=(*train.masks, *held.masks))
+        train = replace(train, videos=(*train.videos, *held.videos), masks=(*train.masks, *held.masks), labels=())
     rng = np.random.default_rng(5)
     out = [rng.random(len(t)) < protocol.held_out_tracks for t in tracks]
     return Material(
@@ -166,7 +166,7 @@ def held_out_figures(scene: Gaussians4D, ready: Prepared, protocol: Protocol) ->
     scores = [
         view(scene, f, ready.clocks.get(f.name, Clock(0.0))).score(most=16, pictures=0).mean for f in ready.held_out
     ]
-    keys = ("psnr", "ssim", "psnr_mask", "ssim_mask")
+    keys = ("psnr", "ssim", "mask_psnr", "mask_ssim")
     return {k: float(np.mean([s.get(k, math.nan) for s in scores])) if scores else math.nan for k in keys}
 
 
