@@ -61,7 +61,7 @@ class ScaffoldOptions:
             raise ValueError("margin, neighbours, fewest, most: expected margin >= 0, 1 neighbour, fewest <= most.")
 
 
-UNIT, LEAST_UNIT, GROWTH = 7.5, 2.0, 1.25
+UNIT, LEAST_UNIT, MOST_UNIT, GROWTH = 7.5, 2.0, 750.0, 1.25  # footprints, and the factor from one try to the next
 
 
 def build_scaffold(
@@ -148,7 +148,6 @@ def _nodes(grid: Grid, path: HermiteSpline, footprint: float, options: ScaffoldO
     every = np.ones(full.shape[:2], bool)
     longest = np.argsort(-grid.seen[picked].sum(1), kind="stable")
     again = picking.pick(full, every, longest, options.second_pick * unit, len(picked))
-    assert again is not None
     fit = _Fit(grid, path, picked[again], unit, footprint, options)
     curves = fit.solve(*picking.neighbours(full[again], every[again], options.neighbours), rounds=3)
     full = fit.on_grid(curves)
@@ -170,20 +169,27 @@ def _first_pick(grid: Grid, footprint: float, options: ScaffoldOptions, seed: in
     xyz, seen = grid.compared()
     order = order[seen[order].any(1)]
 
-    def at(unit: float) -> np.ndarray | None:
-        return picking.pick(xyz, seen, order, unit * footprint, options.most)
+    def at(unit: float) -> np.ndarray:
+        return picking.pick(xyz, seen, order, unit * footprint, options.most + 1)
 
     unit = options.unit or UNIT
     picked = at(unit)
-    while picked is None:  # a larger spacing, rather than a part of the scene without nodes
+    # a larger spacing, rather than a part of the scene without nodes; in vain where few are ever seen together
+    while len(picked) > options.most and unit < MOST_UNIT:
         unit *= GROWTH
         picked = at(unit)
     while options.unit is None and len(picked) < min(options.fewest, len(order)) and unit / GROWTH >= LEAST_UNIT:
         closer = at(unit / GROWTH)
-        if closer is None:
+        if len(closer) > options.most:
             break
         unit, picked = unit / GROWTH, closer
-    return picked, unit * footprint
+    if len(picked) > options.most:
+        logger.warning(
+            "more than %d tracks are never seen together or are further apart than %g footprints: those seen for the "
+            "longest become nodes; are the offsets right?",
+            *(options.most, unit),
+        )
+    return picked[: options.most], unit * footprint
 
 
 class _Fit:
@@ -212,10 +218,9 @@ class _Fit:
         self.design = path.design(grid.times[::stride])
 
     def solve(self, neighbours: np.ndarray, distances: np.ndarray, rounds: int) -> np.ndarray:
-        near = distances < 6 * self.unit
-        ties = np.exp(-(distances[near] ** 2) / (2 * (1.5 * self.unit) ** 2))
-        edges = np.stack([np.nonzero(near)[0], neighbours[near]], 1)
-        coupling = Coupling(edges, ties, self.grid.times, self.seen, self.unit)
+        ties = picking.edge_weights(distances, self.unit, self.options.reach)
+        edges = np.stack([np.nonzero(ties)[0], neighbours[ties > 0]], 1)
+        coupling = Coupling(edges, ties[ties > 0], self.grid.times, self.seen, self.unit)
         return solve_curves(self.path, self.observed, coupling, self.options.smooth, robust=self.robust, rounds=rounds)
 
     def on_grid(self, curves: np.ndarray) -> np.ndarray:

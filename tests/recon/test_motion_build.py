@@ -19,6 +19,7 @@ from recon.motion.solve import (
     Coupling,
     Observations,
     Smoothness,
+    angular_velocities,
     neighbourhood_rotations,
     solve_curves,
 )
@@ -72,7 +73,7 @@ def test_the_pick_covers_and_keeps_apart(few, unit):
     assert mine[~np.eye(len(picked), dtype=bool)].min(initial=np.inf) > unit
     left_out = np.setdiff1d(np.arange(40), picked)
     assert len(left_out) == 0 or (D[left_out].min(1) <= unit).all()
-    assert pick(xyz, seen, order, unit, len(picked) - 1) is None
+    assert pick(xyz, seen, order, unit, 5).tolist() == picked[:5].tolist()
 
 
 def test_the_solver_is_least_squares():
@@ -137,6 +138,22 @@ def test_the_solver_shrugs_off_a_lost_track():
         knots = solve_curves(path, observed, coupling, Smoothness(), robust=0.03, rounds=rounds)
         errors.append(np.abs(path.design(grid) @ knots[:, 0] - truth).max())
     assert errors[1] < 0.03 < 0.5 < errors[0]
+
+
+def test_angular_velocities_are_those_of_the_seen():
+    """Two bodies that turn about different axes; half of each is not seen, and claims to go elsewhere."""
+    rng = np.random.default_rng(0)
+    places = rng.normal(size=(30, 4, 3)) + 50.0
+    body = np.arange(30) % 2
+    omega = np.array([[0.0, 0.0, 0.2], [0.1, -0.3, 0.0]])[body]
+    rates = np.cross(omega[:, None], places) + np.array([[1.0, 2.0, 3.0], [0.0, 0.0, -1.0]])[body][:, None]
+    seen = rng.random((30, 4)) < 0.7
+    rates[~seen] = rng.normal(size=(int((~seen).sum()), 3)) * 10
+    i, j = np.nonzero((body[:, None] == body) & (np.arange(30)[:, None] < np.arange(30)))
+    coupling = Coupling(np.stack([i, j], 1), np.ones(len(i)), np.arange(4) * FRAME, seen, 1e-4)
+    assert np.abs(angular_velocities(coupling, places, rates) - omega[:, None]).max() < 1e-6
+    lonely = Coupling(np.zeros((0, 2), int), np.zeros(0), np.arange(4) * FRAME, seen, 1.0)
+    assert np.abs(angular_velocities(lonely, places, rates)).max() < 1e-6  # one point does not tell how it turns
 
 
 def test_rotations_follow_a_neighbourhood_round_and_round():
@@ -346,6 +363,16 @@ def test_tracks_that_are_never_seen_together():
     for n in range(4):
         found = scaffold.nodes((10 * n + 5) / 30)[0][:, 0]
         assert (found - (n + 0.05)).abs().min() < 5e-3
+
+
+def test_more_short_lives_than_nodes(caplog):
+    """Tracks of one frame each, none seen with another: no spacing makes them fewer."""
+    xyz = np.full((40, 40, 3), np.nan)
+    xyz[np.arange(40), np.arange(40)] = np.random.default_rng(0).normal(size=(40, 3))
+    with caplog.at_level(logging.WARNING, "recon.motion"):
+        scaffold = build_scaffold([tracks_of(xyz)], np.zeros(1), options=ScaffoldOptions(fewest=1, most=10), **UNITS)
+    sound(scaffold)
+    assert len(scaffold) <= 10 and "never seen together" in caplog.text
 
 
 def test_nothing_moves():
