@@ -22,7 +22,8 @@ from recon.video import write_images
 def main(out: Path = Path("out/reconstruct"), steps: int = 700, seed: int = 1) -> None:
     # Two people, five cameras and one between them that nothing sees but the evaluation; offsets up to a frame.
     world = out / "world"
-    write_capture(synthetic(seed), world)
+    if not world.exists():
+        write_capture(synthetic(seed), world)
 
     # In your own work: a folder with scene.json (otsync init), and offsets.json from otsync sync.
     scene, start, truth = open_scene(world), Offsets.load(world / "start.json"), Offsets.load(world / "truth.json")

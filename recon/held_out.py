@@ -8,7 +8,7 @@ for which the rendered motion differs least from the filmed one.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -77,15 +77,17 @@ def view(
     clock: Clock | None = None,
     *,
     gain: Float[np.ndarray, " 3"] | None = None,
+    layered: bool = True,
 ) -> View:
     """A camera on the scene's clock.
 
     Args:
         clock: of the camera; None: not known, all of the scene's span is searched.
         gain: of the camera; None: found.
+        layered: see :class:`View`.
     """
-    ones = np.ones(3)
-    looking = View(scene, footage, clock or Clock(0.0), ones if gain is None else gain, _static_views(scene, footage))
+    own = np.ones(3) if gain is None else gain
+    looking = View(scene, footage, clock or Clock(0.0), own, _static_views(scene, footage), layered)
     if gain is None:
         looking = looking.with_gain()
     return looking.scanned() if clock is None else looking
@@ -93,21 +95,31 @@ def view(
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A camera that looks at a scene: its clock, its gain, and the static Gaussians as it sees them (none: black)."""
+    """A camera that looks at a scene: its clock, its gain, and the static Gaussians as it sees them (none: black).
+
+    layered: what moves is drawn over what is static, as a fit of fixed cameras assumes it: there the floor's splats,
+    whose depth nothing but the cameras' parallax tells, would otherwise hide the feet that stand on it. False: one
+    rendering of both, for fits that did so (moving cameras).
+    """
 
     scene: Gaussians4D
     footage: Footage
     clock: Clock
     gain: Float[np.ndarray, " 3"]
     static: Tensor | None
+    layered: bool = True
 
     def world(self, frame: int, seconds: float | None = None) -> float:
         """World seconds of a frame, also under another offset."""
         return self.clock.rate * float(self.footage.times[frame]) + (self.clock.seconds if seconds is None else seconds)
 
     def image(self, t: float, frame: int = 0) -> Tensor:
-        """[h,w,3] at world second ``t`` by the pose of ``frame``, times the gain, 0..1; static and moving together."""
-        out = _draw(self.scene.at(t), self.footage, frame, self.scene.near)[0]
+        """[h,w,3] at world second ``t`` by the pose of ``frame``, times the gain, 0..1."""
+        if self.layered and self.static is not None:
+            rgb, alpha = _draw(self.scene.moving(t), self.footage, frame, 0.01 * self.scene.near)
+            out = rgb + (1 - alpha) * self.static[frame if len(self.static) > 1 else 0]
+        else:
+            out = _draw(self.scene.at(t), self.footage, frame, self.scene.near)[0]
         return (out * torch.as_tensor(self.gain, dtype=out.dtype)).clamp(0, 1)
 
     def with_gain(self) -> View:
@@ -120,7 +132,7 @@ class View:
             bottom += (weight[..., None] * rendered**2).sum((0, 1))
         gain = np.divide(top, bottom, out=np.ones(3), where=bottom > 0)
         sane = (gain > 1 / BRIGHTEST) & (gain < BRIGHTEST)
-        return View(self.scene, self.footage, self.clock, np.where(sane, gain, 1.0), self.static)
+        return replace(self, gain=np.where(sane, gain, 1.0))
 
     def _backgrounds(self) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         """(rendered static part, filmed background, weight) of the pixels that show no motion."""
@@ -187,7 +199,7 @@ class View:
                 "cannot be found. Give its offset, or hold out another camera."
             )
         best = min(tried, key=lambda o: (tried[o], abs(o)))
-        return View(self.scene, f, Clock(best, self.clock.rate), self.gain, self.static).refined()
+        return replace(self, clock=Clock(best, self.clock.rate)).refined()
 
     def refined(self) -> View:
         """With the offset within a frame of the present one at which the motion fits best."""
@@ -199,13 +211,7 @@ class View:
                 lambda x: self.disagreement(start + x * step, frames), bounds=(-1.0, 1.0), method="bounded",
                 options={"xatol": TOLERANCE},
             )  # fmt: skip
-        return View(
-            self.scene,
-            self.footage,
-            Clock(start + float(found.x) * step, self.clock.rate, "found"),
-            self.gain,
-            self.static,
-        )
+        return replace(self, clock=Clock(start + float(found.x) * step, self.clock.rate, "found"))
 
     def score(
         self, *, most: int = 50, pictures: int = 3, lpips: Lpips | None = None, held_out: bool = True

@@ -82,14 +82,13 @@ def reconstruct(
             save_every=plan.save_every,
         )  # fmt: skip
     with progress.stage("views"):
-        held = [view(found.scene, f, ready.clocks.get(f.name)) for f in ready.held_out]
+        held = [view(found.scene, f, ready.clocks.get(f.name), layered=ready.layered) for f in ready.held_out]
         gains = found.parameters["gain"].detach().cpu().numpy().astype(float)
         scores = [v.score(most=plan.views) for v in held]
         for n in _some(len(ready.footage), SHOWN_TRAINING):
             clock = Clock(float(found.offsets.seconds[n]), float(found.offsets.rates[n]), "fitted")
-            scores.append(
-                view(found.scene, ready.footage[n], clock, gain=gains[n]).score(most=plan.views // 4, held_out=False)
-            )
+            looking = view(found.scene, ready.footage[n], clock, gain=gains[n], layered=ready.layered)
+            scores.append(looking.score(most=max(1, plan.views // 4), held_out=False))
     fitted = [
         FilmedBy.of(f, Clock(float(found.offsets.seconds[n]), float(found.offsets.rates[n]), "fitted"), gains[n])
         for n, f in enumerate(ready.footage)
@@ -119,7 +118,8 @@ def _write(
     if outcome.truth is not None:
         metrics["offset_error"] = offset_figures(found.offsets, outcome.truth)
     write_json(out / "metrics.json", metrics)
-    options = {"width": plan.width, "frames": plan.frames, "seed": plan.seed, "freeze": list(plan.freeze)}
+    options = {"width": plan.width, "frames": plan.frames, "seed": plan.seed, "freeze": list(plan.freeze),
+               "layered": ready.layered}  # fmt: skip
     save_run(
         out, videos, options=options, frame=ready.frame, notes=progress.notes, seconds=progress.seconds,
     )  # fmt: skip
@@ -177,6 +177,6 @@ def evaluate(
         clock, gain = (None, None) if own is None else (own.clock, own.gain)
         if offsets is not None and (own is None or own.held_out):
             clock = given_clocks(offsets).get(footage.name, clock)
-        looking = view(result.scene, footage, clock, gain=gain)
+        looking = view(result.scene, footage, clock, gain=gain, layered=result.layered)
         scores.append(looking.score(most=most, lpips=lpips, held_out=own is None or own.held_out))
     return tuple(scores), lpips.reason

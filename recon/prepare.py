@@ -89,6 +89,11 @@ class Prepared:
     frame: str
     left_out: tuple[str, ...] = ()
 
+    @property
+    def layered(self) -> bool:
+        """Whether the fit draws what moves over backgrounds, rather than together with what is static."""
+        return all(f.background is not None for f in self.footage)
+
 
 class Progress:
     """Says what happens, remembers what was lacking, and times the stages."""

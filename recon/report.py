@@ -160,8 +160,8 @@ def _view_rows(views: Sequence[ViewScore], lpips_reason: str) -> str:
     missing = f" LPIPS: {escape(lpips_reason)}." if lpips_reason else ""
     return (
         f"<div class=scroll><table><tr><th>camera<th class=t>role{head}<th>frames<th>gain R G B<th class=t>clock"
-        f"{''.join(rows)}</table></div><p class=s>Static and moving Gaussians rendered together, as for a new view; the "
-        f"gain comes from what is static.{missing}</p>"
+        f"{''.join(rows)}</table></div><p class=s>Nothing of the cameras' own pictures is shown: static Gaussians, "
+        f"and over them what moves. The gain comes from what is static.{missing}</p>"
     )
 
 

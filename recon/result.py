@@ -65,6 +65,11 @@ class Result:
     options: dict[str, Any] = field(default_factory=dict)
     frame: str = "world"
 
+    @property
+    def layered(self) -> bool:
+        """Whether the fit drew what moves over what is static; see :class:`recon.held_out.View`."""
+        return bool(self.options.get("layered", True))
+
     def video(self, name: str) -> FilmedBy:
         """The named video. ValueError lists what there is."""
         for one in self.videos:

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 from jaxtyping import UInt8
+from torch import Tensor
 
 from otsync.types import Camera
 from recon.orbit import orbit
@@ -36,9 +37,19 @@ def rendered(
             middle = moving.means.median(0).values.double().numpy()
         poses = list(orbit([v.camera for v in result.videos], middle, len(times), turns=turns))
     for t, pose in zip(times, poses, strict=True):
-        with torch.no_grad():
-            image = result.scene.render(replace(lens, w2c=pose), float(t), depth=None).colors[0]
+        image = seen_by(result, replace(lens, w2c=pose), float(t))
         yield (image.numpy() * gain * 255).clip(0, 255).round().astype(np.uint8)
+
+
+def seen_by(result: Result, camera: Camera, t: float) -> Tensor:
+    """[h,w,3] of a static camera at world second ``t``: what moves over what is static, or both in one, as fitted."""
+    scene = result.scene
+    with torch.no_grad():
+        if scene.static is None or not result.layered:
+            return scene.render(camera, t, depth=None).colors[0]
+        moving = scene.moving(t).render(camera, depth=None, near_plane=0.01 * scene.near)
+        behind = scene.static.render(camera, depth=None, near_plane=scene.near)
+        return moving.colors[0] + (1 - moving.alphas[0]) * behind.colors[0]
 
 
 def at_width(camera: Camera, width: int | None) -> Camera:
