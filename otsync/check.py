@@ -123,13 +123,15 @@ def _intrinsics(video: Video) -> Iterable[Finding]:
 
 
 def _files(scene: Scene, every_frame: bool) -> Iterable[Finding]:
-    """Frames, masks and depth that do not decode, and sizes that disagree with the camera."""
+    """Frames, masks, labels and depth that do not decode, and sizes that disagree with the camera."""
     video = scene.videos[0]
     n = len(video.frames)
     if n < 48:
         yield Finding("warning", video.name, f"{n} frames are few.", "Use clips of two seconds and more.")
     picks = range(n) if every_frame else sorted({0, n // 2, n - 1})
-    for what, sequence in (("frame", video.frames), ("mask", scene.masks[0]), ("depth map", video.depth)):
+    labels = scene.labels[0] if scene.labels else None
+    kinds = (("frame", video.frames), ("mask", scene.masks[0]), ("depth map", video.depth), ("label image", labels))
+    for what, sequence in kinds:
         if sequence is None:
             continue
         bad, size = [], None

@@ -1,4 +1,4 @@
-"""The command line: ``otsync demo | simulate | match | init | check | sync | bench``, over the same dataclasses as the library.
+"""The command line: ``otsync demo | simulate | match | init | check | sync | run | bench``, over the same dataclasses as the library.
 
 Exit codes: 0 done; 1 an answer was refused (its status is printed); 2 bad arguments or files; 130 interrupted.
 """
@@ -17,6 +17,7 @@ from . import __version__
 from .align import DTW, ConstantShift, LikelihoodScan
 from .anchored import AnchoredFGW
 from .commands_recordings import Check, Init, RecordingOptions, sync_recording
+from .commands_run import Run
 from .graph import Graph
 from .match import (
     EntropicFGW,
@@ -242,7 +243,7 @@ class Bench:
     promises: bool = False
     """For sync and match: measure what is promised, on fresh seeds, instead of the tables."""
     first_seed: int | None = None
-    """Where the seeds of --promises begin; default: the suite's own."""
+    """Where the seeds of --promises begin, or panoptic's seed; default: the suite's own."""
     json: bool = False
     """For panoptic: one line of JSON on standard output instead of tables."""
     cache: Path | None = None
@@ -258,7 +259,8 @@ class Bench:
                 raise ValueError("scene: expected a recording: otsync bench panoptic SCENE.")
             from .bench import panoptic
 
-            return panoptic.run(self.scene, self.out, json=self.json, cache=self.cache)
+            protocol = panoptic.Protocol() if self.first_seed is None else panoptic.Protocol(seed=self.first_seed)
+            return panoptic.run(self.scene, self.out, json=self.json, cache=self.cache, protocol=protocol)
         if self.promises:
             from .bench import match_limits
             from .bench import sync as sync_bench
@@ -285,6 +287,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "init": Init,
     "check": Check,
     "sync": Sync,
+    "run": Run,
     "bench": Bench,
 }
 

@@ -47,7 +47,16 @@ class KeptPairs:
 def digest(tracks: TrackSet) -> str:
     """A hash of everything in a track set that an answer can depend on."""
     camera = tracks.camera
-    parts: list[Any] = [tracks.xyz, tracks.uv, tracks.seen, tracks.features, tracks.sigma, tracks.times, tracks.frame]
+    parts: list[Any] = [
+        tracks.xyz,
+        tracks.uv,
+        tracks.seen,
+        tracks.features,
+        tracks.sigma,
+        tracks.times,
+        tracks.frame,
+        tracks.labels,
+    ]
     if camera is not None:
         parts += [camera.K, camera.w2c, camera.distortion, camera.width, camera.height]
     return digest_of(*parts)

@@ -21,7 +21,7 @@ from typing import Any, Literal
 import numpy as np
 
 from .align import Aligner
-from .costs import Cosine
+from .costs import Cosine, Labels
 from .epipolar import EpipolarScan
 from .epipolar_fit import EpipolarRefine
 from .geometry import seen_pixels
@@ -37,7 +37,7 @@ from .priors.stereo import HullStereo, Rig
 from .refine import Refiner, SplineRefine
 from .scan import LikelihoodScan
 from .sync import MapLike, synchronize
-from .tracks import Selection, Tracking, pixel_tracks
+from .tracks import Selection, Tracking, pixel_tracks, track_labels
 from .types import Offsets, Status, TrackSet, Video
 
 Route = Literal["auto", "tracks", "epipolar", "stereo"]
@@ -46,6 +46,9 @@ Tell = Callable[[str], None]
 
 COLOUR = 3.0
 """Weight of the colour histograms beside the curve distance: what separates limbs that run close together."""
+
+LABELS = 3.0
+"""Weight of given labels: a track of another thing costs as much as the largest distance in space."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +107,7 @@ def synchronize_scene(
         map: any map-like callable; two threads use two cores.
         tell: receives one line per stage.
     """
-    stages, cache = stages or Stages(), cache or Cache()
+    stages, cache = with_labels(stages or Stages(), scene), cache or Cache()
     chosen, why = choose_route(scene, route, stages)
     for line in why:
         tell(line)
@@ -144,6 +147,20 @@ def synchronize_scene(
     return Synchronized(offsets, tuple(lifted), chosen, why, first, clock.seconds)
 
 
+def with_labels(stages: Stages, scene: Scene) -> Stages:
+    """The stages with the cost of labels in both matchers, when every video of the scene has labels."""
+    if not scene.labels or any(labels is None for labels in scene.labels):
+        return stages
+
+    def told(matcher: Matcher) -> Matcher:
+        costs = getattr(matcher, "costs", None)
+        if costs is None or any(isinstance(c, Labels) for c in costs):
+            return matcher
+        return replace(matcher, costs=(*costs, Labels(weight=LABELS)))  # type: ignore[type-var]
+
+    return replace(stages, epipolar_matcher=told(stages.epipolar_matcher), matcher=told(stages.matcher))
+
+
 def choose_route(scene: Scene, route: Route, stages: Stages) -> tuple[str, tuple[str, ...]]:
     """The route and the reasons for it, in words. ValueError when the named one is not possible."""
     if len(scene.videos) < 2:
@@ -151,13 +168,9 @@ def choose_route(scene: Scene, route: Route, stages: Stages) -> tuple[str, tuple
     if route not in ("auto", "tracks", "epipolar", "stereo"):
         raise ValueError(f"route: expected auto, tracks, epipolar or stereo; found {route!r}.")
     flat = [v.name for v in scene.videos if v.depth is None]
-    moving = [v.name for v in scene.videos if v.camera.w2c.ndim == 3]
-    few = len(scene.videos) < stages.stereo.min_views
     lacks = {
         "tracks": f"depth is missing for {', '.join(flat)}" if flat else "",
-        "stereo": f"cameras move: {', '.join(moving)}" if moving
-        else f"{len(scene.videos)} videos are fewer than the {stages.stereo.min_views} that a visual hull needs" if few
-        else "",
+        "stereo": lacks_stereo(scene, stages),
         "epipolar": "",
     }  # fmt: skip
     if route != "auto":
@@ -175,21 +188,39 @@ def choose_route(scene: Scene, route: Route, stages: Stages) -> tuple[str, tuple
     raise AssertionError("the epipolar route needs nothing")
 
 
+def lacks_stereo(scene: Scene, stages: Stages) -> str:
+    """What hull and stereo need and the scene has not; empty when nothing is missing."""
+    moving = [v.name for v in scene.videos if v.camera.w2c.ndim == 3]
+    if moving:
+        return f"cameras move: {', '.join(moving)}"
+    if len(scene.videos) < stages.stereo.min_views:
+        return f"{len(scene.videos)} videos are fewer than the {stages.stereo.min_views} that a visual hull needs"
+    return ""
+
+
 def track_all(
     scene: Scene, stages: Stages, cache: Cache, map: MapLike, tell: Tell = lambda text: None
 ) -> list[dict[str, np.ndarray]]:
-    """Masks, point tracks and descriptors of every video. ValueError names the first frame that does not read."""
+    """Masks, point tracks, descriptors and, where given, labels of every video.
+
+    ValueError names the first frame that does not read.
+    """
     started, done = time.perf_counter(), []
 
-    def one(item: tuple[Video, Any]) -> dict[str, np.ndarray]:
-        video, masks = item
+    def one(item: tuple[Video, Any, Any]) -> dict[str, np.ndarray]:
+        video, masks, labels = item
         found = stages.tracking(video, masks, cache)
+        if labels is not None:
+            size, uv = (video.camera.width, video.camera.height), found["uv"]
+            key = (_digest(labels), size, digest_of(uv))
+            found |= cache.arrays("labels", key, lambda: {"labels": track_labels(labels, uv, size)})
         done.append(video.name)
         spent = time.perf_counter() - started
         tell(f"tracks {len(done)}/{len(scene.videos)}: {video.name}, {len(found['uv'])} tracks, {spent:.1f} s")
         return found
 
-    return list(map(one, list(zip(scene.videos, scene.masks, strict=True))))
+    labels = scene.labels or (None,) * len(scene.videos)
+    return list(map(one, list(zip(scene.videos, scene.masks, labels, strict=True))))
 
 
 def select(video: Video, raw: dict[str, np.ndarray], stages: Stages, frame: str) -> TrackSet:
@@ -200,10 +231,11 @@ def select(video: Video, raw: dict[str, np.ndarray], stages: Stages, frame: str)
             f"video {video.name}: expected moving foreground to track; found no track that lives and moves enough. "
             "Check the masks, choose a part of the clip with motion, or leave this video out."
         )
-    return pixel_tracks(
+    tracks = pixel_tracks(
         raw["uv"][keep], raw["features"][keep], video.camera, fps=video.fps, timestamps=video.timestamps,
         name=video.name, frame=frame,
     )  # fmt: skip
+    return replace(tracks, labels=raw["labels"][keep]) if "labels" in raw else tracks
 
 
 def pairs_in_pixels(
@@ -255,14 +287,24 @@ def stereo_depth(
     scene: Scene, tracks: Sequence[TrackSet], offsets: Offsets, stages: Stages, cache: Cache, map: MapLike = map
 ) -> list[np.ndarray]:
     """Depth of every track sample by hull and stereo over the videos whose clocks ``offsets`` knows."""
-    content = [stages.tracking.key(v, m) for v, m in zip(scene.videos, scene.masks, strict=True)]
-    given = list(zip(scene.videos, scene.masks, strict=True))
-    masks = list(map(lambda item: stages.tracking.masks(item[0], item[1], cache), given))
-    # rounding keeps the cache's key the same over the last bits of a solution
-    rig = Rig.at(scene.videos, masks, np.round(offsets.seconds, 6), stages.tracking.width)
-    uv = [seen_pixels(t) for t in tracks]
-    poses = [(v.camera.K.tobytes(), v.camera.w2c.tobytes()) for v in scene.videos]
-    return stages.stereo(rig, uv, cache, (*content, digest_of(*poses)), map)
+    pairs = list(zip(scene.videos, scene.masks, strict=True))
+    masks = list(map(lambda item: stages.tracking.masks(item[0], item[1], cache), pairs))
+    rig, key = rig_at(scene, masks, offsets, range(len(scene.videos)), stages)
+    return stages.stereo(rig, [seen_pixels(t) for t in tracks], cache, key, map)
+
+
+def rig_at(
+    scene: Scene, masks: Sequence[Sequence[np.ndarray]], offsets: Offsets, chosen: Sequence[int], stages: Stages
+) -> tuple[Rig, tuple[Any, ...]]:
+    """The chosen videos on one clock, for stereo; and a key of everything that it sees of them."""
+    videos = [scene.videos[v] for v in chosen]
+    # rounding keeps the key the same over the last bits of a solution
+    seconds, rates = np.round(offsets.seconds[list(chosen)], 6), offsets.rates[list(chosen)]
+    rig = Rig.at(videos, [masks[v] for v in chosen], seconds, stages.tracking.width, rates)
+    pixels = [stages.tracking.key(scene.videos[v], scene.masks[v]) for v in chosen]
+    poses = [(c.K.tobytes(), c.w2c.tobytes(), None if c.distortion is None else c.distortion.tobytes())
+             for c in rig.cameras]  # fmt: skip
+    return rig, (*pixels, stages.tracking.masker, stages.tracking.width, digest_of(*poses))
 
 
 def without_times(offsets: Offsets) -> Offsets:

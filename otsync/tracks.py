@@ -67,6 +67,33 @@ def pixel_tracks(
     )
 
 
+def track_labels(
+    images: Sequence[np.ndarray], uv: Float[np.ndarray, "N T 2"], size: tuple[int, int]
+) -> Int[np.ndarray, " N"]:
+    """The label that most of a track's samples lie on; -1 where fewer than half of them lie on one and the same.
+
+    Args:
+        images: per frame (H,W) whole numbers, 0 none; of any resolution with the camera's field of view.
+        uv: pixels of the images as they are, with distortion, nan unseen. size: width and height of those images.
+    """
+    seen = np.isfinite(uv[..., 0])
+    found = np.zeros(seen.shape, np.int64)
+    for k in range(uv.shape[1]):
+        at = np.flatnonzero(seen[:, k])
+        if len(at):
+            image = np.asarray(images[k])
+            h, w = image.shape
+            x, y = np.floor(uv[at, k] * np.array([w, h]) / np.array(size)).astype(int).T
+            found[at, k] = image[np.clip(y, 0, h - 1), np.clip(x, 0, w - 1)]
+    names, index = np.unique(found, return_inverse=True)
+    votes = np.zeros((len(uv), len(names)), int)
+    np.add.at(votes, (np.nonzero(seen)[0], index.reshape(found.shape)[seen]), 1)
+    votes[:, names == 0] = 0
+    winner = votes.argmax(1)
+    sure = votes.max(1) * 2 > seen.sum(1)
+    return np.where(sure, names[winner], -1)
+
+
 class PackedMasks(Sequence[np.ndarray]):
     """Masks of one bit a pixel, unpacked when a frame is asked for: 29 kB for 640 x 360."""
 

@@ -3,18 +3,20 @@
 All are means of unsquared norms, smooth at zero and exactly zero there. Lengths are in footprints (the world size of a
 working pixel), steps of time are those of the study's frame, 1/30 s, whatever the videos' own: a weight means the same
 in every scene. Each object draws its own moment from `draw.rng`; a motion to which a loss does not apply gives None.
+Offsets get no gradient from here: a motion is as stiff as it is, whenever it was filmed.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Protocol
 
 import numpy as np
+import torch
 from torch import Tensor
 
-from recon.motion import PerGaussian, Scaffold
+from recon.motion import PerGaussian, Scaffold, fused, regularizer_kernels
 from recon.motion.motion import Motion
 from recon.motion.rotations import conjugate, product, rotation_vectors
 from recon.motion.solve import FRAME
@@ -22,6 +24,7 @@ from recon.raster.projection import rotation_matrices
 
 SOFT = 0.0075  # footprints: below it a norm is quadratic (0.1 mm where a footprint is 1.33 cm)
 SOFT_ANGLE = 1e-4  # radians
+SHIFTS = (FRAME, 3 * FRAME, 8 * FRAME)  # seconds over which shapes are compared
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,12 +63,43 @@ def soft_norm(x: Tensor, soft: float = SOFT) -> Tensor:
     return ((x * x).sum(-1) + soft * soft).sqrt() - soft
 
 
-def _relative(motion: Scaffold, t: float, neighbours: int, draw: Draw) -> Tensor:
-    """R_kᵀ(x_i - x_k) [M,K,3] in footprints: node i in the frame of its neighbour k."""
-    positions, quats = motion.nodes(t, draw.clocks)
-    k = motion.edges[:, :neighbours]
-    apart = (positions[:, None] - positions[k]) / draw.footprint
-    return (rotation_matrices(quats)[k].transpose(-1, -2) @ apart[..., None])[..., 0]
+def shape_change(motion: Scaffold, times: tuple[float, float], neighbours: int, draw: Draw) -> Tensor:
+    """mean_i Σ_k ŵ_ik ‖l_ik(t_0) - l_ik(t_1)‖ with l_ik = R_kᵀ(x_i - x_k) in footprints, over the first neighbours."""
+    k, shares = motion.edges[:, :neighbours], _edge_shares(motion, neighbours)
+    if fused.applies(motion.knots, motion.knot_quats):
+        moments = motion.moments(times, draw.clocks)
+        edges, w = k.numpy(), shares.numpy()
+
+        def compute(knots, quats, g_knots, g_quats):
+            curves = (knots, quats, motion.rig.clock)
+            return regularizer_kernels.arap(curves, moments, edges, w, 1 / draw.footprint, SOFT, g_knots, g_quats)
+
+        return fused.penalty(motion.knots, motion.knot_quats, compute)
+    local = []
+    for t in times:
+        positions, quats = motion.nodes(t, draw.clocks)
+        apart = (positions[:, None] - positions[k]) / draw.footprint
+        local.append((rotation_matrices(quats)[k].transpose(-1, -2) @ apart[..., None])[..., 0])
+    return (soft_norm(local[0] - local[1]) * shares).sum(1).mean()
+
+
+def length_change(motion: Scaffold, times: tuple[float, float], neighbours: int, draw: Draw) -> Tensor:
+    """mean_i Σ_k ŵ_ik |‖x_i - x_k‖(t_0) - ‖x_i - x_k‖(t_1)| in footprints, over the first neighbours."""
+    k, shares = motion.edges[:, :neighbours], _edge_shares(motion, neighbours)
+    if fused.applies(motion.knots, motion.knot_quats):
+        moments = motion.moments(times, draw.clocks)
+        edges, w = k.numpy(), shares.numpy()
+
+        def compute(knots, quats, g_knots, g_quats):
+            curves = (knots, quats, motion.rig.clock)
+            return regularizer_kernels.length(curves, moments, edges, w, 1 / draw.footprint, SOFT, g_knots)
+
+        return fused.penalty(motion.knots, motion.knot_quats, compute)
+    lengths = []
+    for t in times:
+        positions, _ = motion.nodes(t, draw.clocks)
+        lengths.append(soft_norm((positions[:, None] - positions[k]) / draw.footprint))
+    return (soft_norm((lengths[0] - lengths[1])[..., None]) * shares).sum(1).mean()
 
 
 def _edge_shares(motion: Scaffold, neighbours: int) -> Tensor:
@@ -74,17 +108,49 @@ def _edge_shares(motion: Scaffold, neighbours: int) -> Tensor:
     return w / w.sum(1, keepdim=True).clamp_min(1e-12)
 
 
+def difference(motion: Motion, times: list[float], coefficients: list[float], draw: Draw) -> Tensor | None:
+    """mean ‖Σ_s coefficients_s x(t_s)‖ in footprints over what moves by its own parameters: nodes, or Gaussians
+    without a scaffold."""
+    if isinstance(motion, PerGaussian):
+        path, knots = motion.path, motion.own_knots
+        moments = path.basis(np.array(times)[:, None])[:2]
+        clock = np.zeros(knots.shape[1], np.int32)
+    elif isinstance(motion, Scaffold):
+        path, knots = motion.path, motion.knots
+        moments, clock = motion.moments(times, draw.clocks), motion.rig.clock
+    else:
+        return None
+    if fused.applies(knots):
+        weights = np.array(coefficients)
+
+        def compute(knots, quats, g_knots, g_quats):
+            curves = (knots, quats, clock)
+            return regularizer_kernels.stencil(curves, moments, weights, 1 / draw.footprint, SOFT, g_knots)
+
+        return fused.penalty(knots, knots.new_empty(0, 0, 4), compute)
+    if isinstance(motion, Scaffold):
+        at = [motion.nodes(t, draw.clocks)[0] for t in times]
+    else:
+        at = [path.at(knots, t) for t in times]
+    together = torch.stack([c * x for c, x in zip(coefficients, at, strict=True)]).sum(0)
+    return soft_norm(together / draw.footprint).mean()
+
+
+def _step(motion: Motion) -> float:
+    """Seconds over which velocities are taken."""
+    return motion.path.step(FRAME) if isinstance(motion, Scaffold | PerGaussian) else FRAME
+
+
 @dataclass(frozen=True)
 class Arap:
     """As rigid as possible: a node keeps its place in the frames of its neighbours (MoSca's L_coord).
 
-    L = mean_i Σ_k ŵ_ik ‖l_ik(t) - l_ik(t + s)‖ with l_ik = R_kᵀ(x_i - x_k), s drawn from `shifts` (seconds). Zero for
-    rigid motions of all nodes together.
+    Compares two moments apart by one of `shifts` (seconds), drawn. Zero for rigid motions of all nodes together.
     """
 
     weight: float = 0.008
     every: int = 2
-    shifts: tuple[float, ...] = (FRAME, 3 * FRAME, 8 * FRAME)
+    shifts: tuple[float, ...] = SHIFTS
     neighbours: int = 6
 
     def __call__(self, motion: Motion, means: Tensor, quats: Tensor, draw: Draw) -> Tensor | None:
@@ -92,17 +158,16 @@ class Arap:
             return None
         shift = motion.path.step(float(draw.rng.choice(self.shifts)))
         t = draw.moment(0, shift)
-        change = _relative(motion, t, self.neighbours, draw) - _relative(motion, t + shift, self.neighbours, draw)
-        return (soft_norm(change) * _edge_shares(motion, self.neighbours)).sum(1).mean()
+        return shape_change(motion, (t, t + shift), self.neighbours, _still(draw))
 
 
 @dataclass(frozen=True)
 class Length:
-    """Distances to neighbours are kept (MoSca's L_len): mean_i Σ_k ŵ_ik |‖l_ik(t)‖ - ‖l_ik(t + s)‖|."""
+    """Distances to neighbours are kept (MoSca's L_len), between two moments as for :class:`Arap`."""
 
     weight: float = 0.008
     every: int = 2
-    shifts: tuple[float, ...] = (FRAME, 3 * FRAME, 8 * FRAME)
+    shifts: tuple[float, ...] = SHIFTS
     neighbours: int = 6
 
     def __call__(self, motion: Motion, means: Tensor, quats: Tensor, draw: Draw) -> Tensor | None:
@@ -110,25 +175,7 @@ class Length:
             return None
         shift = motion.path.step(float(draw.rng.choice(self.shifts)))
         t = draw.moment(0, shift)
-        k = motion.edges[:, : self.neighbours]
-        lengths = []
-        for moment in (t, t + shift):
-            positions, _ = motion.nodes(moment, draw.clocks)
-            lengths.append(soft_norm((positions[:, None] - positions[k]) / draw.footprint))
-        return ((lengths[0] - lengths[1]).abs() * _edge_shares(motion, self.neighbours)).sum(1).mean()
-
-
-def _places(motion: Motion, times: list[float], draw: Draw) -> list[Tensor] | None:
-    """Positions [M,3] of what moves by its own parameters, in footprints: nodes, or Gaussians without a scaffold."""
-    if isinstance(motion, Scaffold):
-        return [motion.nodes(t, draw.clocks)[0] / draw.footprint for t in times]
-    if isinstance(motion, PerGaussian):
-        return [motion.path.at(motion.own_knots, t) / draw.footprint for t in times]
-    return None
-
-
-def _frame(motion: Motion) -> float:
-    return motion.path.step(FRAME) if isinstance(motion, Scaffold | PerGaussian) else FRAME
+        return length_change(motion, (t, t + shift), self.neighbours, _still(draw))
 
 
 @dataclass(frozen=True)
@@ -139,10 +186,9 @@ class Velocity:
     every: int = 2
 
     def __call__(self, motion: Motion, means: Tensor, quats: Tensor, draw: Draw) -> Tensor | None:
-        step = _frame(motion)
-        t = draw.moment(0, step)
-        at = _places(motion, [t, t + step], draw)
-        return None if at is None else soft_norm(at[1] - at[0]).mean() * (FRAME / step)
+        step = _step(motion)
+        t, scale = draw.moment(0, step), FRAME / step
+        return difference(motion, [t, t + step], [-scale, scale], _still(draw))
 
 
 @dataclass(frozen=True)
@@ -153,15 +199,18 @@ class Acceleration:
     every: int = 2
 
     def __call__(self, motion: Motion, means: Tensor, quats: Tensor, draw: Draw) -> Tensor | None:
-        step = _frame(motion)
-        t = draw.moment(step, step)
-        at = _places(motion, [t - step, t, t + step], draw)
-        return None if at is None else soft_norm(at[2] - 2 * at[1] + at[0]).mean() * (FRAME / step) ** 2
+        step = _step(motion)
+        t, scale = draw.moment(step, step), (FRAME / step) ** 2
+        return difference(motion, [t - step, t, t + step], [scale, -2 * scale, scale], _still(draw))
+
+
+def _still(draw: Draw) -> Draw:
+    return draw if draw.clocks is None else replace(draw, clocks=draw.clocks.detach())
 
 
 def _turns(motion: Scaffold, times: list[float], draw: Draw) -> list[Tensor]:
     """Rotation vectors [M,3] from each time to the next."""
-    quats = [motion.nodes(t, draw.clocks)[1] for t in times]
+    quats = [motion.nodes(t, _still(draw).clocks)[1] for t in times]
     return [rotation_vectors(product(b, conjugate(a))) for a, b in pairwise(quats)]
 
 
@@ -175,10 +224,10 @@ class RotationVelocity:
     def __call__(self, motion: Motion, means: Tensor, quats: Tensor, draw: Draw) -> Tensor | None:
         if not isinstance(motion, Scaffold):
             return None
-        step = _frame(motion)
+        step = _step(motion)
         t = draw.moment(0, step)
         (turn,) = _turns(motion, [t, t + step], draw)
-        return soft_norm(turn, SOFT_ANGLE).mean() * (FRAME / step)
+        return soft_norm(turn * (FRAME / step), SOFT_ANGLE).mean()
 
 
 @dataclass(frozen=True)
@@ -191,10 +240,10 @@ class RotationAcceleration:
     def __call__(self, motion: Motion, means: Tensor, quats: Tensor, draw: Draw) -> Tensor | None:
         if not isinstance(motion, Scaffold):
             return None
-        step = _frame(motion)
+        step = _step(motion)
         t = draw.moment(step, step)
         before, after = _turns(motion, [t - step, t, t + step], draw)
-        return soft_norm(after - before, SOFT_ANGLE).mean() * (FRAME / step) ** 2
+        return soft_norm((after - before) * (FRAME / step) ** 2, SOFT_ANGLE).mean()
 
 
 #: The study's: set once on one scene, not tuned.

@@ -67,6 +67,32 @@ def render(camera: Camera, centres: np.ndarray, colours: np.ndarray, radius: flo
     return image
 
 
+def exact_depth(camera: Camera, centres: np.ndarray, radius: float, pixels: np.ndarray | None = None) -> np.ndarray:
+    """Depth along z of the balls' surfaces, 0 on the wall: (H,W) at pixel centres, or at ideal ``pixels`` (...,2)."""
+    if pixels is None:
+        pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), -1) + 0.5
+    z = surfaces(camera, centres, radius, pixels).min(0)
+    return np.where(np.isfinite(z), z, 0)
+
+
+def exact_labels(camera: Camera, centres: np.ndarray, radius: float) -> np.ndarray:
+    """(H,W) uint8: which ball is seen, from 1 on; 0 the wall."""
+    pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), -1) + 0.5
+    z = surfaces(camera, centres, radius, pixels)
+    return np.where(np.isfinite(z.min(0)), z.argmin(0) + 1, 0).astype(np.uint8)
+
+
+def surfaces(camera: Camera, centres: np.ndarray, radius: float, pixels: np.ndarray) -> np.ndarray:
+    """(balls, ...) depth at which the rays through ideal ``pixels`` (...,2) meet every ball; inf: never."""
+    rays = np.concatenate([pixels, np.ones_like(pixels[..., :1])], -1) @ np.linalg.inv(camera.K).T
+    out = []
+    for c in camera.to_camera(centres):
+        a, b, q = (rays**2).sum(-1), rays @ c, c @ c - radius**2
+        root = b**2 - a * q
+        out.append(np.where(root > 0, (b - np.sqrt(np.maximum(root, 0))) / a, np.inf))
+    return np.stack(out)
+
+
 def write_recording(
     folder: Path, offsets: list[float], *, frames: int = 75, balls: int = 7, seed: int = 1, suffix: str = ".jpg"
 ) -> np.ndarray:

@@ -80,8 +80,14 @@ def test_the_rasterizer_knows_only_types():
         assert "from otsync" not in path.read_text() or "from otsync.types" in path.read_text(), path
 
 
+#: what stands on top of both packages: from a recording to a result, its page, and the command line
+ON_TOP = {"prepare.py", "pipeline.py", "report.py", "cli.py", "bench.py"}
+
+
 def test_recon_never_imports_the_algorithms():
     for path in sorted((ROOT / "recon").rglob("*.py")):
+        if path.parent.name == "recon" and path.name in ON_TOP:
+            continue
         for node in ast.walk(ast.parse(path.read_text())):
             names = []
             if isinstance(node, ast.ImportFrom) and node.module:
@@ -99,6 +105,23 @@ def test_recon_never_imports_the_algorithms():
                         "otsync.bench",
                     )
                     assert name.startswith(allowed), f"{path.relative_to(ROOT)} imports {name}"
+
+
+def test_nothing_in_recon_imports_what_stands_on_top():
+    names = {f"recon.{name[:-3]}" for name in ON_TOP}
+    for path in sorted((ROOT / "recon").rglob("*.py")):
+        if path.name in ON_TOP:
+            continue
+        for node in ast.walk(ast.parse(path.read_text())):
+            found = {node.module} if isinstance(node, ast.ImportFrom) else set()
+            found |= {alias.name for alias in node.names} if isinstance(node, ast.Import) else set()
+            assert not names & found, f"{path.relative_to(ROOT)} imports {names & found}"
+
+
+def test_the_command_line_is_light_until_something_runs():
+    code = "import sys, otsync.cli; print(' '.join(m.split('.')[0] for m in sys.modules))"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True).stdout
+    assert not {"torch", "ot", "tslearn", "transformers", "matplotlib", "cv2", "av", "recon"} & set(out.split())
 
 
 def test_import_loads_nothing_heavy():

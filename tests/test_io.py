@@ -90,6 +90,8 @@ def test_take_names_what_there_is(folder):
         ({"range": [5, 99]}, "range"),
         ({"range": "x"}, "range"),
         ({"masks": "right/f1*.png"}, "12 files"),
+        ({"labels": "right/f1*.png"}, "12 files"),
+        ({"labels": "../who/*.png"}, "pattern|outside"),
         ({"depth": "right/*.png"}, "depth"),
         ({"depth": {"frames": "right/*.png", "scale": 0}}, "scale"),
         ({"file": "a.mp4"}, "either"),

@@ -13,6 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -20,11 +21,12 @@ from otsync.cli import main
 from otsync.io import open_scene
 from otsync.keep import KeptPairs, digest, pack, unpack
 from otsync.priors import Cache
-from otsync.recordings import Stages, choose_route, synchronize_scene, without_times
+from otsync.recordings import Stages, choose_route, synchronize_scene, with_labels, without_times
 from otsync.sync import Job, run
+from otsync.tracks import track_labels
 from otsync.types import Offsets
 
-from .recording_world import paths, ring, write_recording
+from .recording_world import exact_depth, exact_labels, paths, ring, write_recording
 from .test_epipolar import world
 
 TRUE = [0.0, 7.0, -5.0, 3.5]
@@ -151,28 +153,63 @@ def test_routes_and_their_reasons(recording):
 
 
 @pytest.mark.slow
-def test_given_depth_takes_the_tracks_route(recording, synced):
-    """Exact depth of the drawn balls."""
-    scene = open_scene(recording)
+def test_given_depth_takes_the_tracks_route(tmp_path):
+    """Exact depth of the drawn balls; three seconds of a dozen, for the evidence that the tracks route asks for."""
+    write_recording(tmp_path, TRUE, frames=100, balls=12)
+    scene = open_scene(tmp_path)
     videos = []
     for video, camera, offset in zip(scene.videos, ring(4), TRUE, strict=True):
-        centres = paths((np.arange(60) + offset) / 30, 7, 1)
-        y, x = np.mgrid[0:180, 0:320] + 0.5
-        rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(camera.K).T
-        maps = []
-        for k in range(60):
-            z = np.full((180, 320), np.inf)
-            for c in camera.to_camera(centres)[:, k]:
-                a, b, q = (rays**2).sum(-1), rays @ c, c @ c - 0.16**2
-                root = b**2 - a * q
-                z = np.where(root > 0, np.minimum(z, (b - np.sqrt(np.maximum(root, 0))) / a), z)
-            maps.append(np.where(np.isfinite(z), z, 0))
-        videos.append(replace(video, depth=maps))
-    deep = replace(scene, videos=tuple(videos))
+        centres = paths((np.arange(100) + offset) / 30, 12, 1)
+        videos.append(replace(video, depth=[exact_depth(camera, centres[:, k], 0.16) for k in range(100)]))
     with ThreadPoolExecutor(2) as pool:
-        found = synchronize_scene(deep, cache=Cache(synced / "stages"), map=pool.map)
+        found = synchronize_scene(replace(scene, videos=tuple(videos)), map=pool.map)
     assert found.route == "tracks"
-    np.testing.assert_allclose(found.offsets.frames, TRUE, atol=0.4)
+    np.testing.assert_allclose(found.offsets.frames, TRUE, atol=0.15)
+    assert found.offsets.ok
+
+
+def test_labels_are_read_and_keep_things_apart(recording, synced, tmp_path):
+    """Images of which ball is where: every track gets its ball's number, and partners are of the same ball."""
+    document = json.loads((recording / "scene.json").read_text())
+    for v, (camera, offset) in enumerate(zip(ring(4), TRUE, strict=True)):
+        home = tmp_path / f"cam{v}"
+        shutil.copytree(recording / f"cam{v}", home)
+        (home / "who").mkdir()
+        centres = paths((np.arange(60) + offset) / 30, 7, 1)
+        for k in range(60):
+            cv2.imwrite(str(home / "who" / f"{k:03d}.png"), exact_labels(camera, centres[:, k], 0.16))
+        document["videos"][v]["labels"] = f"cam{v}/who/*.png"
+    (tmp_path / "scene.json").write_text(json.dumps(document))
+    scene, cache = open_scene(tmp_path), Cache(synced / "stages")
+    found = synchronize_scene(scene, cache=cache)
+    np.testing.assert_allclose(found.offsets.frames, TRUE, atol=0.25)
+    for tracks, camera, offset in zip(found.tracks, ring(4), TRUE, strict=True):
+        ball = camera.project(paths((np.arange(60) + offset) / 30, 7, 1))
+        assert (tracks.labels > 0).mean() > 0.9
+        for n in np.flatnonzero(tracks.labels > 0):
+            away = np.linalg.norm(tracks.uv[n] - ball[tracks.labels[n] - 1], axis=1)[tracks.seen[n]]
+            assert np.median(away) < 24  # the largest ball's radius in pixels
+    for (a, b), matches in found.offsets.matches.items():
+        la, lb = (found.tracks[v].labels[i] for v, i in zip((a, b), matches.pairs.T, strict=True))
+        best = matches.score > np.quantile(matches.score, 0.9)
+        assert (la == lb)[best & (la > 0) & (lb > 0)].all()
+    assert with_labels(Stages(), open_scene(recording)) == Stages()
+    assert main(["check", str(tmp_path)]) == 0
+    cv2.imwrite(str(tmp_path / "cam0" / "who" / "000.png"), np.zeros((4, 4, 3), np.uint8))
+    assert main(["check", str(tmp_path)]) == 1
+
+
+def test_a_tracks_label_is_what_most_of_it_lies_on():
+    images = [np.array([[0, 7], [9, 9]], np.uint16)] * 4
+    uv = np.array([
+        [[1.5, 0.5]] * 4,
+        [[0.5, 1.5], [0.5, 1.5], [0.5, 1.5], [1.5, 0.5]],
+        [[0.5, 1.5], [0.5, 1.5], [0.5, 0.5], [1.5, 0.5]],
+        [[0.5, 0.5]] * 4,
+        [[np.nan, np.nan]] * 3 + [[1.5, 0.5]],
+    ])  # fmt: skip
+    np.testing.assert_array_equal(track_labels(images, uv, (2, 2)), [7, 9, -1, -1, 7])
+    np.testing.assert_array_equal(track_labels(images, 10 * uv, (20, 20)), [7, 9, -1, -1, 7])
 
 
 def test_a_pair_survives_the_cache():

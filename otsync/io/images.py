@@ -6,7 +6,7 @@ import os
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from ..files import existing, read_npz
 
@@ -26,6 +26,17 @@ def read_mask(path: str | os.PathLike[str]) -> Bool[np.ndarray, "H W"]:
     """Foreground where an image is brighter than half of its own maximum (files hold 0/1 as well as 0/255)."""
     values = np.asarray(_decode(path).convert("L"))
     return values > values.max(initial=0) / 2
+
+
+def read_labels(path: str | os.PathLike[str]) -> Int[np.ndarray, "H W"]:
+    """Whole numbers of a single-channel image (8 or 16 bits, or a palette's indices); 0: no label."""
+    values = np.asarray(_decode(path))
+    if values.ndim != 2 or values.dtype.kind not in "iu":
+        raise ValueError(
+            f"{path}: expected labels (H,W) as whole numbers; found {values.dtype} of {values.shape}. Save one number a "
+            "pixel in a grey PNG."
+        )
+    return values
 
 
 def read_depth(path: str | os.PathLike[str], scale: float) -> Float[np.ndarray, "H W"]:

@@ -6,12 +6,12 @@ A document::
      "videos": [{"name": "left", "file": "left.mp4",
                  "camera": {"K": [[f,0,cx],[0,f,cy],[0,0,1]], "w2c": [[...4x4...]], "width": 1920, "height": 1080}},
                 {"name": "right", "frames": "right/*.png", "fps": 30, "range": [10, 160],
-                 "camera": {...}, "masks": "seg/right/*.png",
+                 "camera": {...}, "masks": "seg/right/*.png", "labels": "who/right/*.png",
                  "depth": {"frames": "depth/right/*.png", "scale": 0.001}}]}
 
 Paths are relative to the file's folder and may not leave it. ``w2c`` is world-to-camera, OpenCV axes, 4x4 or one per
 frame. ``range`` [first, stop) keeps some frames; a video file's clock comes from its container unless fps or
-timestamps are given.
+timestamps are given. ``labels``: images of whole numbers that mean the same thing or class in every video, 0 none.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ import numpy as np
 from ..files import read_json, write_json
 from ..types import Camera, Video
 from .frames import ArrayFrames, FrameRange, ImageFrames, LazyFrames, VideoFrames
-from .images import read_depth, read_image, read_mask
+from .images import read_depth, read_image, read_labels, read_mask
 
 FORMAT, VERSION = "otsync.scene", 1
 MAX_VIDEOS, MAX_FILES = 1000, 200_000
@@ -44,6 +44,7 @@ class Scene:
         frame: name of the world frame that the cameras share.
         root: the folder that paths are relative to.
         notes: what the reader assumed or could not find.
+        labels: per video a sequence of (H,W) integer labels that all videos share, 0 none; or None. Empty: none at all.
     """
 
     videos: tuple[Video, ...]
@@ -51,6 +52,7 @@ class Scene:
     frame: str = "world"
     root: Path = Path()
     notes: tuple[str, ...] = field(default_factory=tuple)
+    labels: tuple[Sequence[np.ndarray] | None, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -64,7 +66,10 @@ class Scene:
                 f"cameras: expected some of {', '.join(self.names)}; found {', '.join(missing)}. Check the names."
             )
         index = [self.names.index(n) for n in names]
-        return replace(self, videos=tuple(self.videos[i] for i in index), masks=tuple(self.masks[i] for i in index))
+        labels = tuple(self.labels[i] for i in index) if self.labels else ()
+        return replace(
+            self, videos=tuple(self.videos[i] for i in index), masks=tuple(self.masks[i] for i in index), labels=labels
+        )
 
 
 def open_scene(path: str | os.PathLike[str], *, allow_outside: bool = False) -> Scene:
@@ -113,20 +118,21 @@ def scene_from_document(document: dict[str, Any], root: Path, *, allow_outside: 
         )
     builder = Paths(root, allow_outside)
     built = [_video(entry, n, builder) for n, entry in enumerate(entries)]
-    names = [video.name for video, _ in built]
+    names = [video.name for video, _, _ in built]
     twice = sorted({n for n in names if names.count(n) > 1})
     if twice:
         raise ValueError(f"scene.videos: expected unique names; {', '.join(twice)} occur more than once.")
     return Scene(
-        tuple(v for v, _ in built),
-        tuple(m for _, m in built),
+        tuple(video for video, _, _ in built),
+        tuple(masks for _, masks, _ in built),
         str(document.get("frame", "world")),
         Path(root),
         tuple(str(n) for n in document.get("notes", ())),
+        tuple(labels for _, _, labels in built),
     )
 
 
-def _video(entry: Any, n: int, paths: Paths) -> tuple[Video, Sequence[np.ndarray] | None]:
+def _video(entry: Any, n: int, paths: Paths) -> tuple[Video, Sequence[np.ndarray] | None, Sequence[np.ndarray] | None]:
     if not isinstance(entry, dict):
         raise ValueError(f"scene.videos[{n}]: expected an object; found {_short(entry)}.")
     name = str(entry.get("name", f"video{n}"))
@@ -148,9 +154,10 @@ def _video(entry: Any, n: int, paths: Paths) -> tuple[Video, Sequence[np.ndarray
             return sequence if len(keep) == len(sequence) else FrameRange(sequence, keep)
 
         depth = cut(_depth(entry.get("depth"), paths), "depth")
-        masks = cut(_masks(entry.get("masks"), paths), "masks")
+        masks = cut(_images(entry.get("masks"), paths, read_mask, "mask"), "masks")
+        labels = cut(_images(entry.get("labels"), paths, read_labels, "labels"), "labels")
         video = Video(cut(frames, "frames") or frames, camera, fps, timestamps, name, depth)
-        return video, masks
+        return video, masks, labels
     except FileNotFoundError as error:
         raise FileNotFoundError(f"{where}: {error}") from None
     except (ValueError, TypeError, KeyError, OverflowError) as error:
@@ -202,8 +209,8 @@ def _depth(value: Any, paths: Paths) -> LazyFrames | None:
     return ImageFrames(paths.many(value["frames"]), lambda path: read_depth(path, scale), f"depth*{scale:g}")
 
 
-def _masks(value: Any, paths: Paths) -> LazyFrames | None:
-    return None if value is None else ImageFrames(paths.many(value), read_mask, "mask")
+def _images(value: Any, paths: Paths, read: Callable[[Path], np.ndarray], kind: str) -> LazyFrames | None:
+    return None if value is None else ImageFrames(paths.many(value), read, kind)
 
 
 def _range(entry: dict[str, Any], n: int) -> range:

@@ -40,10 +40,12 @@ class Rig:
         masks: Sequence[Sequence[np.ndarray]],
         offsets: Float[np.ndarray, " V"],
         width: int = 640,
+        rates: Float[np.ndarray, " V"] | None = None,
     ) -> Rig:
-        """Frames that show the same moment under ``offsets`` (seconds), on the clock of the longest video's fps."""
+        """Frames that show the same moment under ``offsets`` (seconds) and ``rates``, on the fastest video's beat."""
         frames = tuple(WorkingFrames(v.frames, (v.camera.width, v.camera.height), width) for v in videos)
-        clocks = [v.times + o for v, o in zip(videos, offsets, strict=True)]
+        rates = np.ones(len(videos)) if rates is None else rates
+        clocks = [r * v.times + o for v, o, r in zip(videos, offsets, rates, strict=True)]
         fps = max(v.fps or 30.0 for v in videos)
         start, stop = min(c[0] for c in clocks), max(c[-1] for c in clocks)
         # the grid runs through the first video's own frames: whole-frame offsets meet exactly
@@ -88,7 +90,7 @@ class HullStereo:
     ) -> list[Float[np.ndarray, "N T"]]:
         """Depth along z of every track point (undistorted camera pixels, nan unseen), in world units, 0 unknown."""
         cache = cache or Cache()
-        space = _Space.of(self, rig)
+        space = Space.of(self, rig)
         starts = range(0, len(rig.index), self.chunk)
         # without a key of the pixels nothing may be kept: the tracks alone do not say which images they came from
         keep = cache if key else Cache()
@@ -104,14 +106,14 @@ class HullStereo:
                 out[:, frames] = found[f"depth{v}"]
         return depth
 
-    def _chunk(self, rig: Rig, space: _Space, uv: Sequence[np.ndarray], first: int) -> dict[str, np.ndarray]:
+    def _chunk(self, rig: Rig, space: Space, uv: Sequence[np.ndarray], first: int) -> dict[str, np.ndarray]:
         moments = range(first, min(first + self.chunk, len(rig.index)))
         used = [[int(k) for s in moments if (k := rig.index[s, v]) >= 0] for v in range(len(uv))]
         out = {f"frames{v}": np.array(used[v], int) for v in range(len(uv))}
         out |= {f"depth{v}": np.zeros((len(uv[v]), len(used[v])), np.float32) for v in range(len(uv))}
         for s in moments:
             present = np.flatnonzero(rig.index[s] >= 0)
-            if len(present) < max(3, self.min_views - self.misses):
+            if not self.enough(present):
                 continue
             images = {v: space.image(rig, v, int(rig.index[s, v])) for v in present.tolist()}
             hull = space.hull(self, rig, s, present)
@@ -124,42 +126,60 @@ class HullStereo:
         return out
 
     def _depths(
-        self, space: _Space, hull: np.ndarray, images: dict[int, np.ndarray], v: int, points: np.ndarray, k: int
+        self, space: Space, hull: np.ndarray, images: dict[int, np.ndarray], v: int, points: np.ndarray, k: int
     ) -> Float[np.ndarray, " N"]:
-        from .kernels_stereo import choose_depth, first_hit, sweep
-
-        R, center, inverse_K = space.pose(v, k)
         around = self.spread * np.array(
             [(0, 0), (-1, -1), (0, -1), (1, -1), (-1, 0), (1, 0), (-1, 1), (0, 1), (1, 1)], float
         )
         sub = (points[:, None] + around[None]).reshape(-1, 2)
-        rays = np.concatenate([sub, np.ones((len(sub), 1))], 1) @ inverse_K.T @ R.T
+        start, scores = self.scores(space, hull, images, self.partners(space, np.array(list(images)), v), v, k, sub)
+        shape = (len(points), len(around))
+        return self.choose(space, start.reshape(shape), scores.reshape(*shape, -1))
+
+    def enough(self, present: Int[np.ndarray, " P"]) -> bool:
+        """Whether the videos that show a moment suffice for a hull and a correlation."""
+        return len(present) >= max(3, self.min_views - self.misses)
+
+    def partners(self, space: Space, present: Int[np.ndarray, " P"], v: int) -> list[int]:
+        """The views that v is compared with, nearest by angle."""
+        here = set(present.tolist())
+        return [u for u in space.order[v] if u in here][: self.neighbours]
+
+    def scores(
+        self, space: Space, hull: np.ndarray, images: dict[int, np.ndarray], near: Sequence[int], v: int, k: int,
+        points: Float[np.ndarray, "N 2"],
+    ) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, "N D"]]:  # fmt: skip
+        """Depth at which each point's ray enters the hull, 0 never, and the correlations over the sweep behind it."""
+        from .kernels_stereo import first_hit, sweep
+
+        R, center, inverse_K = space.pose(v, k)
         unit = space.unit
+        rays = np.concatenate([points, np.ones((len(points), 1))], 1) @ inverse_K.T @ R.T
         start = first_hit(
             hull, space.low, self.voxel * unit, center, rays, 0.4 * self.voxel * unit, space.near, space.far
         )
         depths = unit * np.arange(self.sweep[0], self.sweep[1] + 1e-9, self.step)
-        near = [u for u in space.order[v] if u in images][: self.neighbours]
         if len(near) < 2:
-            return np.zeros(len(points), np.float32)
+            return np.zeros(len(points)), np.full((len(points), len(depths)), -1.0)
         scores = sweep(
-            sub, start, depths, images[v], np.stack([images[u] for u in near]), space.P[near], R, center, inverse_K,
+            points, start, depths, images[v], np.stack([images[u] for u in near]), space.P[near], R, center, inverse_K,
             self.patch, 4.0,
         )  # fmt: skip
-        shape = (len(points), len(around))
-        depth, quality = choose_depth(
-            scores.reshape(*shape, -1),
-            start.reshape(shape),
-            float(depths[0]),
-            self.step * unit,
-            0.05 * unit,
-            0.6 / unit,
-        )
+        return start, scores
+
+    def choose(
+        self, space: Space, start: Float[np.ndarray, "N S"], scores: Float[np.ndarray, "N S D"]
+    ) -> Float[np.ndarray, " N"]:
+        """Depth by the summed correlations of a point and those around it, 0 where they are not believed."""
+        from .kernels_stereo import choose_depth
+
+        unit = space.unit
+        depth, quality = choose_depth(scores, start, self.sweep[0] * unit, self.step * unit, 0.05 * unit, 0.6 / unit)
         return np.where(quality > self.least, depth, 0.0).astype(np.float32)
 
 
 @dataclass(frozen=True, eq=False)
-class _Space:
+class Space:
     """The box that the hull is carved from, and the cameras at working resolution."""
 
     P: Float[np.ndarray, "V 3 4"]
@@ -173,7 +193,7 @@ class _Space:
     far: float
 
     @classmethod
-    def of(cls, stereo: HullStereo, rig: Rig) -> _Space:
+    def of(cls, stereo: HullStereo, rig: Rig) -> Space:
         from .kernels_stereo import carve
 
         if any(c.w2c.ndim == 3 for c in rig.cameras):

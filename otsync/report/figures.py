@@ -16,7 +16,7 @@ MAP_PIXELS = 100
 CHOSEN, PATH, TRUTH, GREY = "#0a7d33", "#c22f2f", "#6b3fa0", "#8a8f98"
 
 
-def _axes(width: float, height: float, columns: int = 1):
+def axes_of(width: float, height: float, columns: int = 1):
     """A figure outside pyplot's global state, and its axes."""
     from matplotlib.figure import Figure
 
@@ -27,7 +27,7 @@ def _axes(width: float, height: float, columns: int = 1):
     return figure, axes
 
 
-def _svg(figure, label: str) -> str:
+def svg(figure, label: str) -> str:
     """The figure as an <svg> element; the same input gives the same bytes."""
     import matplotlib
 
@@ -46,7 +46,7 @@ def clock_bars(offsets: Offsets, clips: Sequence[tuple[float, float]]) -> str:
 
     ``clips``: first second and duration of every video on its own clock.
     """
-    figure, ax = _axes(7.2, 0.9 + 0.24 * len(offsets))
+    figure, ax = axes_of(7.2, 0.9 + 0.24 * len(offsets))
     for v, name in enumerate(offsets.names):
         first, duration = clips[v]
         start, sigma = offsets.seconds[v] + offsets.rates[v] * first, offsets.sigma[v]
@@ -61,14 +61,14 @@ def clock_bars(offsets: Offsets, clips: Sequence[tuple[float, float]]) -> str:
     ax.set_yticks(range(len(offsets)), list(offsets.names))
     ax.invert_yaxis()
     ax.set_xlabel(f"seconds on the clock of {offsets.names[offsets.reference]} (grey: not to be trusted)")
-    return _svg(figure, "videos on the common clock")
+    return svg(figure, "videos on the common clock")
 
 
 def pair_figure(
     pair: Alignment, cost: np.ndarray | None, path: np.ndarray | None, origin: float, truth: float | None
 ) -> str:
     """Left: the frame-to-frame cost with the warping path and the chosen offset. Right: the score over offsets."""
-    figure, (left, right) = _axes(7.2, 2.5, 2)
+    figure, (left, right) = axes_of(7.2, 2.5, 2)
     if cost is not None:
         step = max(1, -(-max(cost.shape) // MAP_PIXELS))
         extent = (-0.5, cost.shape[1] - 0.5, cost.shape[0] - 0.5, -0.5)
@@ -101,7 +101,7 @@ def pair_figure(
         _mark(right, pair, truth)
     else:
         right.set_axis_off()
-    return _svg(figure, "cost map and score")
+    return svg(figure, "cost map and score")
 
 
 def _mark(ax, pair: Alignment, truth: float | None) -> None:
@@ -109,12 +109,13 @@ def _mark(ax, pair: Alignment, truth: float | None) -> None:
         ax.axvline(pair.frames, color=CHOSEN, lw=1, label="chosen")
     if truth is not None:
         ax.axvline(truth * pair.fps, color=TRUTH, lw=1, ls=":", label="true")
-    ax.legend(fontsize=6)
+    if ax.get_legend_handles_labels()[0]:
+        ax.legend(fontsize=6)
 
 
 def residual_bars(labels: Sequence[str], frames: np.ndarray, trusted: Sequence[bool]) -> str:
     """How far each pair's own answer lies from the solution of the graph, in frames."""
-    figure, ax = _axes(7.2, 0.8 + 0.15 * len(labels))
+    figure, ax = axes_of(7.2, 0.8 + 0.15 * len(labels))
     ax.barh(range(len(labels)), frames, color=[CHOSEN if ok else GREY for ok in trusted], height=0.7)
     ax.axvline(0, color="black", lw=0.6)
     ax.set_yticks(range(len(labels)), labels, fontsize=6)
@@ -122,4 +123,4 @@ def residual_bars(labels: Sequence[str], frames: np.ndarray, trusted: Sequence[b
     if np.abs(frames).max(initial=0.0) > 3:
         ax.set_xscale("symlog", linthresh=0.5)
     ax.set_xlabel("pair minus graph, frames (grey: flagged pair)")
-    return _svg(figure, "graph residuals")
+    return svg(figure, "graph residuals")

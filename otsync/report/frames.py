@@ -47,11 +47,11 @@ def sections(scene: Scene, found: Synchronized) -> str:
     zero = np.zeros(len(scene.videos))
     for title, offsets in (("before", zero), ("after", found.offsets.seconds)):
         sheet = contact_sheet(scene, offsets)
-        parts.append(f"<p>{title}</p>{_image(sheet, f'contact sheet {title}')}")
+        parts.append(f"<p>{title}</p>{inline_image(sheet, f'contact sheet {title}')}")
     matched = matches_drawn(scene, found)
     if matched is not None:
         picture, text = matched
-        parts.append(f"<h2>Matches</h2><p class=s>{escape(text)}</p>{_image(picture, 'matches on frames')}")
+        parts.append(f"<h2>Matches</h2><p class=s>{escape(text)}</p>{inline_image(picture, 'matches on frames')}")
     return "".join(parts)
 
 
@@ -124,7 +124,7 @@ def _thumb(frame: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     return cv2.resize(np.asarray(frame), size, interpolation=cv2.INTER_AREA)
 
 
-def _image(pixels: np.ndarray, label: str) -> str:
+def inline_image(pixels: np.ndarray, label: str) -> str:
     """An inline WebP."""
     from PIL import Image
 

@@ -59,11 +59,16 @@ def write_report(
         *_pair_details(offsets, tracks, truth),
         _footer(offsets),
     ]
+    write_page(path, title, page)
+
+
+def write_page(path: str | os.PathLike[str], title: str, parts: Sequence[str]) -> None:
+    """Write ``parts`` of HTML as one self-contained page without a script, atomically."""
     html = (
         "<!doctype html><html lang=en><head><meta charset=utf-8>"
         "<meta name=viewport content='width=device-width,initial-scale=1'>"
         "<meta http-equiv=Content-Security-Policy content=\"default-src 'none';style-src 'unsafe-inline';img-src data:\">"
-        f"<title>{escape(title)}</title><style>{STYLE}</style></head><body>{''.join(page)}</body></html>\n"
+        f"<title>{escape(title)}</title><style>{STYLE}</style></head><body>{''.join(parts)}</body></html>\n"
     )
     with atomic_write(path, "w") as stream:
         stream.write(html)
@@ -89,18 +94,18 @@ def _offset_table(offsets: Offsets, truth: Sequence[float] | None) -> str:
         fps = offsets.fps[offsets.component[v]]
         cells = [
             f"<td>{escape(name)}",
-            f"<td>{_num(offsets.frames[v], 3)}",
-            f"<td>{_num(offsets.sigma[v] * fps, 3)}",
-            f"<td>{_num(offsets.seconds[v], 5)}",
-            f"<td>{_num(offsets.rates[v], 6).rstrip('0').rstrip('.')}",
+            f"<td>{number(offsets.frames[v], 3)}",
+            f"<td>{number(offsets.sigma[v] * fps, 3)}",
+            f"<td>{number(offsets.seconds[v], 5)}",
+            f"<td>{number(offsets.rates[v], 6).rstrip('0').rstrip('.')}",
         ]
         if truth is not None:
-            cells += [f"<td>{_num(truth[v] * fps, 3)}", f"<td>{_num((offsets.seconds[v] - truth[v]) * fps, 3)}"]
-        rows.append("<tr>" + "".join(cells) + f"<td class=t>{_words(offsets.status[v], offsets.flags[v])}")
+            cells += [f"<td>{number(truth[v] * fps, 3)}", f"<td>{number((offsets.seconds[v] - truth[v]) * fps, 3)}"]
+        rows.append("<tr>" + "".join(cells) + f"<td class=t>{status_words(offsets.status[v], offsets.flags[v])}")
     return f"<div class=scroll><table><tr>{''.join(head)}<th class=t>status{''.join(rows)}</table></div>"
 
 
-def _words(status: Status, flags: Sequence[Status]) -> str:
+def status_words(status: Status, flags: Sequence[Status]) -> str:
     if status.ok:
         return "<span class=ok>trusted</span>"
     return f"<span class=no>{', '.join(f.code.replace('_', ' ') for f in flags or (status,))}</span>"
@@ -139,11 +144,11 @@ def _pair_table(offsets: Offsets, truth: Sequence[float] | None) -> str:
     head = "<th>a<th class=t>b<th>offset, frames<th>± sigma<th>matches" + ("<th>error" if truth is not None else "")
     rows = []
     for (i, j), p in sorted(offsets.alignments.items()):
-        error = "" if truth is None else f"<td>{_num((p.offset - (truth[j] - truth[i])) * p.fps, 3)}"
+        error = "" if truth is None else f"<td>{number((p.offset - (truth[j] - truth[i])) * p.fps, 3)}"
         count = len(offsets.matches[i, j]) if (i, j) in offsets.matches else "–"
         rows.append(
-            f"<tr><td>{escape(offsets.names[i])}<td class=t>{escape(offsets.names[j])}<td>{_num(p.frames, 3)}"
-            f"<td>{_num(p.sigma * p.fps, 3)}<td>{count}{error}<td class=t>{_words(p.status, p.flags)}"
+            f"<tr><td>{escape(offsets.names[i])}<td class=t>{escape(offsets.names[j])}<td>{number(p.frames, 3)}"
+            f"<td>{number(p.sigma * p.fps, 3)}<td>{count}{error}<td class=t>{status_words(p.status, p.flags)}"
         )
     return f"<div class=scroll><table><tr>{head}<th class=t>status{''.join(rows)}</table></div>"
 
@@ -160,7 +165,9 @@ def _pair_details(offsets: Offsets, tracks: Sequence[TrackSet] | None, truth: Se
     for (i, j), p in shown:
         cost, path, origin = _cost_map(p, (i, j), offsets.matches, tracks)
         true = None if truth is None else float(truth[j] - truth[i])
-        parts.append(f"<h3>{escape(offsets.names[i])} – {escape(offsets.names[j])}: {_words(p.status, p.flags)}</h3>")
+        parts.append(
+            f"<h3>{escape(offsets.names[i])} – {escape(offsets.names[j])}: {status_words(p.status, p.flags)}</h3>"
+        )
         parts.append(figures.pair_figure(p, cost, path, origin, true))
     if len(shown) < len(offsets.alignments):
         parts.append(f"<p class=s>{len(offsets.alignments) - len(shown)} further pairs stand in the table only.</p>")
@@ -197,5 +204,5 @@ def _footer(offsets: Offsets) -> str:
     return f"<p class=s>otsync {__version__}, Python {platform.python_version()}, {platform.machine()}. {escape(stats)}</p>"
 
 
-def _num(x: float, digits: int) -> str:
+def number(x: float, digits: int) -> str:
     return f"{x:.{digits}f}" if np.isfinite(x) else "–"

@@ -33,7 +33,8 @@ class Layout:
 class Binding:
     """N Gaussians bound to M nodes: constants of a fit, apart from its learnable parameters.
 
-    rest int64 [N]: which of the R rests the Gaussian was bound at; nodes int64 [N,8] and weights [N,8] >= 0, of sum 1;
+    rest int64 [N]: which of the R rests the Gaussian was bound at; nodes int64 [N,8] and weights [N,8] >= 0, of sum 1,
+    the nearest node first, which is the heaviest;
     times float64 [R] world seconds of the rests; positions [R,M,3] and quats [R,M,4] (unit): the nodes' poses then,
     frozen, so that no reference frame is evaluated anew in each step and a Gaussian's mean keeps its meaning.
     """
@@ -113,5 +114,9 @@ class Binding:
     @cached_property
     def pair_rests(self) -> tuple[np.ndarray, np.ndarray]:
         """Rest positions [Q,3] and quats [Q,4] of the layout's pairs: float32."""
-        at = self.layout.rest, self.layout.node
-        return tuple(np.ascontiguousarray(a.cpu().numpy()[at], np.float32) for a in (self.positions, self.quats))
+        rests, nodes = self.layout.rest, self.layout.node
+
+        def of_pairs(poses: Tensor) -> np.ndarray:
+            return np.ascontiguousarray(poses.cpu().numpy()[rests, nodes], np.float32)
+
+        return of_pairs(self.positions), of_pairs(self.quats)

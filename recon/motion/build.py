@@ -16,7 +16,7 @@ from recon.motion.nodes import Grid
 from recon.motion.paths import HermiteSpline
 from recon.motion.rotations import continuous, quaternions
 from recon.motion.scaffold import Scaffold
-from recon.motion.solve import FRAME, Observations, Priors, Smoothness, neighbourhood_rotations, solve_curves
+from recon.motion.solve import FRAME, Coupling, Observations, Smoothness, neighbourhood_rotations, solve_curves
 from recon.motion.warp import LINEAR
 
 logger = logging.getLogger("recon.motion")
@@ -41,12 +41,12 @@ class ScaffoldOptions:
     unit: float | None = None
     second_pick: float = 0.8
     fewest: int = 32
-    most: int = 900
+    most: int = 1800
     spacing: float = 4 * FRAME
     margin: float = 4 * FRAME
     per_video: bool = False
     neighbours: int = 10
-    reach: float = 5.0
+    reach: float = picking.REACH
     robust: float = 2.3
     shortest: float = 10 * FRAME
     smooth: Smoothness = field(default_factory=Smoothness)
@@ -61,7 +61,7 @@ class ScaffoldOptions:
             raise ValueError("margin, neighbours, fewest, most: expected margin >= 0, 1 neighbour, fewest <= most.")
 
 
-UNIT, LEAST_UNIT, GROWTH = 7.5, 2.0, 1.25
+UNIT, LEAST_UNIT, MOST_UNIT, GROWTH = 7.5, 2.0, 750.0, 1.25  # footprints, and the factor from one try to the next
 
 
 def build_scaffold(
@@ -148,21 +148,14 @@ def _nodes(grid: Grid, path: HermiteSpline, footprint: float, options: ScaffoldO
     every = np.ones(full.shape[:2], bool)
     longest = np.argsort(-grid.seen[picked].sum(1), kind="stable")
     again = picking.pick(full, every, longest, options.second_pick * unit, len(picked))
-    assert again is not None
     fit = _Fit(grid, path, picked[again], unit, footprint, options)
-    curves = fit.solve(*picking.neighbours(full[again], every[again], options.neighbours), rounds=2)
+    curves = fit.solve(*picking.neighbours(full[again], every[again], options.neighbours), rounds=3)
     full = fit.on_grid(curves)
     neighbours, distances = picking.neighbours(full, every[again], options.neighbours)
-    weights = edge_weights(distances, unit, options.reach)
+    weights = picking.edge_weights(distances, unit, options.reach)
     turned = neighbourhood_rotations(curves, neighbours, weights, unit)
     logger.info("%d nodes of %d tracks, %.3g world units apart", len(again), len(grid), unit)
     return _Nodes(curves, turned, neighbours, weights, unit)
-
-
-def edge_weights(distances: np.ndarray, unit: float, reach: float = 5.0) -> np.ndarray:
-    """Weights of edges of D_track `distances`: exp(-D²/2(1.5 unit)²), 0 beyond `reach` units."""
-    near = distances < reach * unit
-    return np.where(near, np.exp(-(np.where(near, distances, 0) ** 2) / (2 * (1.5 * unit) ** 2)) + 1e-6, 0.0)
 
 
 def _first_pick(grid: Grid, footprint: float, options: ScaffoldOptions, seed: int) -> tuple[np.ndarray, float]:
@@ -176,20 +169,27 @@ def _first_pick(grid: Grid, footprint: float, options: ScaffoldOptions, seed: in
     xyz, seen = grid.compared()
     order = order[seen[order].any(1)]
 
-    def at(unit: float) -> np.ndarray | None:
-        return picking.pick(xyz, seen, order, unit * footprint, options.most)
+    def at(unit: float) -> np.ndarray:
+        return picking.pick(xyz, seen, order, unit * footprint, options.most + 1)
 
     unit = options.unit or UNIT
     picked = at(unit)
-    while picked is None:  # a larger spacing, rather than a part of the scene without nodes
+    # a larger spacing, rather than a part of the scene without nodes; in vain where few are ever seen together
+    while len(picked) > options.most and unit < MOST_UNIT:
         unit *= GROWTH
         picked = at(unit)
     while options.unit is None and len(picked) < min(options.fewest, len(order)) and unit / GROWTH >= LEAST_UNIT:
         closer = at(unit / GROWTH)
-        if closer is None:
+        if len(closer) > options.most:
             break
         unit, picked = unit / GROWTH, closer
-    return picked, unit * footprint
+    if len(picked) > options.most:
+        logger.warning(
+            "more than %d tracks are never seen together or are further apart than %g footprints: those seen for the "
+            "longest become nodes; are the offsets right?",
+            *(options.most, unit),
+        )
+    return picked[: options.most], unit * footprint
 
 
 class _Fit:
@@ -206,6 +206,7 @@ class _Fit:
     ) -> None:
         self.grid, self.path, self.unit, self.options = grid, path, unit, options
         self.robust, self.n = options.robust * footprint, len(picked)
+        self.seen = grid.seen[picked]
         self.observed = []
         begin = 0
         for times, xyz in grid.samples:
@@ -217,11 +218,10 @@ class _Fit:
         self.design = path.design(grid.times[::stride])
 
     def solve(self, neighbours: np.ndarray, distances: np.ndarray, rounds: int) -> np.ndarray:
-        near = distances < 6 * self.unit
-        ties = np.exp(-(distances[near] ** 2) / (2 * (1.5 * self.unit) ** 2))
-        edges = np.stack([np.nonzero(near)[0], neighbours[near]], 1)
-        priors = Priors.of(self.path, edges, ties, self.n, self.grid.times, self.options.smooth)
-        return solve_curves(self.path, self.observed, priors, robust=self.robust, rounds=rounds)
+        ties = picking.edge_weights(distances, self.unit, self.options.reach)
+        edges = np.stack([np.nonzero(ties)[0], neighbours[ties > 0]], 1)
+        coupling = Coupling(edges, ties[ties > 0], self.grid.times, self.seen, self.unit)
+        return solve_curves(self.path, self.observed, coupling, self.options.smooth, robust=self.robust, rounds=rounds)
 
     def on_grid(self, curves: np.ndarray) -> np.ndarray:
         """Curves [P,M,3] at the frames at which tracks are compared: float32 [M,G,3] relative to the centre."""

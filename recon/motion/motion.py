@@ -34,6 +34,10 @@ class Motion(Protocol):
         """The motion of the Gaussians at `index`: integers, with repeats, or a mask."""
         ...
 
+    def shifted(self, by: float, clocks: Tensor | None = None) -> Self:
+        """The same motion, `by` seconds later in world time; `clocks` [V]: the videos' offsets after that."""
+        ...
+
     def to(self, device: torch.device | str) -> Self:
         """The same motion on another device."""
         ...

@@ -19,6 +19,7 @@ from recon.motion.paths import MAX_KNOTS
 
 logger = logging.getLogger("recon.motion")
 
+REACH = 5.0  # units of D_track at which neighbours end
 TOP = 3  # D_track is the third largest distance
 BRIDGE_FRAMES = 2.5  # of the video's own: a longer gap is not interpolated
 MAX_FRAMES = 4 * MAX_KNOTS  # of a grid
@@ -142,10 +143,9 @@ def pick(
     order: Int[np.ndarray, " n"],
     unit: float,
     most: int,
-) -> Int[np.ndarray, " m"] | None:
-    """Greedily those tracks, in `order`, whose D_track to all picked before exceeds `unit`; None if over `most`."""
-    found, n = nodes_kernels.pick(xyz, seen, order.astype(np.int64), np.float32(unit) ** 2, TOP, most)
-    return None if n > most else found[:n]
+) -> Int[np.ndarray, " m"]:
+    """Greedily those tracks, in `order`, whose D_track to all picked before exceeds `unit`; at most `most` of them."""
+    return nodes_kernels.pick(xyz, seen, order.astype(np.int64), np.float32(unit) ** 2, TOP, most)
 
 
 def neighbours(
@@ -164,3 +164,9 @@ def neighbours(
     index[:, :found] = np.argsort(D, axis=1, kind="stable")[:, :found]
     distance[:, :found] = np.take_along_axis(D, index[:, :found], 1)
     return np.where(np.isfinite(distance), index, np.arange(m)[:, None]), distance
+
+
+def edge_weights(distances: np.ndarray, unit: float, reach: float = REACH) -> np.ndarray:
+    """Weights of edges of D_track `distances`: exp(-D²/2(1.5 unit)²), 0 beyond `reach` units."""
+    near = distances < reach * unit
+    return np.where(near, np.exp(-(np.where(near, distances, 0) ** 2) / (2 * (1.5 * unit) ** 2)) + 1e-6, 0.0)

@@ -25,7 +25,7 @@ def _near(xyz, seen, i, j, reach2, top):
 
 @kernel()
 def pick(xyz, seen, order, reach2, top, most):
-    """Greedy cover of the tracks in `order`: those picked, and how many (most + 1 once there would be more)."""
+    """Greedy cover of the tracks in `order`, cut off at `most`: those picked."""
     picked = np.empty(most, np.int64)
     n = 0
     for i in order:
@@ -35,11 +35,11 @@ def pick(xyz, seen, order, reach2, top, most):
                 covered = True
                 break
         if not covered:
-            if n == most:
-                return picked, most + 1
             picked[n] = i
             n += 1
-    return picked, n
+            if n == most:
+                break
+    return picked[:n]
 
 
 @kernel()

@@ -76,6 +76,9 @@ class PerGaussian:
         """Means [N,3] displaced to world second `t`, and the quats as they are. `clocks` are ignored."""
         return means + self.path.at(self.own_knots, t), quats
 
+    def shifted(self, by: float, clocks: Tensor | None = None) -> PerGaussian:
+        return replace(self, path=replace(self.path, start=self.path.start + by))
+
     def take(self, index: Tensor | np.ndarray) -> PerGaussian:
         index = torch.as_tensor(index, device=self.own_knots.device)
         return replace(self, own_knots=self.own_knots[:, index])
@@ -109,6 +112,9 @@ class Static:
         self, means: Tensor, quats: Tensor, t: Tensor | float, clocks: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
         return means, quats
+
+    def shifted(self, by: float, clocks: Tensor | None = None) -> Static:
+        return self
 
     def take(self, index: Tensor | np.ndarray) -> Static:
         return self

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import math
 
-from recon.motion.rotations import LEAST_NORM
 from recon.raster.cpu.threads import kernel
+
+LEAST_NORM = 1e-12  # below it a quaternion is no direction any more: divided by this instead, it stays finite
 
 inline = kernel(fastmath={"contract", "nsz"})
 

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-LEAST_NORM = 1e-12  # below it a quaternion is no direction any more: divided by this instead, it stays finite
+from recon.motion.quaternion_kernels import LEAST_NORM
 
 
 def unit(quats: Tensor) -> Tensor:

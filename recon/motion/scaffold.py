@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
 
@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from recon.motion import fused
 from recon.motion import warp as warping
-from recon.motion import warp_fused
 from recon.motion.binding import NODES, Binding
 from recon.motion.paths import WINDOW, Path, path_arrays, path_from_arrays
 from recon.motion.rotations import unit
@@ -106,14 +106,15 @@ class Scaffold:
     def nodes(self, t: Tensor | float, clocks: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Positions [M,3] and unit quaternions [M,4] of the nodes at world second `t`; differentiable in everything."""
         times = self.own_times(t, clocks)
-        if self.clock is None:
-            return self.path.at(self.knots, times[0]), unit(self.path.at(self.knot_quats, times[0]))
+        if fused.applies(self.knots, self.knot_quats):
+            return fused.poses(times, self.knots, self.knot_quats, self.path, self.rig.clock)
         first, w = self.path.weights(times)
-        w = w.to(self.knots.dtype)[self.clock]  # [M,4]
-        window = torch.as_tensor(first)[self.clock] + torch.arange(WINDOW, device=w.device)[:, None]  # [4,M]
+        clock = torch.zeros(len(self), dtype=torch.int64, device=w.device) if self.clock is None else self.clock
+        window = torch.as_tensor(first)[clock] + torch.arange(WINDOW, device=w.device)[:, None]  # [4,M]
         every = torch.arange(len(self), device=w.device)
         positions, quats = (
-            torch.einsum("ma,amx->mx", w, knots[window, every]) for knots in (self.knots, self.knot_quats)
+            torch.einsum("ma,amx->mx", w.to(knots.dtype)[clock], knots[window, every])
+            for knots in (self.knots, self.knot_quats)
         )
         return positions, unit(quats)
 
@@ -126,16 +127,22 @@ class Scaffold:
         """
         if len(means) != len(self.binding):
             raise ValueError(f"means: expected the {len(self.binding)} Gaussians bound here; found {len(means)}.")
-        tensors = (means, quats, self.knots, self.knot_quats)
-        if all(x.dtype == torch.float32 and x.device.type == "cpu" for x in tensors):
-            return warp_fused.warp(means, quats, self.own_times(t, clocks), self.knots, self.knot_quats, self._rig)
+        if fused.applies(means, quats, self.knots, self.knot_quats):
+            return fused.warp(means, quats, self.own_times(t, clocks), self.knots, self.knot_quats, self.rig)
         positions, node_quats = self.nodes(t, clocks)
         return warping.blend(self.binding, positions, node_quats, means, quats, self.blend)
 
+    def moments(self, times: Sequence[float], clocks: Tensor | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """First knots [S,V] and weights [S,V,4] of S world seconds, for the kernels."""
+        own = torch.stack([self.own_times(t, clocks) for t in times]).detach().cpu().numpy()
+        first, weights, _ = self.path.basis(own)
+        return first, weights
+
     @cached_property
-    def _rig(self) -> warp_fused.Rig:
+    def rig(self) -> fused.Rig:
+        """The constants, as the kernels take them."""
         clock = np.zeros(len(self), np.int32) if self.clock is None else self.clock.numpy().astype(np.int32)
-        return warp_fused.Rig(self.path, self.binding, clock, self.blend == warping.DUAL_QUATERNION)
+        return fused.Rig(self.path, self.binding, clock, self.blend == warping.DUAL_QUATERNION)
 
     def bind(
         self, points: Tensor | np.ndarray, t_rest: float, clocks: Tensor | None = None, *, video: int | None = None
@@ -181,6 +188,15 @@ class Scaffold:
         weights /= weights.sum(1, keepdims=True)
         return torch.as_tensor(nodes, device=self.knots.device), torch.as_tensor(weights).to(self.knots)
 
+    def shifted(self, by: float, clocks: Tensor | None = None) -> Scaffold:
+        """The same motion, `by` seconds later. Nodes on videos' own clocks keep them; `clocks` are their new offsets."""
+        binding = replace(self.binding, times=self.binding.times + by)
+        if self.clock is None:
+            return replace(self, path=replace(self.path, start=self.path.start + by), binding=binding)
+        assert self.offsets is not None
+        offsets = self.offsets + by if clocks is None else clocks.detach().to(self.offsets)
+        return replace(self, offsets=offsets, binding=binding)
+
     def take(self, index: Tensor | np.ndarray) -> Scaffold:
         """The same nodes with the Gaussians at `index`: for pruning and duplication."""
         return replace(self, binding=self.binding.take(index))
@@ -195,15 +211,13 @@ class Scaffold:
 
     def to(self, device: torch.device | str) -> Scaffold:
         """The same scaffold on another device."""
-        moved = {k: v.to(device) for k, v in vars(self).items() if isinstance(v, Tensor)}
-        parts = {k: v.to(device) for k, v in vars(self.binding).items() if isinstance(v, Tensor)}
-        return replace(self, binding=Binding(**parts), **moved)
+        return _mapped(self, lambda x: x.to(device), binding=_mapped(self.binding, lambda x: x.to(device)))
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Everything, as plain arrays: what a checkpoint holds."""
-        parts: dict[str, Any] = {k: v for k, v in vars(self).items() if isinstance(v, Tensor)}
-        parts |= {f"binding_{k}": v for k, v in vars(self.binding).items() if isinstance(v, Tensor)}
-        arrays = {k: v.detach().cpu().numpy() for k, v in parts.items()}
+        parts = {f.name: getattr(self, f.name) for f in fields(self)}
+        parts |= {f"binding_{f.name}": getattr(self.binding, f.name) for f in fields(self.binding)}
+        arrays = {k: v.detach().cpu().numpy() for k, v in parts.items() if isinstance(v, Tensor)}
         named = {"kind": np.array("scaffold"), "blend": np.array(self.blend), "unit": np.array(self.unit)}
         return named | path_arrays(self.path) | arrays
 
@@ -221,7 +235,10 @@ class Scaffold:
         try:
             return cls(
                 path_from_arrays(arrays),
-                *(tensor(name) for name in ("knots", "knot_quats", "edges", "edge_weights")),
+                knots=tensor("knots"),
+                knot_quats=tensor("knot_quats"),
+                edges=tensor("edges"),
+                edge_weights=tensor("edge_weights"),
                 unit=float(arrays["unit"]),
                 binding=Binding(*(tensor(f"binding_{name}") for name in bound)),
                 clock=perhaps("clock"),
@@ -231,3 +248,9 @@ class Scaffold:
             )
         except (KeyError, TypeError) as error:
             raise ValueError(f"arrays: expected those of a scaffold; found no sound {error}.") from None
+
+
+def _mapped(value: Any, change: Callable[[Tensor], Tensor], **others: Any) -> Any:
+    """A dataclass with `change` made to each of its tensors."""
+    tensors = {f.name: getattr(value, f.name) for f in fields(value)}
+    return replace(value, **{k: change(v) for k, v in tensors.items() if isinstance(v, Tensor)}, **others)

@@ -125,16 +125,16 @@ _folder = pathlib.Path(__file__).parent
 
 
 @functools.cache
-def _stamps(folder: pathlib.Path) -> tuple[tuple[str, int, int], ...]:
-    return tuple((p.name, p.stat().st_mtime_ns, p.stat().st_size) for p in sorted(folder.glob("*.py")))
+def _stamps(folder: pathlib.Path, pattern: str) -> tuple[tuple[str, int, int], ...]:
+    return tuple((p.name, p.stat().st_mtime_ns, p.stat().st_size) for p in sorted(folder.glob(pattern)))
 
 
 def _tie_to_sources(dispatcher: Any) -> None:
-    """Make the cached code of one kernel stale when any file of its folder, or of this one, changes.
+    """Make the cached code of one kernel stale when any file of this folder, or any *kernels.py of its own, changes.
 
     Numba compares the kernel's own file only, but kernels compile in the constants and functions of the others.
     """
     file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
     if file is not None and hasattr(file, "_source_stamp"):
         own = pathlib.Path(dispatcher.py_func.__code__.co_filename).parent
-        file._source_stamp = (file._source_stamp, _stamps(_folder), _stamps(own))
+        file._source_stamp = (file._source_stamp, _stamps(_folder, "*.py"), _stamps(own, "*kernels.py"))

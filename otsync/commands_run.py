@@ -1,0 +1,100 @@
+"""``otsync run``: from a recording to one synchronised 4D scene. What needs torch is imported when it runs."""
+
+from __future__ import annotations
+
+import os
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import tyro
+
+from .commands_recordings import RecordingOptions
+
+
+@dataclass
+class Run:
+    """Synchronise a recording, then reconstruct it and refine the offsets from its images.
+
+    Example: otsync run recording/ --out result --held-out 0 --budget 300
+
+    A quick look: otsync run recording/ --out look --width 160 --steps 300
+
+    Stopped at any moment, the same command continues. Look at the scene with recon render and recon export.
+    """
+
+    scene: tyro.conf.Positional[Path]
+    """A scene.json, or a folder that holds one, or a folder in Panoptic layout."""
+    out: Path = Path("run")
+    """Folder for offsets_coarse.json, offsets.json, scene.npz, metrics.json, report.html and sync.html."""
+    held_out: tuple[str, ...] = ()
+    """Names of videos that neither synchronisation nor fit sees: the finished scene is held against them."""
+    reference: str | None = None
+    """Name of the video whose clock is the world's; default: the first."""
+    width: int = 320
+    """Working pixels of an image's width in the reconstruction."""
+    frames: tuple[int, int] | None = None
+    """First and last (exclusive) frame of every video to use; default: all."""
+    budget: float | None = None
+    """Seconds for the fit, after everything is prepared; default: 300."""
+    steps: int | None = None
+    """Steps of the fit instead of seconds: the result is then the same on any machine of a kind."""
+    seed: int = 0
+    truth: Path | None = None
+    """True offsets, where they are known: adds errors to tables and reports."""
+    allow_outside: bool = False
+    """Let the scene name files outside its folder."""
+    recording: RecordingOptions = field(default_factory=RecordingOptions)
+
+    def run(self) -> int:
+        try:
+            from recon.cli import FitOptions, opened, reconstructed, tell
+            from recon.fit import Diverged
+            from recon.prepare import Progress, readable
+        except ModuleNotFoundError as error:
+            raise ValueError(f"run: needs {error.name}. Install it: pip install 'otsync[recon,video]'.") from None
+        from .cli import table
+        from .files import write_json
+        from .io.mend import cut
+        from .priors.cache import Cache
+        from .recordings import synchronize_scene
+        from .report.frames import write_recording_report
+
+        options = FitOptions(
+            held_out=self.held_out, width=self.width, budget=self.budget, steps=self.steps, seed=self.seed,
+            cache=self.recording.cache, workers=self.recording.workers,
+        )  # fmt: skip
+        options.length()  # before the work, not after it
+        scene = opened(self.scene, self.allow_outside or self.recording.allow_outside)
+        if self.recording.cameras:
+            scene = scene.take(
+                [*self.recording.cameras, *(n for n in self.held_out if n not in self.recording.cameras)]
+            )
+        scene.take(self.held_out)  # names that are not there
+        cache, progress = Cache(self.recording.cache or self.out / "stages"), Progress(tell)
+        with ThreadPoolExecutor(self.recording.workers or os.cpu_count() or 1) as pool:
+            if self.frames is not None:
+                scene = cut(scene, *self.frames)
+            with progress.stage("reading"):
+                scene = readable(scene, cache, pool.map, progress)
+            train = scene.take([n for n in scene.names if n not in self.held_out])
+            if self.reference is not None and self.reference not in train.names:
+                raise ValueError(f"--reference: expected one of {', '.join(train.names)}; found {self.reference!r}.")
+            reference = 0 if self.reference is None else train.names.index(self.reference)
+            found = synchronize_scene(
+                train, route=self.recording.route, reference=reference, cache=cache, map=pool.map, tell=tell,
+            )  # fmt: skip
+        progress.seconds |= {f"synchronise: {stage}": s for stage, s in found.seconds.items()}
+        print(table(found.offsets))
+        found.offsets.save(self.out / "offsets_coarse.json")
+        write_json(self.out / "sync.json", {"route": found.route, "why": list(found.why), "seconds": found.seconds})
+        write_recording_report(self.out / "sync.html", train, found)
+        for name, flags in zip(found.offsets.names, found.offsets.flags, strict=True):
+            for flag in flags:
+                print(f"{name}: {flag.code}: {flag}", file=sys.stderr)
+        try:
+            return reconstructed(scene, found.offsets, self.out, options, truth=self.truth, progress=progress)
+        except Diverged as error:
+            print(f"otsync: {error}", file=sys.stderr)
+            return 1

@@ -1,0 +1,74 @@
+"""Parts of a scene: some frames of its videos, and those of them that can be read at all."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from ..types import Video
+from .frames import FrameRange, LazyFrames
+from .scene import Scene
+
+
+def cut(scene: Scene, first: int, stop: int) -> Scene:
+    """Frames ``first`` to ``stop`` (exclusive) of every video, at the times they had. ValueError where there are none."""
+    for video in scene.videos:
+        if not 0 <= first < min(stop, len(video.frames)):
+            raise ValueError(
+                f"frames: expected first < stop within the {len(video.frames)} frames of {video.name}; found "
+                f"{first} to {stop}."
+            )
+    return keep_frames(scene, [range(first, min(stop, len(v.frames))) for v in scene.videos])
+
+
+def keep_frames(scene: Scene, index: Sequence[Sequence[int]]) -> Scene:
+    """The frames at ``index`` (rising) of every video, with their masks, depth, poses and times."""
+    videos, masks = [], []
+    for video, mask, picks in zip(scene.videos, scene.masks, index, strict=True):
+        if len(picks) == len(video.frames):
+            videos.append(video)
+            masks.append(mask)
+            continue
+        camera, at = video.camera, np.asarray(picks, int)
+        if camera.w2c.ndim == 3:
+            camera = replace(camera, w2c=camera.w2c[at])
+        depth = None if video.depth is None else _some(video.depth, picks)
+        times = video.times[at]
+        # few frames that are left of many have another rate than the video: then their times alone tell it
+        thinned = video.fps is not None and len(at) > 1 and float(np.median(np.diff(times))) > 1.5 / video.fps
+        frames, fps = _some(video.frames, picks), None if thinned else video.fps
+        videos.append(replace(video, frames=frames, camera=camera, fps=fps, timestamps=times, depth=depth))
+        masks.append(None if mask is None else _some(mask, picks))
+    return replace(scene, videos=tuple(videos), masks=tuple(masks))
+
+
+def unreadable(video: Video, masks: Sequence[Any] | None = None) -> dict[int, str]:
+    """Frames that nothing can be made of, and why: damaged, of another size than the camera says, or with NaN.
+
+    Every frame is decoded once, its mask and depth map too.
+    """
+    bad = {}
+    size = (video.camera.height, video.camera.width)
+    for k in range(len(video.frames)):
+        try:
+            image = np.asarray(video.frames[k])
+            if image.shape != (*size, 3):
+                raise ValueError(f"expected {size[1]} x {size[0]} RGB pixels as the camera says; found {image.shape}")
+            if image.dtype.kind == "f" and not np.isfinite(image).all():
+                raise ValueError("expected finite colours; found NaN or infinity")
+            if masks is not None:
+                np.asarray(masks[k])
+            if video.depth is not None:
+                np.asarray(video.depth[k])
+        except (ValueError, OSError, EOFError, SyntaxError) as error:
+            bad[k] = str(error)
+    return bad
+
+
+def _some(sequence: Sequence[Any], picks: Sequence[int]) -> Sequence[Any]:
+    if isinstance(sequence, LazyFrames):
+        return FrameRange(sequence, picks)
+    return [sequence[k] for k in picks]

@@ -1,0 +1,182 @@
+"""From a recording and its offsets to a 4D scene and better offsets: prepare, fit, compare, write.
+
+A run that was killed continues from its stages and its checkpoint, and ends with the same result.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from otsync.files import write_json
+from otsync.io import Scene
+from otsync.io.mend import cut
+from otsync.types import Offsets, TrackSet
+from recon.effects import Gain
+from recon.evaluate import offset_error
+from recon.fit import Reconstruction, fit
+from recon.held_out import Clock, ViewScore, view
+from recon.lpips import Lpips
+from recon.optimize import RATES, without
+from recon.prepare import MapLike, Plan, Prepared, Progress, given_clocks, prepare, read_footage, readable
+from recon.report import write_reconstruction_report
+from recon.result import FilmedBy, Result, metrics_of, save_run
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What :func:`reconstruct` came to.
+
+    Args:
+        found: the fit. coarse: the offsets it began with, of the same videos. truth: (V,) seconds, where known.
+        views: how well every camera that was compared is shown. left_out: videos without an offset.
+    """
+
+    found: Reconstruction
+    coarse: Offsets
+    views: tuple[ViewScore, ...]
+    left_out: tuple[str, ...] = ()
+    truth: np.ndarray | None = None
+    lpips_reason: str = ""
+
+
+def reconstruct(
+    scene: Scene,
+    offsets: Offsets,
+    out: Path,
+    *,
+    plan: Plan | None = None,
+    tracks: Sequence[TrackSet] | None = None,
+    held_out: Sequence[str] = (),
+    truth: Offsets | None = None,
+    steps: int | None = None,
+    budget: float | None = None,
+    cache: Any = None,
+    map: MapLike = map,
+    progress: Progress | None = None,
+) -> Outcome:
+    """Prepare, fit, evaluate and write the result folder (see :mod:`recon.result`).
+
+    A run that was killed continues from its stages and from ``fit.npz``; given ``steps``, it ends with the same files.
+
+    Args:
+        tracks: in space, of training videos; default: tracked and lifted here.
+        truth: true offsets of at least the training videos. steps, budget: see :func:`recon.fit.fit`.
+    """
+    from otsync.priors.cache import Cache
+
+    plan, progress, cache = plan or Plan(), progress or Progress(), cache or Cache(out / "stages")
+    rates = without(RATES, *plan.freeze)  # says what is wrong before the work
+    out.mkdir(parents=True, exist_ok=True)
+    ready = prepare(scene, offsets, tracks, plan=plan, held_out=held_out, cache=cache, map=map, progress=progress)
+    true = None if truth is None else true_seconds(truth, ready.offsets)
+    effects = (Gain(start=ready.gains), *plan.effects)
+    with progress.stage("fit"):
+        found = fit(
+            ready.initial, ready.footage, ready.offsets, losses=plan.losses, effects=effects, rates=rates, steps=steps,
+            budget=budget, batch=plan.batch, densify=plan.densify, seed=plan.seed, checkpoint=out / "fit.npz",
+            save_every=plan.save_every,
+        )  # fmt: skip
+    with progress.stage("views"):
+        held = [view(found.scene, f, ready.clocks.get(f.name), layered=ready.layered) for f in ready.held_out]
+        gains = found.parameters["gain"].detach().cpu().numpy().astype(float)
+        scores = [v.score(most=plan.views) for v in held]
+        for n in _some(len(ready.footage), SHOWN_TRAINING):
+            clock = Clock(float(found.offsets.seconds[n]), float(found.offsets.rates[n]), "fitted")
+            looking = view(found.scene, ready.footage[n], clock, gain=gains[n], layered=ready.layered)
+            scores.append(looking.score(most=max(1, plan.views // 4), held_out=False))
+    fitted = [
+        FilmedBy.of(f, Clock(float(found.offsets.seconds[n]), float(found.offsets.rates[n]), "fitted"), gains[n])
+        for n, f in enumerate(ready.footage)
+    ]
+    others = [FilmedBy.of(v.footage, v.clock, v.gain, held_out=True) for v in held]
+    outcome = Outcome(found, ready.offsets, tuple(scores), ready.left_out, true, Lpips().reason)
+    _write(out, outcome, [*fitted, *others], ready, plan, progress)
+    return outcome
+
+
+SHOWN_TRAINING = 2
+"""Training cameras that are compared as well, to show what the held-out ones lack."""
+
+
+def _some(count: int, most: int) -> list[int]:
+    return sorted({int(i) for i in np.linspace(0, count - 1, min(count, most)).round()})
+
+
+def _write(
+    out: Path, outcome: Outcome, videos: Sequence[FilmedBy], ready: Prepared, plan: Plan, progress: Progress
+) -> None:
+    """The result folder; run.json last but for the report, since with it the folder counts as finished."""
+    found = outcome.found
+    found.scene.save(out / "scene.npz")
+    found.offsets.save(out / "offsets.json")
+    metrics = metrics_of(outcome.views, found.stats, outcome.lpips_reason)
+    if outcome.truth is not None:
+        metrics["offset_error"] = offset_figures(found.offsets, outcome.truth)
+    write_json(out / "metrics.json", metrics)
+    options = {"width": plan.width, "frames": plan.frames, "seed": plan.seed, "freeze": list(plan.freeze),
+               "layered": ready.layered}  # fmt: skip
+    save_run(
+        out, videos, options=options, frame=ready.frame, notes=progress.notes, seconds=progress.seconds,
+    )  # fmt: skip
+    write_reconstruction_report(
+        out / "report.html", found, outcome.coarse, [f.name for f in ready.footage], outcome.views,
+        seconds=progress.seconds, notes=progress.notes, truth=outcome.truth, lpips_reason=outcome.lpips_reason,
+    )  # fmt: skip
+
+
+def offset_figures(offsets: Offsets, true: np.ndarray) -> dict[str, Any]:
+    """Mean and largest absolute error in frames, relative to the reference."""
+    step = 1.0 / float(offsets.fps[offsets.reference])
+    error = offset_error(offsets.seconds, true, step, reference=offsets.reference)
+    return {"mean_frames": error.mean, "max_frames": error.max, "frames": [float(e) for e in error.errors]}
+
+
+def true_seconds(truth: Offsets, offsets: Offsets) -> np.ndarray:
+    """True offsets of the videos relative to their reference. ValueError names those that the truth lacks."""
+    missing = [n for n in offsets.names if n not in truth.names]
+    if missing:
+        raise ValueError(f"truth: expected offsets of {', '.join(offsets.names)}; {', '.join(missing)} are not in it.")
+    seconds = np.array([truth.seconds[truth.names.index(n)] for n in offsets.names])
+    return seconds - seconds[offsets.reference]
+
+
+def evaluate(
+    result: Result,
+    scene: Scene,
+    names: Sequence[str],
+    offsets: Offsets | None = None,
+    *,
+    most: int = 50,
+    lpips_weights: Path | None = None,
+    cache: Any = None,
+    map: MapLike = map,
+    progress: Progress | None = None,
+) -> tuple[tuple[ViewScore, ...], str]:
+    """Scores of the named cameras against a finished result, and why LPIPS is missing ("" when it is not).
+
+    Clocks: as ``offsets`` say, else those of the result, else found on the frozen scene.
+    """
+    from otsync.priors.cache import Cache
+
+    progress, cache = progress or Progress(), cache or Cache()
+    lpips = Lpips.load(lpips_weights)
+    part = scene.take(names)
+    frames = result.options.get("frames")
+    if frames is not None:
+        part = cut(part, int(frames[0]), int(frames[1]))
+    part = readable(part, cache, map, progress)
+    known = {v.name: v for v in result.videos}
+    scores = []
+    for footage in read_footage(part, int(result.options["width"]), cache, map, progress):
+        own = known.get(footage.name)
+        clock, gain = (None, None) if own is None else (own.clock, own.gain)
+        if offsets is not None and (own is None or own.held_out):
+            clock = given_clocks(offsets).get(footage.name, clock)
+        looking = view(result.scene, footage, clock, gain=gain, layered=result.layered)
+        scores.append(looking.score(most=most, lpips=lpips, held_out=own is None or own.held_out))
+    return tuple(scores), lpips.reason

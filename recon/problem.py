@@ -1,0 +1,139 @@
+"""What a fit is about: a scene, videos with their clocks, losses and effects, checked against each other."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, cast
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from otsync.types import Offsets
+from recon.checkpoint import key_of
+from recon.effects import Effect, initial_parameters
+from recon.footage import Footage
+from recon.gaussians4d import Gaussians4D, scene_arrays
+from recon.losses import ImageLoss
+from recon.regularizers import MotionLoss
+from recon.stage import Clip
+
+Loss = ImageLoss | MotionLoss
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """What a fit is about, and does not change while it runs."""
+
+    scene: Gaussians4D
+    clips: tuple[Clip, ...]
+    times: tuple[Tensor, ...]
+    offsets: Offsets
+    index: np.ndarray
+    losses: tuple[ImageLoss, ...]
+    motion_losses: tuple[MotionLoss, ...]
+    effects: tuple[Effect, ...]
+    keys: np.ndarray
+    batch: int
+    seed: int
+
+    @classmethod
+    def of(
+        cls, scene: Gaussians4D, footage: Sequence[Footage], offsets: Offsets, losses: tuple[Loss, ...],
+        effects: tuple[Effect, ...], batch: int, seed: int,
+    ) -> Problem:  # fmt: skip
+        """Check that everything fits together; ValueError names what does not."""
+        if not footage:
+            raise ValueError("footage: expected at least one video, got none")
+        if batch < 1:
+            raise ValueError(f"batch: expected at least 1 image a step, got {batch}")
+        names = [f.name for f in footage]
+        missing = [n for n in names if n not in offsets.names]
+        if missing or len(set(names)) < len(names):
+            raise ValueError(
+                f"footage: expected unique names among those of offsets ({', '.join(offsets.names)}); found "
+                f"{', '.join(missing or names)}"
+            )
+        index = np.array([offsets.names.index(n) for n in names])
+        apart = [offsets.names[v] for v in index if not np.isfinite(offsets.seconds[v])
+                 or offsets.component[v] != offsets.component[index[0]]]  # fmt: skip
+        if apart:
+            raise ValueError(
+                f"offsets: expected every video on one clock; {', '.join(apart)} have no offset on it. Leave them out."
+            )
+        if len(scene) == 0:
+            raise ValueError("scene: expected moving Gaussians, got none: nothing was seeded where things move")
+        unknown = [type(x).__name__ for x in losses if not hasattr(x, "needs") and not hasattr(x, "every")]
+        if unknown:
+            raise ValueError(f"losses: expected ImageLoss or MotionLoss objects, got {', '.join(unknown)}")
+        keys = [(v, k) for v, f in enumerate(footage) for k in range(len(f.images))
+                if not f.bad[k] and (f.boxes[k, 2:] > f.boxes[k, :2]).all()]  # fmt: skip
+        if not keys:
+            raise ValueError("footage: expected frames in which something moves; found none. Check the masks.")
+        device = scene.dynamic.means.device
+        return cls(
+            scene, tuple(Clip.of(f, device) for f in footage),
+            tuple(torch.as_tensor(f.times, dtype=torch.float64) for f in footage), offsets, index,
+            tuple(cast(ImageLoss, x) for x in losses if hasattr(x, "needs")), tuple(cast(MotionLoss, x) for x in losses if hasattr(x, "every")), effects, np.array(keys), batch, seed,
+        )  # fmt: skip
+
+    @property
+    def start(self) -> np.ndarray:
+        """[V] seconds that the offsets begin at."""
+        return self.offsets.seconds[self.index]
+
+    @property
+    def reference(self) -> int:
+        """The video whose offset stays: the offsets' reference, or the first where that was left out."""
+        at = np.nonzero(self.index == self.offsets.component[self.index[0]])[0]
+        return int(at[0]) if len(at) else 0
+
+    @property
+    def needs_depth(self) -> bool:
+        return any("depth" in loss.needs for loss in self.losses)
+
+    def key(self, *options: Any) -> str:
+        """What decides the result: see :func:`recon.checkpoint.key_of`."""
+        arrays = [*scene_arrays(self.scene).values(), self.start, self.offsets.rates[self.index]]
+        for clip in self.clips:
+            f = clip.footage
+            arrays += [f.images, f.times, f.K, f.w2c, f.boxes, f.bad]
+            arrays += [a for a in (f.masks, f.background) if a is not None]
+        return key_of(arrays, *options)
+
+    def pick(self, step: int) -> list[tuple[int, int]]:
+        """(video, frame) of the images of a step: every frame once before any comes again."""
+        chosen = []
+        for i in range(step * self.batch, (step + 1) * self.batch):
+            epoch, at = divmod(i, len(self.keys))
+            order = np.random.default_rng([self.seed, 1, epoch]).permutation(len(self.keys))
+            chosen.append((int(self.keys[order[at], 0]), int(self.keys[order[at], 1])))
+        return chosen
+
+    def groups(self) -> dict[str, Tensor]:
+        """Every parameter group at its start, frozen or not."""
+        out = scene_groups(self.scene)
+        out |= initial_parameters(self.effects, len(self.clips))
+        out["offsets"] = torch.as_tensor(self.start.copy())
+        out["clock_rates"] = torch.as_tensor(self.offsets.rates[self.index].copy())
+        return out
+
+
+def scene_groups(scene: Gaussians4D) -> dict[str, Tensor]:
+    """The parameter groups of a scene: the dynamic Gaussians' by their own names, the static ones' with a prefix."""
+    out = {f.name: getattr(scene.dynamic, f.name) for f in fields(scene.dynamic)}
+    out |= scene.motion.parameters()
+    if scene.static is not None:
+        out |= {f"static.{f.name}": getattr(scene.static, f.name) for f in fields(scene.static)}
+    return out
+
+
+def assemble(scene: Gaussians4D, groups: Mapping[str, Tensor]) -> Gaussians4D:
+    """The scene with the groups' values."""
+    dynamic = replace(scene.dynamic, **{f.name: groups[f.name] for f in fields(scene.dynamic)})
+    motion = scene.motion.with_parameters({n: groups[n] for n in scene.motion.parameters()})
+    static = scene.static
+    if static is not None:
+        static = replace(static, **{n[7:]: t for n, t in groups.items() if n.startswith("static.")})
+    return replace(scene, dynamic=dynamic, motion=motion, static=static)

@@ -1,0 +1,218 @@
+"""A fit under way: its parameters, and what happens in a step."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from recon.checkpoint import Snapshot
+from recon.density import Densify
+from recon.effects import Shot, compose, prior
+from recon.gaussians4d import scene_arrays, scene_from_arrays
+from recon.losses import Seen
+from recon.optimize import Adam, Decay, check_rates
+from recon.problem import Problem, assemble, scene_groups
+from recon.quiet import uninterrupted
+from recon.regularizers import Draw
+from recon.stage import compose_over, observer
+from recon.uncertainty import newton_sigma
+
+RECORDS = 200  # rows of history in a fit
+PER_GAUSSIAN = ("means", "quats", "log_scales", "opacity_logits", "sh", "own_knots")
+
+
+class Diverged(RuntimeError):
+    """A loss or a gradient is no number any more; the text names the step, the group and the frame."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """What one job of a step gives back; gradients in the order of the groups, None where there is none."""
+
+    loss: float
+    psnr: float
+    gradients: list[Tensor | None]
+    pull: Tensor | None
+
+
+class Run:
+    """A fit under way: its parameters, and what happens in a step."""
+
+    def __init__(self, problem: Problem, rates: dict[str, float], snapshot: Snapshot | None, total: int | None):
+        self.problem, self.rates = problem, rates
+        self.scene, self.step, self.total = problem.scene, 0, total
+        self.groups = problem.groups()
+        self.rows = np.zeros((0, 4 + len(problem.clips)))
+        if snapshot is not None:
+            self.scene, self.step, self.total = (
+                scene_from_arrays(snapshot.scene),
+                snapshot.step,
+                snapshot.steps or total,
+            )
+            self.groups |= {n: v.to(self.groups[n].device) for n, v in snapshot.groups.items()}
+            self.rows = snapshot.history
+        self.adam = self._adam({} if snapshot is None else snapshot.moments)
+        self.decay = Decay()
+        self._since: list[tuple[float, float]] = []
+        self._pull = torch.zeros(2, len(self.scene))
+
+    def _adam(self, moments: Mapping[str, Tensor]) -> Adam:
+        active = check_rates(self.rates, self.groups)
+        adam = Adam(self.groups, active, self.scene.footprint, self.scene.frame_step)
+        adam.restore(moments)
+        return adam
+
+    def values(self) -> dict[str, Tensor]:
+        """Every group's current value; those that are fitted require gradients."""
+        return {**self.groups, **self.adam.groups}
+
+    def world_time(self, values: Mapping[str, Tensor], video: int, frame: int) -> Tensor:
+        """World seconds at which a frame was taken, differentiable in its video's clock."""
+        return values["clock_rates"][video] * self.problem.times[video][frame] + values["offsets"][video]
+
+    def one_step(self, pool: ThreadPoolExecutor, probe: bool = False) -> None:
+        """Render a batch, gather gradients in a fixed order, and move."""
+        p, values = self.problem, self.values()
+        names = list(self.adam.groups)
+        jobs = [pool.submit(self.image_gradient, values, names, key, probe) for key in p.pick(self.step)]
+        if p.motion_losses:
+            jobs.append(pool.submit(self.motion_gradient, values, names))
+        done = [job.result() for job in jobs]
+        total: dict[str, Tensor] = {}
+        for n, result in enumerate(done):
+            share = 1.0 / p.batch if n < p.batch else 1.0
+            for name, gradient in zip(names, result.gradients, strict=True):
+                if gradient is not None:
+                    total[name] = gradient * share if name not in total else total[name].add_(gradient, alpha=share)
+        self._guard(total, done, p.pick(self.step))
+        fraction = self.step / self.total if self.total else 0.0
+        with uninterrupted():
+            self.adam.step(total, self.decay(fraction))
+            self.step += 1
+            self._since += [(r.loss, r.psnr) for r in done[: p.batch]]
+            for r in done[: p.batch]:
+                if r.pull is not None:
+                    self._pull += r.pull
+
+    def look(self, values: dict[str, Tensor], video: int, frame: int, later: float = 0.0) -> Tensor:
+        """The image [h,w,3] of a frame's box as the scene gives it, ``later`` seconds after the frame, without a graph."""
+        p, clip = self.problem, self.problem.clips[video]
+        box = clip.box(frame)
+        observe = observer(assemble(self.scene, values), p.clips, values["offsets"])
+        shot = Shot(video, self.world_time(values, video, frame) + later, box, clip.size[1], frame)
+        with torch.no_grad():
+            return compose_over(compose(observe, p.effects, values)(shot), clip.behind(box))
+
+    def sigma(self, values: dict[str, Tensor]) -> np.ndarray:
+        """See :func:`recon.uncertainty.newton_sigma`."""
+        p = self.problem
+        return newton_sigma(
+            lambda v, k, later: self.look(values, v, k, later), lambda v, k: p.clips[v].image(k, p.clips[v].box(k)),
+            p.keys, p.reference, len(p.clips), self.scene.frame_step,
+        )  # fmt: skip
+
+    def image_gradient(self, values: dict[str, Tensor], names: list[str], key: tuple[int, int], probe: bool) -> Result:
+        """Loss of one frame and its gradients."""
+        p, (v, k) = self.problem, key
+        probes: list[tuple[Tensor, Tensor]] = []
+        scene = assemble(self.scene, values)
+        clip = p.clips[v]
+        box = clip.box(k)
+        observe = observer(scene, p.clips, values["offsets"], depth=p.needs_depth, probes=probes if probe else None)
+        shot = Shot(v, self.world_time(values, v, k), box, clip.size[1], k)
+        rendered = compose(observe, p.effects, values)(shot)
+        image = clip.image(k, box)
+        seen = Seen(
+            rendered=compose_over(rendered, clip.behind(box)), alpha=rendered.alpha, depth=rendered.depth, image=image,
+            mask=clip.mask(k, box), video=v, frame=k, t=shot.t, box=box, view=(clip.K, clip.pose(k)),
+            scales=scene.dynamic.scales, footprint=scene.footprint,
+        )  # fmt: skip
+        parts = [loss.weight * value for loss in p.losses if (value := loss(seen)) is not None]
+        held = prior(p.effects, values)
+        loss = sum(parts if held is None else [*parts, held], torch.zeros(()))
+        psnr = -10 * math.log10(float((seen.rendered.detach() - image).square().mean()) + 1e-12)
+        wanted = [values[n] for n in names] + [means for means, _ in probes]
+        gradients = torch.autograd.grad(loss, wanted, allow_unused=True) if loss.requires_grad else [None] * len(wanted)
+        pull = torch.zeros(2, len(scene)) if probe else None
+        for (_, radii), g in zip(probes, gradients[len(names) :], strict=True):
+            if pull is not None and g is not None:
+                seen_here = (radii > 0).any(-1).cpu()
+                pull += torch.stack([g[0, : len(scene)].norm(dim=-1).cpu() * seen_here, seen_here.float()])
+        return Result(float(loss.detach()), psnr, list(gradients[: len(names)]), pull)
+
+    def motion_gradient(self, values: dict[str, Tensor], names: list[str]) -> Result:
+        """Losses of the motion itself, at a time of its own."""
+        p = self.problem
+        scene = assemble(self.scene, values)
+        rng = np.random.default_rng([p.seed, 2, self.step])
+        draw = Draw(rng, scene.span, scene.frame_step, scene.footprint, values["offsets"])
+        parts = [
+            loss.weight * value for loss in p.motion_losses if self.step % loss.every == 0
+            if (value := loss(scene.motion, scene.dynamic.means, scene.dynamic.quats, draw)) is not None
+        ]  # fmt: skip
+        total = sum(parts, torch.zeros(()))
+        wanted = [values[n] for n in names]
+        gradients = (
+            torch.autograd.grad(total, wanted, allow_unused=True) if total.requires_grad else [None] * len(names)
+        )
+        return Result(float(total.detach()), math.nan, list(gradients), None)
+
+    def _guard(self, total: Mapping[str, Tensor], done: Sequence[Result], keys: list[tuple[int, int]]) -> None:
+        """Diverged, with step, group and frames, before a NaN reaches the parameters."""
+        bad = [n for n, g in total.items() if not bool(g.sum().isfinite()) and not bool(g.isfinite().all())]
+        lost = [n for n, r in enumerate(done) if not math.isfinite(r.loss)]
+        if bad or lost:
+            frames = ", ".join(f"{self.problem.clips[v].footage.name} frame {k}" for v, k in keys)
+            what = f"the gradient of {', '.join(bad)}" if bad else "the loss"
+            raise Diverged(
+                f"step {self.step}: {what} is no number ({frames}). Lower its rate, and look at these frames; the "
+                "parameters before this step are those of the last checkpoint."
+            )
+
+    def densify(self, densify: Densify) -> None:
+        """Split, clone and prune; Adam forgets the new ones' past."""
+        values, moments = {n: v.detach() for n, v in self.values().items()}, self.adam.moments()
+        pull = self._pull[0] / self._pull[1].clamp_min(1)
+        before = len(self.scene)
+        self.scene, old, fresh = densify(assemble(self.scene, values), pull)
+        self.groups = values | scene_groups(self.scene)
+        carried = {}
+        for name, moment in moments.items():
+            group, _, kind = name.rpartition(".")
+            axis = 1 if group == "own_knots" else 0
+            if kind != "step" and moment.ndim > axis and moment.shape[axis] == before and group in PER_GAUSSIAN:
+                moment = moment.index_select(axis, old)
+                moment[(slice(None),) * axis + (fresh,)] = 0
+            carried[name] = moment
+        self.adam = self._adam(carried)
+        self._pull = torch.zeros(2, len(self.scene))
+
+    def record_due(self) -> bool:
+        every = max(1, (self.total or 10**9) // RECORDS)
+        return self.step % every == 0 or self.step == self.total
+
+    def record(self, seconds: float) -> np.ndarray:
+        """Append a row to the history."""
+        loss, psnr = np.mean(self._since, axis=0) if self._since else (math.nan, math.nan)
+        offsets = self.values()["offsets"].detach().cpu().numpy()
+        row = np.array([self.step, seconds, loss, psnr, *offsets])
+        self.rows = np.concatenate([self.rows, row[None]])
+        self._since = []
+        return row
+
+    def snapshot(self) -> Snapshot:
+        values = {n: v.detach().clone() for n, v in self.values().items()}
+        return Snapshot(
+            self.step,
+            self.total or 0,
+            scene_arrays(assemble(self.scene, values)),
+            values,
+            self.adam.moments(),
+            self.rows,
+        )

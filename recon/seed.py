@@ -1,0 +1,169 @@
+"""Where Gaussians begin: surfaces that the depth maps show, taken over moment by moment.
+
+At the middle of the clip every surface voxel gets a Gaussian and is bound to the scaffold. At each further moment the
+model is warped there, and only where it has nothing near are new ones added: what a moment shows that an earlier one
+hid. Their means are those of that moment, so each moment is a rest of the scaffold.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+
+from otsync.types import Offsets
+from recon.footage import Footage
+from recon.gaussians import Gaussians
+from recon.gaussians4d import Gaussians4D
+from recon.motion import Scaffold
+
+logger = logging.getLogger("recon.seed")
+
+DepthAt = Callable[[int], Float[np.ndarray, "h w"] | None]
+"""Frame -> z in world units of its working pixels, 0 where unknown; None where the frame has no map."""
+
+INSIDE = 230
+"""Masks of 0..255 from which on a pixel shows nothing but what moves: edges mix in the background's colour and depth."""
+
+APART = 8 * 1 / 30
+"""Seconds between the moments that seeds are taken at."""
+
+
+@dataclass(frozen=True)
+class Seeding:
+    """How densely Gaussians begin.
+
+    Args:
+        voxel: footprints between seeds. support: pixels that must have seen a voxel, so that stray depths seed nothing.
+        reach: voxels within which a warped Gaussian counts as being there already.
+        scale: standard deviation, in voxels. opacity: at the start.
+    """
+
+    voxel: float = 2.7
+    support: int = 2
+    reach: float = 1.3
+    scale: float = 0.55
+    opacity: float = 0.8
+
+    def __post_init__(self) -> None:
+        if not (self.voxel > 0 and self.reach > 0 and self.scale > 0 and self.support >= 1 and 0 < self.opacity < 1):
+            raise ValueError(f"Seeding: expected positive lengths, support >= 1 and opacity in 0..1; found {self}.")
+
+
+def moments(span: tuple[float, float], frame_step: float, apart: float = APART) -> np.ndarray:
+    """World seconds to seed at, whole frames of the reference: the middle first, then from it outwards, then both ends."""
+    first, last = span
+    middle = first + frame_step * round((last - first) / 2 / frame_step)
+    steps = int((last - first) / 2 // apart)
+    times = [middle]
+    for k in range(1, steps + 1):
+        times += [middle - k * apart, middle + k * apart]
+    inside = [t for t in times if first - 1e-9 <= t <= last + 1e-9]
+    ends = [t for t in (first, last) if min(abs(t - x) for x in inside) > apart / 4]
+    return np.array([*inside, *ends])
+
+
+def cloud_at(
+    footage: Sequence[Footage], depth: Sequence[DepthAt], offsets: Offsets, t: float, frame_step: float,
+    gains: Float[np.ndarray, "V 3"] | None = None,
+) -> tuple[Float[np.ndarray, "P 3"], Float[np.ndarray, "P 3"]]:  # fmt: skip
+    """Positions and colours of all pixels of what moves, over all videos, in the frames believed nearest to ``t``.
+
+    Frames further than one frame of the reference from ``t`` are left out. Colours are divided by the videos' gains.
+    """
+    points, colors = [np.zeros((0, 3))], [np.zeros((0, 3))]
+    for v, f in enumerate(footage):
+        at = offsets.names.index(f.name)
+        k = f.nearest((t - offsets.seconds[at]) / offsets.rates[at])
+        if k is None or abs(offsets.rates[at] * f.times[k] + offsets.seconds[at] - t) > frame_step:
+            continue
+        z = depth[v](k)
+        if z is None:
+            continue
+        known = np.isfinite(z) & (z > 0)
+        if f.masks is not None:
+            known &= f.masks[k] > INSIDE
+        row, column = np.nonzero(known)
+        rays = np.stack([column + 0.5, row + 0.5, np.ones(len(row))], 1) @ np.linalg.inv(f.K).T
+        w2c = f.pose(k)
+        points.append((rays * z[row, column, None] - w2c[:3, 3]) @ w2c[:3, :3])
+        gain = np.ones(3) if gains is None else gains[v]
+        colors.append(f.images[k][row, column] / 255.0 / gain)
+    return np.concatenate(points), np.concatenate(colors).clip(0, 1)
+
+
+def thinned(
+    points: Float[np.ndarray, "P 3"], colors: Float[np.ndarray, "P 3"], voxel: float, support: int
+) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 3"]]:
+    """Mean position and colour of every voxel that at least ``support`` points fell into."""
+    _, inverse, count = np.unique(
+        np.floor(points / voxel).astype(np.int64), axis=0, return_inverse=True, return_counts=True
+    )
+    inverse = inverse.reshape(-1)
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        sums = [np.bincount(inverse, values[:, c], len(count)) for c in range(3)]
+        return np.stack(sums, 1) / np.maximum(count, 1)[:, None]
+
+    keep = count >= support
+    return mean(points)[keep], mean(colors)[keep]
+
+
+def seed(
+    motion: Scaffold,
+    footage: Sequence[Footage],
+    offsets: Offsets,
+    depth: Sequence[DepthAt],
+    *,
+    footprint: float,
+    frame_step: float,
+    span: tuple[float, float],
+    times: Float[np.ndarray, " R"] | None = None,
+    gains: Float[np.ndarray, "V 3"] | None = None,
+    options: Seeding | None = None,
+) -> Gaussians4D:
+    """Gaussians on the surfaces that the depth maps show, bound to a scaffold.
+
+    Args:
+        depth: per video, in the order of ``footage``. offsets: believed clocks, by name.
+        footprint: world units of a working pixel. span: (first, last) world seconds. times: see :func:`moments`.
+        gains: factors of the videos' colours.
+
+    Raises ValueError when no depth falls on anything that moves.
+    """
+    options = options or Seeding()
+    times = moments(span, frame_step) if times is None else times
+    voxel = options.voxel * footprint
+    means, colors = torch.zeros(0, 3), np.zeros((0, 3))
+    for t in times:
+        points, shades = cloud_at(footage, depth, offsets, float(t), frame_step, gains)
+        points, shades = thinned(points, shades, voxel, options.support)
+        if len(means) and len(points):
+            here = motion.warp(means, _upright(len(means)), float(t))[0].detach().numpy()
+            new = cKDTree(here).query(points)[0] > options.reach * voxel
+            points, shades = points[new], shades[new]
+        if not len(points):
+            continue
+        motion = motion.bind(points, float(t))
+        means = torch.cat([means, torch.as_tensor(points, dtype=torch.float32)])
+        colors = np.concatenate([colors, shades])
+        logger.info("seeds at %.3f s: %d, %d in all", t, len(points), len(means))
+    if not len(means):
+        raise ValueError(
+            "depth: expected depth where something moves, at one moment at least; found none. Check masks and depth maps."
+        )
+    n = len(means)
+    gaussians = Gaussians.from_colors(
+        means, _upright(n), torch.full((n, 3), options.scale * voxel), torch.full((n,), options.opacity),
+        torch.as_tensor(colors, dtype=torch.float32),
+    )  # fmt: skip
+    return Gaussians4D(gaussians, motion, footprint, frame_step, span)
+
+
+def _upright(n: int) -> torch.Tensor:
+    return torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1)

@@ -1,0 +1,77 @@
+"""Checkpoints: what goes in comes out, and nothing else gets in."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from recon.checkpoint import Checkpoint, Snapshot, key_of
+
+
+def snapshot(step: int = 7) -> Snapshot:
+    return Snapshot(
+        step, 20, {"scene": np.arange(3, dtype=np.uint8)}, {"means": torch.randn(4, 3), "offsets": torch.zeros(2).double()},
+        {"means.exp_avg": torch.randn(4, 3), "means.step": torch.tensor(7.0)}, np.random.default_rng(0).normal(size=(2, 6)),
+    )  # fmt: skip
+
+
+def test_a_snapshot_comes_back_bit_by_bit(tmp_path):
+    keep = Checkpoint(tmp_path / "fit.npz", "key")
+    assert keep.load() is None
+    before = snapshot()
+    keep.save(before)
+    after = keep.load()
+    assert (after.step, after.steps) == (7, 20)
+    for part in ("groups", "moments"):
+        for name, tensor in getattr(before, part).items():
+            found = getattr(after, part)[name]
+            assert found.dtype == tensor.dtype and torch.equal(found, tensor)
+    assert np.array_equal(after.scene["scene"], before.scene["scene"]) and np.array_equal(after.history, before.history)
+
+
+def test_a_checkpoint_of_another_fit_is_refused(tmp_path):
+    Checkpoint(tmp_path / "fit.npz", "one").save(snapshot())
+    with pytest.raises(ValueError, match="belongs to other videos"):
+        Checkpoint(tmp_path / "fit.npz", "another").load()
+
+
+@pytest.mark.parametrize("damage", ["cut", "flip", "foreign", "empty"])
+def test_damage_is_a_clear_error(tmp_path, damage):
+    path = tmp_path / "fit.npz"
+    keep = Checkpoint(path, "key")
+    keep.save(snapshot())
+    data = bytearray(path.read_bytes())
+    if damage == "cut":
+        data = data[: len(data) // 2]
+    elif damage == "flip":
+        data[len(data) // 3] ^= 0xFF
+    elif damage == "empty":
+        data = bytearray()
+    path.write_bytes(bytes(data))
+    if damage == "foreign":
+        with open(path, "wb") as stream:
+            np.savez(stream, a=np.zeros(3))
+    with pytest.raises(ValueError, match=r"fit\.npz"):
+        keep.load()
+
+
+def test_without_a_path_nothing_is_written(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    keep = Checkpoint(None, "key", every=0.0)
+    assert not keep.due() and keep.load() is None
+    keep.save(snapshot())
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_key_sees_every_change():
+    a = np.arange(6.0).reshape(2, 3)
+    keys = {
+        key_of([a]),
+        key_of([a.T]),
+        key_of([a.astype(np.float32)]),
+        key_of([a.reshape(3, 2)]),
+        key_of([a], "option"),
+    }
+    assert len(keys) == 5
+    assert key_of([a]) == key_of([a.copy()])

@@ -1,0 +1,346 @@
+"""fit(): gradients of the clocks, resuming, gauges, frozen groups, units; and the synthetic scene end to end (slow)."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from otsync.types import Offsets, Status
+from recon.density import Densify
+from recon.effects import Gain, MotionBlur, RollingShutter
+from recon.fit import LOSSES, RATES, Diverged, fit
+from recon.gaussians import Gaussians
+from recon.gaussians4d import Gaussians4D
+from recon.losses import Mask, Photometric
+from recon.motion import HermiteSpline, PerGaussian, Scaffold, Static, build_scaffold
+from recon.optimize import without
+from recon.problem import Problem
+from recon.running import Run
+from recon.simulate import synthetic
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def capture():
+    return synthetic(4, cameras=3, held_out=0, frames=8, size=(48, 32))
+
+
+def believed(capture, seconds=None) -> Offsets:
+    V = len(capture.footage)
+    return Offsets(
+        tuple(f.name for f in capture.footage), np.full(V, 30.0), np.zeros(V) if seconds is None else seconds, np.ones(V),
+        np.full(V, np.nan), 0, np.zeros(V, int), (Status.OK,) * V, ((),) * V,
+    )  # fmt: skip
+
+
+def true_scene(capture, n: int = 400, scale: float = 1.0) -> Gaussians4D:
+    """The world's own Gaussians, carried by a scaffold built from the tracks."""
+    world = capture.world
+    times = capture.footage[0].times
+    footprint = 2.6 / capture.footage[0].K[0, 0] * scale
+    tracks = [replace(t, xyz=scale * t.xyz, camera=None) for t in capture.tracks]
+    scaffold = build_scaffold(tracks, np.zeros(len(tracks)), footprint=footprint, frame_step=1 / 30)
+    pick = np.linspace(0, len(world.part) - 1, n).astype(int)
+    points = torch.as_tensor(scale * world.positions([times[4]])[pick, 0], dtype=torch.float32)
+    g = Gaussians.from_colors(
+        points, torch.tensor([1.0, 0, 0, 0]).repeat(n, 1), torch.full((n, 3), 0.04 * scale), torch.full((n,), 0.8),
+        torch.as_tensor(world.colors[pick], dtype=torch.float32),
+    )  # fmt: skip
+    return Gaussians4D(
+        g, scaffold.bind(points, times[4]), footprint, 1 / 30, (times[0], times[-1]), None, near=0.6 * scale
+    )
+
+
+@pytest.fixture(scope="module")
+def scene(capture):
+    return true_scene(capture)
+
+
+def same(a, b) -> bool:
+    """Equal to the last bit, wall seconds apart."""
+    ga, gb = (
+        {
+            **vars(r.scene.dynamic),
+            **r.scene.motion.parameters(),
+            **r.parameters,
+            "o": torch.as_tensor(r.offsets.seconds),
+        }
+        for r in (a, b)
+    )
+    kept = [i for i in range(len(a.history.step))]
+    return all(torch.equal(ga[n], gb[n]) for n in ga) and np.array_equal(a.history.loss[kept], b.history.loss)
+
+
+class Squared:
+    """A loss without kinks, which finite differences would stumble over."""
+
+    weight, needs = 1.0, frozenset()
+
+    def __call__(self, seen):
+        return (seen.rendered - seen.image).square().mean()
+
+
+def gradient_against_differences(problem, group, index, step):
+    run = Run(problem, dict(RATES), None, 10)
+    values = {n: v.detach() for n, v in run.values().items()}
+
+    def loss(shift: float) -> float:
+        moved = {n: v.clone() for n, v in values.items()}
+        moved[group][index] += shift
+        return run.image_gradient({**moved, group: moved[group].requires_grad_()}, [group], (1, 4), False).loss
+
+    values[group] = values[group].clone().requires_grad_()
+    gradient = run.image_gradient(values, [group], (1, 4), False).gradients[0]
+    return float(gradient[index]), (loss(step) - loss(-step)) / (2 * step)
+
+
+@pytest.mark.parametrize(
+    "effects", [(), (MotionBlur(0.02),), (RollingShutter(0.02, 4),)], ids=["plain", "blur", "rolling"]
+)
+def test_the_clock_s_gradient_is_that_of_the_image(capture, scene, effects):
+    problem = Problem.of(scene, capture.footage, believed(capture), (Squared(),), effects, 1, 0)
+    found, expected = gradient_against_differences(problem, "offsets", 1, 3e-4)
+    assert found == pytest.approx(
+        expected, rel=0.1
+    )  # splats end where their alpha falls below 1/255, which differences see
+
+
+def test_the_sign_of_an_offset(capture, scene):
+    """A video that started later has a positive offset: t_world = t_own + offset."""
+    problem = Problem.of(scene, capture.footage, believed(capture, np.array([0, 0.05, 0])), LOSSES, (), 1, 0)
+    run = Run(problem, dict(RATES), None, 1)
+    later, now = (
+        run.look(run.values(), 1, 2),
+        run.look({**run.values(), "offsets": torch.zeros(3).double()}, 1, 2, 0.05),
+    )
+    assert torch.equal(later, now)
+
+
+def test_a_fit_does_not_depend_on_threads_or_on_time(capture, scene):
+    a = fit(scene, capture.footage, believed(capture), steps=6, batch=2, effects=(Gain(),))
+    torch.set_num_threads(1)
+    b = fit(scene, capture.footage, believed(capture), steps=6, batch=2, effects=(Gain(),))
+    assert same(a, b)
+
+
+@pytest.mark.parametrize("densify", [None, Densify((0.3,), share=0.2)], ids=["plain", "densified"])
+def test_a_stopped_fit_continues_with_the_same_bits(capture, scene, tmp_path, monkeypatch, densify):
+    options = {"steps": 10, "batch": 2, "densify": densify}
+    whole = fit(scene, capture.footage, believed(capture), **options)
+    path, step = tmp_path / "fit.npz", Run.one_step
+
+    def one_step(self, *args, **kwargs):
+        step(self, *args, **kwargs)
+        if self.step == 6:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Run, "one_step", one_step)
+        with pytest.raises(KeyboardInterrupt):
+            fit(scene, capture.footage, believed(capture), checkpoint=path, **options)
+    assert path.exists()
+    again = fit(scene, capture.footage, believed(capture), checkpoint=path, **options)
+    assert again.stats["steps"] == 10
+    values = ((vars(r.scene.dynamic) | r.scene.motion.parameters()) for r in (whole, again))
+    first, second = values
+    assert all(torch.equal(first[n], second[n]) for n in first)
+    assert np.array_equal(whole.offsets.seconds, again.offsets.seconds)
+
+
+def test_a_finished_fit_is_read_back(capture, scene, tmp_path):
+    options = {"steps": 3, "checkpoint": tmp_path / "fit.npz"}
+    assert same(*(fit(scene, capture.footage, believed(capture), **options) for _ in range(2)))
+
+
+def test_a_checkpoint_of_other_options_is_refused(capture, scene, tmp_path):
+    path = tmp_path / "fit.npz"
+    fit(scene, capture.footage, believed(capture), steps=2, checkpoint=path)
+    with pytest.raises(ValueError, match="belongs to other"):
+        fit(scene, capture.footage, believed(capture), steps=3, checkpoint=path)
+
+
+def test_frozen_groups_stand_still(capture, scene):
+    result = fit(scene, capture.footage, believed(capture), steps=3, rates=without(RATES, "offsets", "means"))
+    assert torch.equal(result.scene.dynamic.means, scene.dynamic.means)
+    assert np.array_equal(result.offsets.seconds, np.zeros(3))
+    assert not torch.equal(result.scene.dynamic.sh, scene.dynamic.sh)
+
+
+def test_the_reference_keeps_its_place_and_the_motion_goes_with_it(capture, scene):
+    """The common shift that the fit drifts by is taken out of offsets and motion alike: the images stay."""
+    result = fit(scene, capture.footage, believed(capture), steps=5)
+    assert result.offsets.seconds[0] == 0 and result.stats["drift_frames"] != 0
+    drift = result.stats["drift_frames"] / 30
+    start = result.scene.motion.path.start
+    assert start == pytest.approx(scene.motion.path.start - drift, abs=1e-12)
+
+
+def test_a_change_of_units_changes_nothing_but_the_units(capture):
+    offsets = []
+    for scale in (1.0, 1000.0):
+        footage = []
+        for f in capture.footage:
+            w2c = f.w2c.copy()
+            w2c[:3, 3] *= scale
+            footage.append(replace(f, w2c=w2c))
+        result = fit(true_scene(capture, scale=scale), footage, believed(capture), steps=12)
+        offsets.append(result.offsets.seconds * 30)
+    assert offsets[0] == pytest.approx(offsets[1], abs=2e-3)
+    assert np.abs(offsets[0]).max() > 0.02
+
+
+@pytest.mark.parametrize("motion", ["per-gaussian", "static"])
+def test_other_motions_stand_in_the_slot(capture, scene, motion):
+    other = Static() if motion == "static" else PerGaussian.following(scene.motion, scene.dynamic.means)
+    result = fit(replace(scene, motion=other), capture.footage, believed(capture), steps=3)
+    assert isinstance(result.scene.motion, type(other)) and result.history.loss[-1] > 0
+
+
+def test_a_scaffold_per_video(capture, scene):
+    from recon.motion import ScaffoldOptions
+
+    per_video = build_scaffold(
+        capture.tracks,
+        np.zeros(3),
+        footprint=scene.footprint,
+        frame_step=1 / 30,
+        options=ScaffoldOptions(per_video=True),
+    )
+    bound = per_video.bind(scene.dynamic.means, capture.footage[0].times[4])
+    result = fit(replace(scene, motion=bound), capture.footage, believed(capture), steps=4)
+    assert torch.allclose(result.scene.motion.offsets, torch.as_tensor(result.offsets.seconds), atol=1e-12)
+
+
+def test_densification_splits_what_is_pulled_and_drops_what_is_faint(scene):
+    n = len(scene)
+    faint = scene.dynamic.opacity_logits.clone()
+    faint[:10] = -8.0
+    pull = torch.zeros(n)
+    pull[20:40] = 1.0
+    denser, old, new = Densify((0.5,), share=20 / (n - 10))(
+        replace(scene, dynamic=replace(scene.dynamic, opacity_logits=faint)), pull
+    )
+    assert len(denser) == n - 10 + 20 == len(denser.motion.binding)
+    assert not set(range(10)) & set(old.tolist())
+    assert sorted(old[new].unique().tolist()) == list(range(20, 40))
+    # halves stand either side of their parent
+    for parent in (20, 30):
+        rows = torch.nonzero(old == parent)[:, 0]
+        assert torch.allclose(denser.dynamic.means[rows].mean(0), scene.dynamic.means[parent], atol=1e-6)
+
+
+def test_joint_rendering_where_no_background_is_cached(capture, scene):
+    """A camera without a cached background renders static and moving Gaussians together."""
+    footage = [replace(f, background=None) for f in capture.footage]
+    whole = replace(scene, static=capture.world.static)
+    rates = {**RATES, "static.sh": 0.02}
+    result = fit(whole, footage, believed(capture), steps=3, rates=rates)
+    assert not torch.equal(result.scene.static.sh, whole.static.sh)
+    assert torch.equal(result.scene.static.means, whole.static.means)
+
+
+def test_a_diverged_fit_names_step_group_and_frame(capture, scene):
+    class Broken(Mask):
+        def __call__(self, seen):
+            return seen.alpha.sum() * float("nan")
+
+    with pytest.raises(Diverged, match=r"step 0: .* is no number \(cam"):
+        fit(scene, capture.footage, believed(capture), losses=(Photometric(), Broken()), steps=2)
+
+
+def test_what_does_not_fit_together_is_refused(capture, scene):
+    off = believed(capture)
+    with pytest.raises(ValueError, match="footage: expected at least one"):
+        fit(scene, (), off)
+    with pytest.raises(ValueError, match="footage: expected unique names"):
+        fit(scene, [replace(capture.footage[0], name="elsewhere")], off)
+    with pytest.raises(ValueError, match="expected every video on one clock"):
+        fit(scene, capture.footage, believed(capture, np.array([0, np.nan, 0])))
+    with pytest.raises(ValueError, match="rates: expected groups"):
+        fit(scene, capture.footage, off, rates={"mean": 1.0}, steps=1)
+    with pytest.raises(ValueError, match="steps, budget"):
+        fit(scene, capture.footage, off, steps=1, budget=1.0)
+    empty = replace(
+        scene,
+        dynamic=Gaussians(*(t[:0] for t in vars(scene.dynamic).values())),
+        motion=scene.motion.take(np.zeros(0, int)),
+    )
+    with pytest.raises(ValueError, match="scene: expected moving Gaussians"):
+        fit(empty, capture.footage, off)
+    still = [replace(f, boxes=np.zeros_like(f.boxes)) for f in capture.footage]
+    with pytest.raises(ValueError, match="expected frames in which something moves"):
+        fit(scene, still, off)
+
+
+def test_one_camera_and_bad_frames_are_no_obstacle(capture, scene):
+    bad = capture.footage[0].bad.copy()
+    bad[3] = True
+    result = fit(scene, [replace(capture.footage[0], bad=bad)], believed(capture), steps=3)
+    assert np.isfinite(result.history.loss[-1]) and result.offsets.seconds[0] == 0
+
+
+def test_a_scene_on_disk_comes_back(scene, tmp_path):
+    scene.save(tmp_path / "scene.npz")
+    back = Gaussians4D.load(tmp_path / "scene.npz")
+    assert back.span == scene.span and back.footprint == scene.footprint
+    assert np.array_equal(back.tracks([0.05, 0.2]), scene.tracks([0.05, 0.2]))
+    (tmp_path / "scene.npz").write_bytes(b"PK\x03\x04" + bytes(40))
+    with pytest.raises(ValueError, match=r"scene\.npz"):
+        Gaussians4D.load(tmp_path / "scene.npz")
+
+
+def test_a_spline_far_beyond_its_knots_still_renders(capture, scene):
+    lost = believed(capture, np.array([0, 100.0, 0]))
+    assert np.isfinite(fit(scene, capture.footage, lost, steps=2).history.loss[-1])
+
+
+def test_types_of_motion_are_scaffolds(scene):
+    assert isinstance(scene.motion, Scaffold) and isinstance(scene.motion.path, HermiteSpline)
+
+
+KILLED = """
+import sys
+sys.path.insert(0, {tests!r})
+from tests.recon.test_fit import believed, true_scene
+from recon.fit import fit
+from recon.simulate import synthetic
+capture = synthetic(4, cameras=3, held_out=0, frames=8, size=(48, 32))
+result = fit(true_scene(capture), capture.footage, believed(capture), steps=60, checkpoint={path!r}, save_every=0.0)
+result.offsets.save({out!r})
+"""
+
+
+@pytest.mark.slow
+def test_sigkill_at_random_moments_changes_nothing(tmp_path):
+    def start(name):
+        code = KILLED.format(tests=str(ROOT), path=str(tmp_path / f"{name}.npz"), out=str(tmp_path / f"{name}.json"))
+        return subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)})
+
+    assert start("whole").wait() == 0
+    rng, kills = np.random.default_rng(0), 0
+    for _ in range(40):
+        process = start("killed")
+        seen = (tmp_path / "killed.npz").exists()
+        deadline = time.monotonic() + 60
+        while not seen and process.poll() is None and time.monotonic() < deadline:
+            seen = (tmp_path / "killed.npz").exists()
+            time.sleep(0.01)
+        time.sleep(float(rng.uniform(0, 0.4)) if kills else 0.1)
+        if kills < 8 and process.poll() is None:
+            process.send_signal(signal.SIGKILL)
+            process.wait()
+            kills += 1
+        elif process.wait() == 0:
+            break
+    assert kills >= 3
+    assert (tmp_path / "killed.json").read_bytes() == (tmp_path / "whole.json").read_bytes()

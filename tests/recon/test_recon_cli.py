@@ -1,0 +1,280 @@
+"""The recon command: every verb on one small recording, what it refuses, and that a killed run continues."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from itertools import pairwise
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from PIL import Image
+
+from otsync.cli import main as otsync
+from otsync.files import read_npz
+from otsync.io import open_scene
+from otsync.types import Offsets, TrackSet
+from recon.cli import main
+from recon.result import load_result
+
+from .test_pipeline import same_files
+from .worlds import FRAMES, SIZE, capture, write_world
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory):
+    return write_world(tmp_path_factory.mktemp("world"))
+
+
+def fit(world: Path, out: Path, *more: str, steps: int = 30) -> int:
+    return main(["fit", str(world), "--offsets", str(world / "start.json"), "--out", str(out), "--width", str(SIZE[0]),
+                 "--steps", str(steps), "--backdrop-steps", "60", *more])  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def result(world, tmp_path_factory):
+    out = tmp_path_factory.mktemp("result")
+    assert fit(world, out, "--held-out", "held0", "--truth", str(world / "truth.json")) == 0
+    return out
+
+
+def test_fit_writes_offsets_scene_metrics_and_report(world, result, tmp_path, capsys):
+    shutil.copytree(result, tmp_path / "again")
+    assert fit(world, tmp_path / "again", "--held-out", "held0", "--truth", str(world / "truth.json")) == 0
+    told = capsys.readouterr()
+    assert "before" in told.out and "error" in told.out and "cam1" in told.out and "held out" in told.out
+    assert "LPIPS is left out: no weights given" in told.out and "fit:" in told.err
+    assert same_files(result, tmp_path / "again")
+    assert Offsets.load(result / "offsets.json").names == ("cam0", "cam1", "cam2")
+    run = json.loads((result / "run.json").read_text())
+    assert run["options"]["width"] == SIZE[0] and {"reading", "footage", "fit", "views"} <= run["seconds"].keys()
+
+
+def test_a_camera_is_rendered_to_images_and_to_a_video(result, tmp_path):
+    assert (
+        main(["render", str(result), "--camera", "held0", "--times", "0.1", "0.3", "--out", str(tmp_path / "im")]) == 0
+    )
+    images = [np.asarray(Image.open(p)) for p in sorted((tmp_path / "im").iterdir())]
+    assert [i.shape for i in images] == [(SIZE[1], SIZE[0], 3)] * 2
+    filmed = capture().held_out[0].images[[3, 9]].astype(float)
+    for image, true, other in zip(images, filmed, filmed[::-1], strict=True):
+        assert ((image - true) ** 2).mean() < ((image - other) ** 2).mean()  # the right moment, not only the place
+    assert main(["render", str(result), "--camera", "cam1", "--out", str(tmp_path / "v.mp4"), "--width", "48"]) == 0
+    with av.open(str(tmp_path / "v.mp4")) as video:
+        frames = [f.to_ndarray(format="rgb24") for f in video.decode(video=0)]
+    # the world's span: from the earliest camera's first frame to the latest one's last
+    low, high = load_result(result).scene.span
+    assert len(frames) == int((high - low) * 30 + 1e-6) + 1 >= FRAMES and frames[0].shape == (32, 48, 3)
+
+
+def test_a_path_goes_around_a_frozen_moment(result, tmp_path):
+    args = ["render", str(result), "--path", "orbit", "--times", "0.2", "--frames", "5", "--out", str(tmp_path / "o")]
+    assert main(args) == 0
+    images = [np.asarray(Image.open(p)).astype(float) for p in sorted((tmp_path / "o").iterdir())]
+    assert len(images) == 5 and all(np.abs(a - b).mean() > 1 for a, b in pairwise(images))
+
+
+def test_exports_are_written_where_asked(result, tmp_path, capsys):
+    for kind, name in (("ply", "a.ply"), ("splat", "a.splat"), ("tracks", "t.npz"), ("checkpoint", "c.npz")):
+        at = ["--at", "0.2"] if kind in ("ply", "splat") else []
+        assert main(["export", str(result), "--format", kind, *at, "--out", str(tmp_path / name)]) == 0
+        assert (tmp_path / name).stat().st_size > 1000
+    assert len(TrackSet.load(tmp_path / "t.npz")) == len(load_result(result).scene)
+    one, two = read_npz(tmp_path / "c.npz"), read_npz(result / "scene.npz")
+    assert all(np.array_equal(one[k], two[k]) for k in two)
+    assert main(["export", str(result), "--format", "ply-sequence", "--fps", "10", "--out", str(tmp_path / "s")]) == 0
+    assert len(list((tmp_path / "s").glob("*.ply"))) == 5
+    assert main(["export", str(result), "--format", "tracks", "--at", "0.1"]) == 2
+    assert "--at" in capsys.readouterr().err
+
+
+def test_eval_repeats_the_figures_of_the_run(world, result, tmp_path, capsys):
+    out = tmp_path / "eval.json"
+    assert main(["eval", str(result), str(world), "--truth", str(world / "truth.json"), "--out", str(out)]) == 0
+    assert "offset error: mean" in capsys.readouterr().out
+    told, before = json.loads(out.read_text()), json.loads((result / "metrics.json").read_text())
+    assert told["held_out"] == before["held_out"]
+    assert told["offset_error"] == before["offset_error"]
+    assert main(["eval", str(result), str(world), "--held-out", "cam1", "--views", "2", "--out", str(out)]) == 0
+    assert json.loads(out.read_text())["views"][0]["held_out"] is False
+
+
+@pytest.mark.parametrize(
+    ("args", "says"),
+    [
+        (["render", "RESULT", "--out", "x.mp4"], "--camera, --path: expected one of them"),
+        (["render", "RESULT", "--camera", "cam9"], "expected one of cam0"),
+        (["render", "RESULT", "--camera", "cam0", "--times", "99"], "which the videos cover"),
+        (["render", "RESULT", "--camera", "cam0", "--out", "x.gif"], "expected .mp4"),
+        (["render", "RESULT", "--camera", "cam0", "--width", "0"], "width: expected"),
+        (["render", "RESULT", "--camera", "cam0", "--frames", "9"], "--frames: expected with --path"),
+        (["render", "nowhere", "--camera", "cam0"], "expected a finished reconstruction"),
+        (["export", "RESULT", "--format", "ply", "--at", "-4"], "which the videos cover"),
+        (["eval", "RESULT", "WORLD", "--held-out", "cam9"], "expected some of"),
+        (["fit", "WORLD", "--offsets", "nowhere.json"], "no such file"),
+        (["fit", "nowhere", "--offsets", "WORLD/start.json"], "nowhere"),
+        (["fit", "WORLD", "--offsets", "WORLD/start.json", "--steps", "3", "--budget", "4"], "expected one of them"),
+        (["fit", "WORLD", "--offsets", "WORLD/start.json", "--frames", "50", "60"], "expected first < stop"),
+        (["fit", "WORLD", "--offsets", "WORLD/start.json", "--held-out", "cam0"], "the reference (cam0)"),
+        (["fit", "WORLD", "--offsets", "WORLD/start.json", "--freeze", "nothing", "--held-out", "held0"], "groups: expected"),
+    ],
+)  # fmt: skip
+def test_bad_arguments_exit_with_two_and_say_what_was_expected(
+    world, result, tmp_path, monkeypatch, capsys, args, says
+):
+    monkeypatch.chdir(tmp_path)
+    swapped = [a.replace("RESULT", str(result)).replace("WORLD", str(world)) for a in args]
+    code = main(swapped)
+    told = capsys.readouterr()
+    assert code == (0 if not says else 2), told.err
+    if says:
+        assert says in told.err and "Traceback" not in told.err
+
+
+def test_a_damaged_result_is_named(result, tmp_path, capsys):
+    for name in ("run.json", "scene.npz", "offsets.json"):
+        folder = tmp_path / name
+        shutil.copytree(result, folder)
+        whole = (folder / name).read_bytes()
+        (folder / name).write_bytes(whole[: len(whole) // 2])
+        assert main(["export", str(folder)]) == 2
+        assert name in capsys.readouterr().err
+    run = json.loads((result / "run.json").read_text())
+    run["videos"][0]["gain"] = ["red"]
+    shutil.copytree(result, tmp_path / "odd")
+    (tmp_path / "odd" / "run.json").write_text(json.dumps(run))
+    assert main(["render", str(tmp_path / "odd"), "--camera", "cam0"]) == 2
+    assert "not a sound reconstruction" in capsys.readouterr().err
+
+
+def test_offsets_that_are_not_to_be_trusted_end_in_one(world, tmp_path, capsys):
+    document = json.loads((world / "start.json").read_text())
+    document["videos"][2] |= {"status": "weak", "flags": ["weak"]}
+    document["videos"][1] |= {
+        "offset_seconds": None,
+        "offset_frames": None,
+        "status": "no_match",
+        "flags": ["no_match"],
+    }
+    (tmp_path / "o.json").write_text(json.dumps(document))
+    code = main(["fit", str(world), "--offsets", str(tmp_path / "o.json"), "--out", str(tmp_path / "r"), "--width", "96",
+                 "--backdrop-steps", "9", "--steps", "3", "--held-out", "held0"])  # fmt: skip
+    told = capsys.readouterr().err
+    assert code == 1 and "cam1 is left out" in told and "not to be trusted: cam2" in told
+    assert load_result(tmp_path / "r").offsets.names == ("cam0", "cam2")
+
+
+def test_simulate_writes_a_recording_that_the_printed_command_fits(tmp_path, capsys):
+    args = ["simulate", str(tmp_path / "w"), "--cameras", "2", "--held-out", "1", "--frames", "4", "--width", "48",
+            "--height", "32", "--seed", "9"]  # fmt: skip
+    assert main(args) == 0
+    told = capsys.readouterr().out
+    assert "recon fit" in told and "--held-out held0" in told
+    scene = open_scene(tmp_path / "w")
+    assert scene.names == ("cam0", "cam1", "held0") and len(scene.videos[0].frames) == 4
+    assert scene.videos[2].depth is None and scene.masks[2] is not None
+    truth, start = Offsets.load(tmp_path / "w" / "truth.json"), Offsets.load(tmp_path / "w" / "start.json")
+    assert truth.seconds[0] == 0 != truth.seconds[1] and not start.seconds.any()
+    assert main(args) == 2
+    assert "holds scene.json" in capsys.readouterr().err
+
+
+def test_every_help_has_an_example(capsys):
+    for verb in ("fit", "render", "eval", "export", "simulate"):
+        with pytest.raises(SystemExit) as stop:
+            main([verb, "--help"])
+        assert stop.value.code == 0 and f"recon {verb}" in " ".join(capsys.readouterr().out.split())
+    with pytest.raises(SystemExit):
+        otsync(["run", "--help"])
+    assert "Example: otsync run" in " ".join(capsys.readouterr().out.split())
+
+
+def command(world: Path, out: Path) -> list[str]:
+    return [sys.executable, "-m", "recon.cli", "fit", str(world), "--offsets", str(world / "start.json"), "--out", str(out),
+            "--width", str(SIZE[0]), "--backdrop-steps", "60", "--steps", "200", "--save-every", "0.5", "--held-out", "held0"]  # fmt: skip
+
+
+@pytest.mark.slow
+def test_a_run_killed_at_any_moment_ends_with_the_same_files(world, tmp_path):
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    began = time.monotonic()
+    subprocess.run(command(world, tmp_path / "whole"), check=True, capture_output=True, env=environment, timeout=600)
+    whole = time.monotonic() - began
+    rng = np.random.default_rng(int(time.time()))
+    for n in range(2):
+        out, killed = tmp_path / f"killed{n}", 0
+        for _ in range(12):
+            run = subprocess.Popen(command(world, out), stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment)
+            try:
+                code = run.wait(rng.uniform(0.3, 0.9) * whole if killed < 3 else 600)
+            except subprocess.TimeoutExpired:
+                run.send_signal(signal.SIGKILL)
+                code = run.wait()
+            if code == 0:
+                break
+            assert code == -signal.SIGKILL, run.stderr.read().decode()
+            killed += 1
+        assert killed and code == 0
+        assert same_files(tmp_path / "whole", out)
+        assert not list(out.glob(".*.part")) or killed  # a killed writer may leave a part, never under the file's name
+
+
+@pytest.mark.slow
+def test_ctrl_c_exits_with_130_and_says_how_to_go_on(world, tmp_path):
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    args = [*command(world, tmp_path / "r")]
+    args[args.index("200")] = "100000"
+    run = subprocess.Popen(args, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment)
+    deadline = time.monotonic() + 120
+    while not (tmp_path / "r" / "fit.npz").exists() and time.monotonic() < deadline:
+        time.sleep(0.2)
+    run.send_signal(signal.SIGINT)
+    _, told = run.communicate(timeout=60)
+    assert run.returncode == 130 and b"continues from here" in told and b"Traceback" not in told
+
+
+def test_run_says_what_it_cannot_do(world, tmp_path, capsys):
+    base = ["run", str(world), "--out", str(tmp_path / "r"), "--steps", "3"]
+    for more, says in (
+        (["--held-out", "cam1", "cam2", "held0"], "expected at least two videos; found 1"),
+        (["--held-out", "nobody"], "expected some of cam0"),
+        (["--held-out", "held0", "--reference", "held0"], "--reference: expected one of cam0, cam1, cam2"),
+        (["--budget", "9"], "expected one of them"),
+        (["--frames", "5", "5"], "expected first < stop"),
+        (["--recording.route", "stereo", "--held-out", "held0"], "3 videos are fewer than the 5"),
+    ):
+        assert otsync([*base, *more]) == 2, more
+        assert says in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_run_goes_from_a_recording_to_a_scene_and_better_offsets(tmp_path, capsys):
+    """Offsets of several frames, found from the tracks, then refined from the images to hundredths."""
+    world, out = tmp_path / "world", tmp_path / "run"
+    assert main(["simulate", str(world), "--frames", "60", "--max-offset", "6", "--seed", "4"]) == 0
+    args = ["run", str(world), "--out", str(out), "--held-out", "held0", "--width", "160", "--steps", "500",
+            "--truth", str(world / "truth.json")]  # fmt: skip
+    assert otsync(args) in (0, 1)  # a coarse answer may be flagged
+    told = capsys.readouterr()
+    truth, coarse, found = (
+        Offsets.load(p) for p in (world / "truth.json", out / "offsets_coarse.json", out / "offsets.json")
+    )
+    assert coarse.names == found.names == ("cam0", "cam1", "cam2", "cam3", "cam4")
+    before, after = (np.abs(o.frames - truth.frames[:5])[1:] for o in (coarse, found))
+    assert np.abs(truth.frames[:5]).max() > 3 and before.max() < 1.5
+    assert after.mean() < 0.08 and after.max() < 0.16 and after.mean() < before.mean()
+    metrics = json.loads((out / "metrics.json").read_text())
+    view = metrics["views"][0]
+    assert view["clock"] == "found" and abs(view["offset_seconds"]) * 30 < 0.15
+    assert "route tracks" in told.err and (out / "sync.html").exists() and (out / "report.html").exists()
+    assert otsync(args) in (0, 1)  # everything is there: the same again, at once
+    assert json.loads((out / "metrics.json").read_text()) == metrics

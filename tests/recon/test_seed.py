@@ -1,0 +1,87 @@
+"""Seeds lie on the surfaces that the depth maps show, once each."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from recon.capture import clocks
+from recon.motion import build_scaffold
+from recon.seed import Seeding, cloud_at, moments, seed, thinned
+from recon.simulate import synthetic
+
+
+@pytest.fixture(scope="module")
+def capture():
+    return synthetic(5, cameras=3, held_out=0, frames=12, size=(80, 48), offsets=[0, 0, 0])
+
+
+def known(capture):
+    return clocks([f.name for f in capture.footage], capture.offsets, 30)
+
+
+def maps(capture):
+    return [stack.__getitem__ for stack in capture.depth]
+
+
+def planted(capture, **options):
+    footprint = 2.6 / capture.footage[0].K[0, 0]
+    scaffold = build_scaffold(capture.tracks, capture.offsets, footprint=footprint, frame_step=1 / 30)
+    return seed(
+        scaffold, capture.footage, known(capture), options.pop("depth", maps(capture)), footprint=footprint,
+        frame_step=1 / 30, span=(0.0, 11 / 30), **options,
+    )  # fmt: skip
+
+
+def test_moments_begin_in_the_middle_and_reach_both_ends():
+    t = moments((0.0, 47 / 30), 1 / 30) * 30
+    assert t[0] == pytest.approx(24, abs=0.51) and set(np.round(t)) >= {0, 47}
+    assert np.diff(np.sort(t)).max() <= 8 + 1e-6 and len(set(np.round(t, 6))) == len(t)
+    assert moments((1.0, 1.0), 1 / 30).tolist() == [1.0]
+
+
+def test_clouds_lie_on_the_surface(capture):
+    points, colors = cloud_at(capture.footage, maps(capture), known(capture), 5 / 30, 1 / 30)
+    true = capture.world.positions([5 / 30])[:, 0]
+    assert np.median(cKDTree(true).query(points)[0]) < 0.05  # the true points stand 4 cm apart
+    assert len(points) == len(colors) > 300 and colors.min() >= 0 and colors.max() <= 1
+
+
+def test_gains_are_taken_out_of_the_colours(capture):
+    gains = np.array([[0.5, 1, 1]] * 3)
+    plain = cloud_at(capture.footage, maps(capture), known(capture), 0.1, 1 / 30)[1]
+    told = cloud_at(capture.footage, maps(capture), known(capture), 0.1, 1 / 30, gains)[1]
+    assert told[:, 0] == pytest.approx(np.minimum(2 * plain[:, 0], 1)) and np.array_equal(told[:, 1:], plain[:, 1:])
+
+
+def test_frames_that_are_too_far_away_say_nothing(capture):
+    assert len(cloud_at(capture.footage, maps(capture), known(capture), 3.0, 1 / 30)[0]) == 0
+
+
+def test_thinning_keeps_means_and_needs_support():
+    points = np.array([[0.1, 0, 0], [0.3, 0, 0], [5.0, 5, 5], [-0.1, 0, 0], [-0.2, 0, 0]])
+    at, color = thinned(points, points / 10, 1.0, 2)
+    assert sorted(at[:, 0].tolist()) == pytest.approx([-0.15, 0.2]) and len(color) == 2
+
+
+def test_later_moments_add_only_what_is_new(capture):
+    whole = planted(capture)
+    count = np.bincount(whole.motion.binding.rest.numpy())
+    assert count[0] > count[1:].max() and len(whole) == count.sum()
+    # at the moment they were seeded at, Gaussians stand where the depth saw them
+    times = whole.motion.binding.times.numpy()
+    for r, t in enumerate(times):
+        here = whole.tracks([t])[whole.motion.binding.rest.numpy() == r, 0]
+        assert np.median(cKDTree(capture.world.positions([t])[:, 0]).query(here)[0]) < 0.05
+
+
+def test_a_finer_voxel_plants_more(capture):
+    assert len(planted(capture, options=Seeding(voxel=2.0))) > 1.3 * len(planted(capture, options=Seeding(voxel=3.5)))
+
+
+def test_no_depth_is_a_clear_error(capture):
+    with pytest.raises(ValueError, match="expected depth where something moves"):
+        planted(capture, depth=[lambda k: None] * 3)
+    with pytest.raises(ValueError, match="Seeding: expected"):
+        Seeding(voxel=0)
