@@ -78,7 +78,9 @@ def test_a_part_of_a_moving_camera_keeps_its_times_and_poses():
 
 def test_lenses_are_undone():
     cv2 = pytest.importorskip("cv2")
-    cam = Camera(np.array([[300.0, 0, 161], [0, 300, 122], [0, 0, 1]]), np.eye(4), 320, 240, np.array([-0.3, 0.1, 0, 0]))
+    cam = Camera(
+        np.array([[300.0, 0, 161], [0, 300, 122], [0, 0, 1]]), np.eye(4), 320, 240, np.array([-0.3, 0.1, 0, 0])
+    )
     points = np.array([[-0.3, -0.2, 1], [0.25, -0.15, 1], [0.1, 0.2, 1], [-0.35, 0.1, 1]])
     half = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
     where, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), cam.K - half, cam.distortion)
