@@ -361,7 +361,7 @@ def _room(rng: np.random.Generator) -> Gaussians:
     floor = np.stack([*rng.uniform(-RADIUS, RADIUS, (2, 1500)), np.zeros(1500)], 1)
     wall = np.stack([RADIUS * np.sin(angle), RADIUS * np.cos(angle), rng.uniform(0, HEIGHT, 2500)], 1)
     at = np.concatenate([floor, wall])
-    colors = 0.5 + 0.15 * np.sin(2.3 * at) @ rng.standard_normal((3, 3)) + 0.06 * rng.standard_normal(at.shape)
+    colors = 0.5 + 0.15 * np.sin(2.3 * at) @ rng.standard_normal((3, 3)) + 0.03 * rng.standard_normal(at.shape)
     quats = np.zeros((len(at), 4))
     quats[:1500, 0] = 1
     quats[1500:] = np.stack([np.cos(-angle / 2), 0 * angle, 0 * angle, np.sin(-angle / 2)], 1)  # x along, y through

@@ -116,7 +116,8 @@ def look_at(
 ) -> tuple[Float[np.ndarray, " 3"], float]:
     """The point that is nearest to all optical axes, and the cameras' median distance from it.
 
-    Parallel axes meet nowhere: then, and for a single camera, the median of ``points`` is taken. ValueError without.
+    Parallel axes meet nowhere: then, and for a single camera, the median of ``points`` is taken, or of the depth that
+    the pictures have. ValueError without.
     """
     centers, axes = np.stack([s.center for s in stills]), np.stack([s.w2c[2, :3] for s in stills])
     focus = None
@@ -127,6 +128,8 @@ def look_at(
             focus = None
     if focus is None:
         if points is None or not len(points):
+            points = np.concatenate([_lifted(s) for s in stills])
+        if not len(points):
             raise ValueError(
                 "points: expected some of the scene, since the cameras do not look at one place and so tell no "
                 "distance; found none. Give lifted tracks or depth."
@@ -275,6 +278,15 @@ def disagreement(views: Sequence[View], points: Float[np.ndarray, "N 3"]) -> flo
     within = (np.abs(colors - mean) * weight * np.sqrt(count / (count - 1))).sum()
     overall = np.median(colors[ok[:, twice]], 0)
     return float(within / max((np.abs(colors - overall) * weight).sum(), 1e-12))
+
+
+def _lifted(still: Still) -> Float[np.ndarray, "N 3"]:
+    """Some points of the background at their known depth."""
+    u, v = still.pixels(max(1, still.size[0] // 32))
+    if still.depth is None:
+        return np.empty((0, 3))
+    known = still.depth[v, u] > 0
+    return still.lift(u[known], v[known], still.depth[v, u][known])
 
 
 def _sphere(
