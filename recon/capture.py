@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,13 @@ from otsync.files import atomic_write
 from otsync.io.scene import write_document
 from otsync.types import Offsets, Status
 from recon.footage import Footage
+from recon.gaussians4d import Gaussians4D
+from recon.motion import ScaffoldOptions, build_scaffold
+from recon.seed import seed
 from recon.simulate import Capture
+
+CAMERA_DISTANCE = 2.6
+"""Metres from the cameras to what moves: their images' pixels cover this over the focal length."""
 
 DEPTH_STEP = 0.0005
 """Metres per step of the 16-bit depth images."""
@@ -80,3 +87,18 @@ def _png(path: Path, image: np.ndarray) -> None:
 
     with atomic_write(path) as stream:
         Image.fromarray(image).save(stream, "PNG")
+
+
+def begun(capture: Capture, offsets: Offsets, options: ScaffoldOptions | None = None) -> Gaussians4D:
+    """The scene that a fit of a capture begins with: scaffold and seeds from the believed ``offsets``, and the true
+    static Gaussians, so that what moves is judged by itself."""
+    footprint = float(np.median([CAMERA_DISTANCE / f.K[0, 0] for f in capture.footage]))
+    span = (float(capture.footage[0].times[0]), float(capture.footage[0].times[-1]))
+    motion = build_scaffold(
+        capture.tracks, offsets.seconds, footprint=footprint, frame_step=capture.frame_step, options=options
+    )
+    scene = seed(
+        motion, capture.footage, offsets, [z.__getitem__ for z in capture.depth], footprint=footprint,
+        frame_step=capture.frame_step, span=span,
+    )  # fmt: skip
+    return replace(scene, static=capture.world.static, near=capture.near)

@@ -1,4 +1,4 @@
-"""The command line of reconstruction: ``recon fit | render | eval | export | simulate``, and what ``otsync run`` calls.
+"""The command line of reconstruction: ``recon fit | render | eval | export | simulate | bench``, and what ``otsync run`` calls.
 
 Exit codes: 0 done; 1 an answer is not to be trusted (it is written all the same); 2 bad arguments or files; 130
 interrupted: the same command continues where it stopped.
@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
+from recon.commands_bench import Bench
 from recon.density import Densify
 from recon.export import Format
 from recon.motion import ScaffoldOptions
@@ -309,6 +310,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "eval": Eval,
     "export": Export,
     "simulate": Simulate,
+    "bench": Bench,
 }
 
 

@@ -120,11 +120,9 @@ def convergence(found: Reconstruction, coarse: Offsets, videos: Sequence[str], t
 
 
 def _pace(found: Reconstruction) -> str:
-    steps, seconds = found.stats.get("steps", 0.0), found.stats.get("seconds", np.nan)
-    done = found.history.step[0] if len(found.history.step) else 0
-    text = f"{steps:.0f} steps"
-    if steps and np.isfinite(seconds) and done <= steps:
-        text += f", {seconds:.1f} s in the last session"
+    # a fit that was continued knows the time of its sessions one by one: the longest is what it took, about
+    seconds = max([found.stats.get("seconds", 0.0), *found.history.seconds.tolist()])
+    text = f"{found.stats.get('steps', 0.0):.0f} steps" + (f", {seconds:.1f} s" if seconds >= 0.1 else "")
     return text + ". Left: relative to the reference. Right: mean over the images since the last point."
 
 

@@ -124,9 +124,8 @@ def test_depth_rests_on_the_offsets(world, measured):
 
 def test_a_frame_that_falls_between_the_moments_has_an_empty_map(world):
     scene, _ = world
-    starts = np.array(STARTS) - 0.7 * (
-        np.arange(8) > 0
-    )  # the earliest frame lies more than half a step before the grid
+    # the earliest frame lies more than half a step before the grid, which runs through the first video's frames
+    starts = np.array(STARTS) - 0.7 * (np.arange(8) > 0)
     maps = depth_maps(scene, clocks(starts / FPS), [[7], [0], [], [], [0, 7], [], [], []], width=80, stages=STAGES)
     assert [m.shape for m in maps] == [(n, 45, 80) for n in (1, 1, 0, 0, 2, 0, 0, 0)]
     assert not maps[4][0].any()

@@ -40,7 +40,7 @@ class ScaffoldOptions:
 
     unit: float | None = None
     second_pick: float = 0.8
-    fewest: int = 32
+    fewest: int = 300
     most: int = 1800
     spacing: float = 4 * FRAME
     margin: float = 4 * FRAME

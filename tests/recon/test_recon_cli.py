@@ -189,13 +189,25 @@ def test_simulate_writes_a_recording_that_the_printed_command_fits(tmp_path, cap
 
 
 def test_every_help_has_an_example(capsys):
-    for verb in ("fit", "render", "eval", "export", "simulate"):
+    for verb in ("fit", "render", "eval", "export", "simulate", "bench"):
         with pytest.raises(SystemExit) as stop:
             main([verb, "--help"])
         assert stop.value.code == 0 and f"recon {verb}" in " ".join(capsys.readouterr().out.split())
     with pytest.raises(SystemExit):
         otsync(["run", "--help"])
     assert "Example: otsync run" in " ".join(capsys.readouterr().out.split())
+
+
+def test_bench_writes_a_row_for_every_configuration(world, tmp_path, capsys):
+    args = ["bench", str(world), "--truth", str(world / "truth.json"), "--held-out", "held0", "--width", str(SIZE[0]),
+            "--steps", "4", "--backdrop-steps", "5", "--rows", "ours", "true time", "--out", str(tmp_path)]  # fmt: skip
+    assert main(args) == 0
+    rows = json.loads((tmp_path / "recon.json").read_text())["rows"]
+    assert [r["configuration"] for r in rows] == ["ours", "true time"]
+    assert rows[1]["start"] == 0 < rows[0]["start"] < 1
+    assert "ours" in capsys.readouterr().err
+    assert main([*args[:-4], "theirs", "--out", str(tmp_path)]) == 2
+    assert "rows: expected some of ours" in capsys.readouterr().err
 
 
 def command(world: Path, out: Path) -> list[str]:

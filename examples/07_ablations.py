@@ -1,0 +1,50 @@
+"""What each part is worth: the same fit with and without spline, scaffold and refinement, on one simulated capture.
+
+    python examples/07_ablations.py --rows ours fixed "w/o scaffold" --out ablations
+
+A row is another object in a slot (recon/configurations.py), never another code path. On real recordings:
+recon bench recording/ --held-out NAME --rows ours fixed "w/o spline" "w/o scaffold".
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from pathlib import Path
+
+from otsync.io import open_scene
+from otsync.types import Offsets
+from recon.bench import Protocol, run
+from recon.capture import write_capture
+from recon.configurations import CONFIGURATIONS
+from recon.simulate import synthetic
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rows", nargs="+", default=["ours", "fixed", "w/o spline", "w/o scaffold"],
+                        choices=list(CONFIGURATIONS))  # fmt: skip
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--steps", type=int, default=700)
+    parser.add_argument("--out", type=Path, default=Path("ablations"))
+    args = parser.parse_args()
+
+    # the cameras' clocks are right here: the protocol puts the errors in, so that every row begins with the same ones
+    capture = synthetic(args.seed, offsets=[0.0] * 5)
+    held_out = tuple(f.name for f in capture.held_out)
+    with tempfile.TemporaryDirectory() as folder:
+        write_capture(capture, folder)
+        protocol = Protocol(
+            held_out=held_out,
+            seeds=(args.seed,),
+            steps=args.steps,
+            width=capture.footage[0].size[0],
+            backdrop_steps=800,
+        )
+        truth = Offsets.load(Path(folder) / "truth.json")
+        run(open_scene(folder), truth, args.out, protocol=protocol, rows=args.rows)
+    print(f"wrote {args.out / 'recon.csv'} and {args.out / 'recon.json'}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,54 @@
+"""``recon bench``: configurations of the field, and ablations, on one recording whose clocks are known."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import tyro
+
+from recon.bench import Protocol
+
+
+@dataclass
+class Bench:
+    """Measure offsets, held-out views and coherence of motion on a synchronised recording with errors put in.
+
+    Example: recon bench recording/ --held-out 0 --frames 20 68 --rows ours fixed "true time" --out bench
+
+    On a simulated recording: recon bench world --truth world/truth.json --held-out held0 --width 160
+    """
+
+    scene: tyro.conf.Positional[Path]
+    """A scene.json, or a folder that holds one, or a folder in Panoptic layout."""
+    truth: Path | None = None
+    """True offsets; default: all zero, a recording that is truly synchronised."""
+    rows: tuple[str, ...] = ("ours", "fixed", "true time")
+    """Configurations: see recon/configurations.py."""
+    out: Path = Path("bench/out")
+    """Folder for recon.csv and recon.json, written row by row, and the stages."""
+    cache: Path | None = None
+    """Folder where stages are kept; default: stages in --out."""
+    protocol: tyro.conf.OmitArgPrefixes[Protocol] = field(default_factory=Protocol)
+    allow_outside: bool = False
+    """Let the scene name files outside its folder."""
+
+    def run(self) -> int:
+        from otsync.io import open_scene
+        from otsync.types import Offsets
+        from recon.bench import run
+        from recon.capture import clocks
+
+        scene = open_scene(self.scene, allow_outside=self.allow_outside)
+        if self.truth is None:
+            truth = clocks(scene.names, np.zeros(len(scene.names)), scene.videos[0].fps or 30.0)
+        else:
+            truth = Offsets.load(self.truth)
+        run(
+            scene, truth, self.out, protocol=self.protocol, rows=self.rows, cache=self.cache,
+            tell=lambda text: print(text, file=sys.stderr, flush=True),
+        )  # fmt: skip
+        print(f"wrote {self.out / 'recon.csv'} and {self.out / 'recon.json'}")
+        return 0
