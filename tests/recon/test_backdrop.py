@@ -126,9 +126,9 @@ def test_the_floor_is_found_however_the_world_is_turned(capture, with_points):
 def test_cameras_agree_about_true_surfaces_only(capture):
     views = [View.of(s) for s in stills_of(capture.footage)]
     grid = np.stack([*np.meshgrid(*[np.linspace(-1.2, 1.2, 30)] * 2), np.zeros((30, 30))], -1).reshape(-1, 3)
-    true, wrong = disagreement(views, grid), disagreement(views, grid + [0, 0, 0.4])
+    true, wrong = disagreement(views, grid), disagreement(views, grid + np.array([0, 0, 0.4]))
     assert true < 0.4 and wrong > true + 0.2
-    assert disagreement(views, grid + [0, 0, 50]) == 1.0  # nobody sees that
+    assert disagreement(views, grid + np.array([0, 0, 50])) == 1.0  # nobody sees that
     assert disagreement(views[:1], grid) == 1.0
 
 
@@ -303,7 +303,7 @@ def test_videos_without_a_background_take_no_part(small):
     blind = replace(small.footage[1], masks=None, background=None, background_seen=None)
     found = fit_backdrop([small.footage[0], blind, small.footage[2]], depth=small.depth, steps=5, progress=False)
     assert np.isnan(found.psnr).tolist() == [False, True, False] and (found.gains[1] == 1).all()
-    with pytest.raises(ValueError, match="expected a video whose background shows.*Give masks"):
+    with pytest.raises(ValueError, match=r"expected a video whose background shows.*Give masks"):
         fit_backdrop([blind], progress=False)
 
 
