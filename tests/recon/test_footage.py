@@ -214,9 +214,9 @@ def test_bad_frames_are_left_out_and_named(caplog):
 
 
 def test_no_usable_frame_is_an_error():
-    with pytest.raises(ValueError, match="'left': expected frames that can be read.*300 x 300|found none.*64 x 48"):
+    with pytest.raises(ValueError, match=r"'left': expected frames that can be read.*found none.*64 x 48"):
         footage_of(video(clip(width=30)))
-    with pytest.raises(ValueError, match="floats in 0..1"):
+    with pytest.raises(ValueError, match=r"floats in 0\.\.1"):
         footage_of(video([f.astype(float) for f in clip()]))
     with pytest.raises(ValueError, match="uint8, or floats"):
         footage_of(video([f.astype(np.int32) for f in clip()]))
@@ -258,7 +258,7 @@ def test_missing_depth_names_the_video():
     for call in (lambda: depth_at(None, f, 0), lambda: working_depth(video())):
         with pytest.raises(ValueError, match="depth of 'left': expected depth maps"):
             call()
-    with pytest.raises(ValueError, match="depth of 'left': expected 6 maps.*found 2"):
+    with pytest.raises(ValueError, match=r"depth of 'left': expected 6 maps.*found 2"):
         depth_at([np.ones((48, 64))] * 2, f, 0)
     with pytest.raises(ValueError, match="depth of 'left', frame 1: expected a map"):
         depth_at([np.ones(5)] * 6, f, 1)
