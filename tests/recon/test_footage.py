@@ -78,7 +78,9 @@ def test_a_part_of_a_moving_camera_keeps_its_times_and_poses():
 
 def test_lenses_are_undone():
     cv2 = pytest.importorskip("cv2")
-    cam = Camera(np.array([[300.0, 0, 161], [0, 300, 122], [0, 0, 1]]), np.eye(4), 320, 240, np.array([-0.3, 0.1, 0, 0]))
+    cam = Camera(
+        np.array([[300.0, 0, 161], [0, 300, 122], [0, 0, 1]]), np.eye(4), 320, 240, np.array([-0.3, 0.1, 0, 0])
+    )
     points = np.array([[-0.3, -0.2, 1], [0.25, -0.15, 1], [0.1, 0.2, 1], [-0.35, 0.1, 1]])
     half = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
     where, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), cam.K - half, cam.distortion)
@@ -212,9 +214,9 @@ def test_bad_frames_are_left_out_and_named(caplog):
 
 
 def test_no_usable_frame_is_an_error():
-    with pytest.raises(ValueError, match="'left': expected frames that can be read.*300 x 300|found none.*64 x 48"):
+    with pytest.raises(ValueError, match=r"'left': expected frames that can be read.*300 x 300|found none.*64 x 48"):
         footage_of(video(clip(width=30)))
-    with pytest.raises(ValueError, match="floats in 0..1"):
+    with pytest.raises(ValueError, match=r"floats in 0\.\.1"):
         footage_of(video([f.astype(float) for f in clip()]))
     with pytest.raises(ValueError, match="uint8, or floats"):
         footage_of(video([f.astype(np.int32) for f in clip()]))
@@ -256,7 +258,7 @@ def test_missing_depth_names_the_video():
     for call in (lambda: depth_at(None, f, 0), lambda: working_depth(video())):
         with pytest.raises(ValueError, match="depth of 'left': expected depth maps"):
             call()
-    with pytest.raises(ValueError, match="depth of 'left': expected 6 maps.*found 2"):
+    with pytest.raises(ValueError, match=r"depth of 'left': expected 6 maps.*found 2"):
         depth_at([np.ones((48, 64))] * 2, f, 0)
     with pytest.raises(ValueError, match="depth of 'left', frame 1: expected a map"):
         depth_at([np.ones(5)] * 6, f, 1)

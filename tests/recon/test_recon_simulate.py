@@ -176,7 +176,9 @@ def test_rows_are_read_one_after_the_other(capture):
     assert rolled.readout == readout and capture.footage[1].readout is None
     t = 4 / FPS + capture.offsets[1]
     whole = {
-        s: np.stack([seen(capture.world, rolled, t + s * readout * ((r + 0.5) / 48 - 0.5))[0][r] for r in range(0, 48, 4)])
+        s: np.stack(
+            [seen(capture.world, rolled, t + s * readout * ((r + 0.5) / 48 - 0.5))[0][r] for r in range(0, 48, 4)]
+        )
         for s in (-1, 1)
     }
     assert psnr(whole[1], rolled.images[4, ::4]) > psnr(whole[-1], rolled.images[4, ::4]) + 1
