@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -281,3 +285,14 @@ def test_what_does_not_fit_is_refused():
 
 def test_float32_on_the_cpu_is_what_the_kernels_take():
     assert fused.applies(torch.zeros(1), torch.ones(2)) and not fused.applies(torch.zeros(1), torch.zeros(1).double())
+
+
+@pytest.mark.slow
+def test_a_processor_without_avx_carries_the_same(tmp_path):
+    """Compiled for the least x86-64 there is: a row of eight lanes twice instead of sixteen once."""
+    env = {**os.environ, "NUMBA_CPU_NAME": "generic", "NUMBA_CACHE_DIR": str(tmp_path)}
+    code = "from recon.raster.cpu.simd import LANES; assert LANES == 8, LANES; import pytest; "
+    code += f"raise SystemExit(pytest.main(['-q', '-x', '-m', 'not slow', {str(Path(__file__))!r}]))"
+    root = Path(__file__).parents[2]
+    result = subprocess.run([sys.executable, "-c", code], env=env, cwd=root, capture_output=True, text=True)
+    assert result.returncode == 0, result.stdout[-3000:]
