@@ -20,13 +20,13 @@ from torch import Tensor
 from tqdm import tqdm
 
 from recon.depth import Depths
-from recon.discs import seed_discs
+from recon.discs import seed_discs, surface_of
 from recon.footage import Footage
 from recon.gaussians import Gaussians
 from recon.raster import render, sh
 from recon.ssim import SMALL, photometric
 from recon.stills import Still, stills_of
-from recon.surroundings import Floor, surroundings
+from recon.surroundings import Floor, View, surroundings
 
 log = logging.getLogger("recon.backdrop")
 
@@ -112,18 +112,42 @@ def fit_backdrop(
     started = time.perf_counter()
     around = surroundings(_some(stills, 32), points, floor)
     near = NEAR * around.distance
-    start, sharpest = seed_discs(stills, around, near).gaussians(sh_degree)
+    surfaces = [surface_of(s, around, near) for s in stills]
+    gains = first_gains(stills, np.concatenate([s.at for s in surfaces]), len(footage))
+    start, sharpest = seed_discs(stills, surfaces, around, near, gains).gaussians(sh_degree)
     log.info("backdrop: %d seeds, near plane %.3g", len(start), near)
-    fit = _Fit(start, sharpest.to(device), stills, len(footage), near, around.distance, rates, seed, device)
+    fit = _Fit(start, sharpest.to(device), stills, gains, near, around.distance, rates, seed, device)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # torch's pool would compete with the rasterizer's
     try:
         loss = fit.run(total, budget, progress)
     finally:
         torch.set_num_threads(threads)
-    gains, scores = fit.result(len(footage))
+    gains, scores = fit.result()
     stats = {"seconds": time.perf_counter() - started, "steps": fit.step, "seeds": len(start), "loss": loss}
     return StaticFit(fit.gaussians().detach(), gains, near, scores, around.floor, stats)
+
+
+def first_gains(stills: Sequence[Still], points: Float[np.ndarray, "N 3"], videos: int) -> Float[np.ndarray, "V 3"]:
+    """Gains of the videos by the colours that they show of the same surface points, of geometric mean 1.
+
+    Occlusion and points that are in the wrong place change colours too, but not all one way: medians are taken.
+    """
+    looks = [View.of(still).look(points[:: max(1, len(points) // 4000)]) for still in stills]
+    colors = np.where(np.stack([k for _, k in looks])[..., None], np.stack([c for c, _ in looks]), np.nan)
+    twice = np.isfinite(colors[..., 0]).sum(0) >= 2
+    shift, video = np.zeros((videos, 3)), np.array([s.video for s in stills])
+    if not twice.any():
+        return np.ones((videos, 3))
+    for _ in range(20):
+        apart = colors[:, twice] - shift[video][:, None]
+        apart = apart - np.nanmean(apart, 0)
+        for v in np.unique(video):
+            own = apart[video == v].reshape(-1, 3)
+            own = own[np.isfinite(own[:, 0])]
+            shift[v] += np.median(own, 0) if len(own) else 0.0
+    taking_part = np.isin(np.arange(videos), video)
+    return np.where(taking_part[:, None], np.exp(shift - shift[taking_part].mean(0)), 1.0)
 
 
 def colour_gain(
@@ -187,12 +211,12 @@ class _Fit:
     """A background fit under way."""
 
     def __init__(
-        self, start: Gaussians, sharpest: Tensor, stills: Sequence[Still], videos: int, near: float,
+        self, start: Gaussians, sharpest: Tensor, stills: Sequence[Still], gains: np.ndarray, near: float,
         distance: float, rates: Mapping[str, float], seed: int, device: torch.device | str,
     ):  # fmt: skip
         self.sharpest, self.near, self.stills, self.seed, self.step = sharpest, near, stills, seed, 0
         footprint = distance / float(np.median([s.K[0, 0] for s in stills]))
-        values = {**vars(start), "gains": torch.zeros(videos, 3)}
+        values = {**vars(start), "gains": torch.as_tensor(gains - 1, dtype=torch.float32)}
         self.groups = {name: value.to(device).clone() for name, value in values.items()}
         self.rates = {n: r * (footprint if n == "means" else 1.0) for n, r in rates.items() if self.groups[n].numel()}
         for name in self.rates:
@@ -281,8 +305,9 @@ class _Fit:
         self.step += 1
         return value
 
-    def result(self, videos: int) -> tuple[np.ndarray, np.ndarray]:
+    def result(self) -> tuple[np.ndarray, np.ndarray]:
         """(gains [V,3], PSNR [V])."""
+        videos = len(self.groups["gains"])
         error, weight = np.zeros(videos), np.zeros(videos)
         with torch.no_grad():
             for i, still in enumerate(self.stills):

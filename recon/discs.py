@@ -66,33 +66,56 @@ class Discs:
         return gaussians, torch.as_tensor(SHARPEST * self.pixel, dtype=torch.float32)
 
 
-def seed_discs(stills: Sequence[Still], around: Surroundings, near: float) -> Discs:
-    """Discs on the surfaces that the pictures show, one a voxel, and what lies behind them.
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """What one picture shows, ray by ray: points, normals and colours [N,3], and whether their depth was given [N]."""
 
-    A pixel's surface is at its depth where that is known, else on the floor or the shell. Nothing is seeded nearer than
-    ``near`` (along z) to the camera that shows it.
+    at: Float[np.ndarray, "N 3"]
+    normal: Float[np.ndarray, "N 3"]
+    color: Float[np.ndarray, "N 3"]
+    measured: Bool[np.ndarray, " N"]
+
+
+def surface_of(still: Still, around: Surroundings, near: float) -> Surface:
+    """A pixel's surface is at its depth where that is known, else on the floor or the shell.
+
+    What is nearer than ``near`` (along z) is left out.
     """
-    parts: list[tuple[np.ndarray, ...]] = []
-    for still in stills:
-        u, v = still.pixels(max(1, round(still.size[0] / RAYS)))
-        rays = still.rays(u, v)
-        away, normal = around.cast(np.broadcast_to(still.center, rays.shape), rays)
-        known = np.isfinite(away)
-        at = still.center + np.where(known, away, 0)[:, None] * rays
-        given = np.zeros(len(u), bool)
-        if still.depth is not None:
-            z = still.depth[v, u]
-            given = z > 0
-            at[given] = still.lift(u[given], v[given], z[given])
-            normal = np.where(given[:, None], normals_of_depth(still, u, v), normal)
-        keep = (known | given) & ((at - still.center) @ still.w2c[2, :3] > near)
-        parts.append((at[keep], normal[keep], still.image[v, u][keep] / 255, given[keep]))
-    at, normal, color, given = (np.concatenate(rows) for rows in zip(*parts, strict=True))
+    u, v = still.pixels(max(1, round(still.size[0] / RAYS)))
+    rays = still.rays(u, v)
+    away, normal = around.cast(np.broadcast_to(still.center, rays.shape), rays)
+    known = np.isfinite(away)
+    at = still.center + np.where(known, away, 0)[:, None] * rays
+    given = np.zeros(len(u), bool)
+    if still.depth is not None:
+        z = still.depth[v, u]
+        given = z > 0
+        at[given] = still.lift(u[given], v[given], z[given])
+        normal = np.where(given[:, None], normals_of_depth(still, u, v), normal)
+    keep = (known | given) & ((at - still.center) @ still.w2c[2, :3] > near)
+    return Surface(at[keep], normal[keep], still.image[v, u][keep] / 255, given[keep])
+
+
+def seed_discs(
+    stills: Sequence[Still],
+    surfaces: Sequence[Surface],
+    around: Surroundings,
+    near: float,
+    gains: Float[np.ndarray, "V 3"] | None = None,
+) -> Discs:
+    """Discs on the surfaces of all pictures, one a voxel, and what lies behind them.
+
+    gains: factors of the videos' colours, which are taken out.
+    """
+    at, normal, given = (np.concatenate([getattr(s, n) for s in surfaces]) for n in ("at", "normal", "measured"))
     if not len(at):
         raise ValueError(
             f"footage: expected background farther than the near plane ({near:.3g}); found none. Check that depth and "
             "poses are in the same unit."
         )
+    color = np.concatenate(
+        [s.color if gains is None else s.color / gains[t.video] for s, t in zip(surfaces, stills, strict=True)]
+    ).clip(0, 1)
     pixel = _nearest_pixel(stills, at, near)
     # voxels of a power of two times the smallest, so that far things are not seeded finer than they are seen
     base = np.percentile(pixel, 1)

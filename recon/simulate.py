@@ -356,16 +356,21 @@ def _body(b: int, rng: np.random.Generator) -> tuple[Parts, Callable[[np.ndarray
 
 
 def _room(rng: np.random.Generator) -> Gaussians:
-    """A floor and a round wall of flat, overlapping discs, blotchy."""
-    angle = rng.uniform(0, 2 * np.pi, 2500)
-    floor = np.stack([*rng.uniform(-RADIUS, RADIUS, (2, 1500)), np.zeros(1500)], 1)
-    wall = np.stack([RADIUS * np.sin(angle), RADIUS * np.cos(angle), rng.uniform(0, HEIGHT, 2500)], 1)
+    """A floor and a round wall of small, flat, overlapping discs, blotchy.
+
+    Splats are sorted by their middles, so that a floor of large ones would seem to stand higher, and differently so from
+    every side.
+    """
+    on_floor, on_wall, width = 4000, 7000, 0.08
+    angle = rng.uniform(0, 2 * np.pi, on_wall)
+    floor = np.stack([*rng.uniform(-RADIUS, RADIUS, (2, on_floor)), np.zeros(on_floor)], 1)
+    wall = np.stack([RADIUS * np.sin(angle), RADIUS * np.cos(angle), rng.uniform(0, HEIGHT, on_wall)], 1)
     at = np.concatenate([floor, wall])
     colors = 0.5 + 0.15 * np.sin(2.3 * at) @ rng.standard_normal((3, 3)) + 0.03 * rng.standard_normal(at.shape)
     quats = np.zeros((len(at), 4))
-    quats[:1500, 0] = 1
-    quats[1500:] = np.stack([np.cos(-angle / 2), 0 * angle, 0 * angle, np.sin(-angle / 2)], 1)  # x along, y through
-    scales = np.concatenate([np.tile([0.14, 0.14, 0.01], (1500, 1)), np.tile([0.14, 0.01, 0.14], (2500, 1))])
+    quats[:on_floor, 0] = 1
+    quats[on_floor:, 0], quats[on_floor:, 3] = np.cos(angle / 2), -np.sin(angle / 2)  # y turned outwards
+    scales = np.concatenate([np.tile([1, 1, 0.1], (on_floor, 1)), np.tile([1, 0.1, 1], (on_wall, 1))]) * width
     arrays = (at, quats, scales, np.full(len(at), 0.95), colors.clip(0, 1))
     return Gaussians.from_colors(*(torch.as_tensor(a, dtype=torch.float32) for a in arrays))
 

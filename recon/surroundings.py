@@ -166,8 +166,10 @@ def find_floor(
     if points is not None and len(points):
         lowest = np.percentile(points @ up, 0.5)
         low, high = lowest - 0.1 * distance, lowest + 0.05 * distance
-    side = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
-    side /= np.linalg.norm(side)
+    # a direction of the scene, not of its axes: a turned scene gets the turned floor
+    sides = np.cross(up, np.stack([v.center for v in views]) - focus)
+    side = max(sides, key=np.linalg.norm)
+    side = side / np.linalg.norm(side)
     frame = np.stack([side, np.cross(up, side)])
     grid = np.linspace(-0.75, 0.75, 48) * distance
     spots = np.stack(np.meshgrid(grid, grid), -1).reshape(-1, 2)
