@@ -28,7 +28,8 @@ class Snapshot:
         step, steps: done, and in all.
         scene: arrays of the scene as it stood (constants of the motion too: densification changes them).
         groups, moments: the optimiser's parameters and averages.
-        history: one row per record, see :data:`recon.fit.HISTORY`.
+        history: one row per record, see :class:`recon.fit.History`. since: (loss, psnr) of the images since the last row.
+        densified: how often the scene was made denser. pull: [2,N] what that is decided by, gathered since the last time.
     """
 
     step: int
@@ -37,6 +38,9 @@ class Snapshot:
     groups: dict[str, Tensor]
     moments: dict[str, Tensor]
     history: np.ndarray
+    densified: int
+    pull: Tensor
+    since: np.ndarray
 
 
 class Checkpoint:
@@ -58,8 +62,10 @@ class Checkpoint:
         """Write ``snapshot`` over the last one, atomically."""
         if self.path is None:
             return
-        about = {"format": FORMAT, "version": VERSION, "key": self.key, "step": snapshot.step, "steps": snapshot.steps}
-        arrays = {"fit": np.frombuffer(json.dumps(about).encode(), np.uint8), "history": snapshot.history}
+        about = {"format": FORMAT, "version": VERSION, "key": self.key, "step": snapshot.step,
+                 "steps": snapshot.steps, "densified": snapshot.densified}  # fmt: skip
+        arrays = {"fit": np.frombuffer(json.dumps(about).encode(), np.uint8), "history": snapshot.history,
+                  "since": snapshot.since, "pull": snapshot.pull.numpy()}  # fmt: skip
         arrays |= {f"scene/{k}": v for k, v in snapshot.scene.items()}
         for part in ("groups", "moments"):
             arrays |= {f"{part}/{k}": v.detach().cpu().numpy() for k, v in getattr(snapshot, part).items()}
@@ -82,7 +88,8 @@ class Checkpoint:
                     parts[part][key] = array
             snapshot = Snapshot(
                 int(about["step"]), int(about["steps"]), parts["scene"], _tensors(parts["groups"]),
-                _tensors(parts["moments"]), arrays["history"],
+                _tensors(parts["moments"]), arrays["history"], int(about["densified"]),
+                torch.from_numpy(np.array(arrays["pull"])), arrays["since"],
             )  # fmt: skip
             key = about["key"]
         except (KeyError, TypeError, ValueError, AttributeError, UnicodeDecodeError) as error:

@@ -30,7 +30,7 @@ from recon.gaussians4d import Gaussians4D
 from recon.losses import Mask, Photometric, ScaleHinge
 from recon.optimize import RATES
 from recon.problem import Loss, Problem, assemble
-from recon.quiet import one_thread_each
+from recon.quiet import one_thread_each, uninterrupted
 from recon.regularizers import Acceleration, Arap, Length, Velocity
 from recon.running import Diverged, Run
 
@@ -104,7 +104,7 @@ def fit(
         losses, effects: what is in the tuple is computed, nothing else.
         rates: learning rate of each parameter group at the start; a group without one is frozen, "offsets" too.
         steps, budget: how long: a number of steps, or wall seconds, which are turned into a number of steps once the
-            first ones have shown their speed. Default: 2000 steps.
+            first ones have shown their speed (120 at the least). Default: 2000 steps.
         batch: images per step, each on its own thread. The result does not depend on the number of threads.
         checkpoint: file that the fit is kept in, every ``save_every`` seconds and on Ctrl-C; a fit that was killed
             continues from it and ends with the same numbers.
@@ -125,14 +125,13 @@ def fit(
         calibrate = Calibration(budget)
         try:
             while run.total is None or run.step < run.total:
-                run.one_step(pool, probe=densify is not None)
+                with uninterrupted():
+                    run.advance(pool, densify)
+                    row = run.record(time.perf_counter() - started) if run.record_due() else None
                 bar.update()
                 if run.total is None:
                     bar.total = run.total = calibrate(run.step)
-                if densify is not None and run.total and run.step in densify.steps(run.total):
-                    run.densify(densify)
-                if run.record_due():
-                    row = run.record(time.perf_counter() - started)
+                if row is not None:
                     bar.set_postfix_str(f"PSNR {row[3]:.1f}, offsets moved {_moved(problem, row[4:])} frames", False)
                 if keep.due():
                     keep.save(run.snapshot())
@@ -148,7 +147,7 @@ def _steps(steps: int | None, budget: float | None) -> int | None:
     if steps is not None and budget is not None:
         raise ValueError("steps, budget: expected one of them, got both")
     if budget is not None:
-        if not budget > 0:
+        if not 0 < budget < math.inf:
             raise ValueError(f"budget: expected seconds above 0, got {budget}")
         return None
     steps = 2000 if steps is None else steps
@@ -172,7 +171,7 @@ class Calibration:
             return None
         assert self.budget is not None  # only then is the number of steps open
         each = (time.perf_counter() - self.since) / (CALIBRATION[1] - CALIBRATION[0])
-        return max(step, int(self.budget / each))
+        return max(2 * step, int(self.budget / each))  # rates must have time to decay
 
 
 def _moved(problem: Problem, seconds: np.ndarray) -> str:

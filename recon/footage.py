@@ -6,7 +6,7 @@ Everything is kept as uint8: 150 frames of 320 x 180 are 26 MB, their masks 9 MB
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -44,6 +44,9 @@ class Footage:
             empty (all zeros) where nothing moves and in bad frames.
         readout: seconds from the first to the last row of a rolling shutter, or None.
         bad: frames that could not be read.
+        depth: z in world units [h,w] by frame, 0 where unknown; for a depth loss.
+        tracks: :class:`recon.losses.Sightings` by frame; for a track loss.
+        features: extracted features [h,w,C] by frame; for a feature loss.
     """
 
     name: str
@@ -57,6 +60,9 @@ class Footage:
     boxes: Int[np.ndarray, "T 4"]
     readout: float | None
     bad: Bool[np.ndarray, " T"]
+    depth: Mapping[int, np.ndarray] | None = None
+    tracks: Mapping[int, Any] | None = None
+    features: Mapping[int, np.ndarray] | None = None
 
     def __len__(self) -> int:
         return len(self.images)

@@ -8,7 +8,7 @@ render. Colours are in 0..1; lengths enter in footprints, pixels or ratios, so a
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal, Protocol
+from typing import ClassVar, Literal, Protocol
 
 import numpy as np
 import torch
@@ -137,6 +137,7 @@ class Depth:
     tolerance: float = 0.05
     scale: Literal["given", "median"] = "given"
     needs: frozenset[str] = field(default=frozenset({"depth"}), init=False)
+    reads: ClassVar[str] = "depth"
 
     def __call__(self, seen: Seen) -> Tensor | None:
         if seen.depth is None or seen.given_depth is None:
@@ -163,6 +164,7 @@ class Track:
     weight: float = 0.01
     tolerance: float = 2.0
     needs: frozenset[str] = field(default=frozenset(), init=False)
+    reads: ClassVar[str] = "tracks"
 
     def __call__(self, seen: Seen) -> Tensor | None:
         if seen.tracks is None or seen.means is None or seen.view is None or not len(seen.tracks.uv):
@@ -185,6 +187,7 @@ class Feature:
 
     weight: float = 0.1
     needs: frozenset[str] = field(default=frozenset({"features"}), init=False)
+    reads: ClassVar[str] = "features"
 
     def __call__(self, seen: Seen) -> Tensor | None:
         if seen.features is None or seen.given_features is None:

@@ -67,6 +67,15 @@ class Problem:
         unknown = [type(x).__name__ for x in losses if not hasattr(x, "needs") and not hasattr(x, "every")]
         if unknown:
             raise ValueError(f"losses: expected ImageLoss or MotionLoss objects, got {', '.join(unknown)}")
+        for loss in losses:
+            reads = getattr(loss, "reads", None)
+            if reads is not None and not any(getattr(f, reads) for f in footage):
+                raise ValueError(
+                    f"losses: {type(loss).__name__} compares with the {reads} of footage; found none in any video. Give "
+                    f"Footage.{reads}, or leave the loss out."
+                )
+            if reads == "features" and scene.features is None:
+                raise ValueError("losses: Feature compares the scene's features; found none. Lift them first.")
         keys = [(v, k) for v, f in enumerate(footage) for k in range(len(f.images))
                 if not f.bad[k] and (f.boxes[k, 2:] > f.boxes[k, :2]).all()]  # fmt: skip
         if not keys:
@@ -89,9 +98,9 @@ class Problem:
         at = np.nonzero(self.index == self.offsets.component[self.index[0]])[0]
         return int(at[0]) if len(at) else 0
 
-    @property
-    def needs_depth(self) -> bool:
-        return any("depth" in loss.needs for loss in self.losses)
+    def needs(self, what: str) -> bool:
+        """Whether a loss asks for "depth" or "features" to be rendered."""
+        return any(what in loss.needs for loss in self.losses)
 
     def key(self, *options: Any) -> str:
         """What decides the result: see :func:`recon.checkpoint.key_of`."""
@@ -100,6 +109,9 @@ class Problem:
             f = clip.footage
             arrays += [f.images, f.times, f.K, f.w2c, f.boxes, f.bad]
             arrays += [a for a in (f.masks, f.background) if a is not None]
+            for given in (f.depth, f.features):
+                arrays += [given[k] for k in sorted(given)] if given else []
+            arrays += [x.numpy() for k in sorted(f.tracks) for x in vars(f.tracks[k]).values()] if f.tracks else []
         return key_of(arrays, *options)
 
     def pick(self, step: int) -> list[tuple[int, int]]:
@@ -124,6 +136,8 @@ def scene_groups(scene: Gaussians4D) -> dict[str, Tensor]:
     """The parameter groups of a scene: the dynamic Gaussians' by their own names, the static ones' with a prefix."""
     out = {f.name: getattr(scene.dynamic, f.name) for f in fields(scene.dynamic)}
     out |= scene.motion.parameters()
+    if scene.features is not None:
+        out["features"] = scene.features
     if scene.static is not None:
         out |= {f"static.{f.name}": getattr(scene.static, f.name) for f in fields(scene.static)}
     return out
@@ -136,4 +150,4 @@ def assemble(scene: Gaussians4D, groups: Mapping[str, Tensor]) -> Gaussians4D:
     static = scene.static
     if static is not None:
         static = replace(static, **{n[7:]: t for n, t in groups.items() if n.startswith("static.")})
-    return replace(scene, dynamic=dynamic, motion=motion, static=static)
+    return replace(scene, dynamic=dynamic, motion=motion, static=static, features=groups.get("features"))

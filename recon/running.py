@@ -13,18 +13,17 @@ from torch import Tensor
 
 from recon.checkpoint import Snapshot
 from recon.density import Densify
-from recon.effects import Shot, compose, prior
-from recon.gaussians4d import scene_arrays, scene_from_arrays
+from recon.effects import Rendered, Shot, compose, prior
+from recon.gaussians4d import Gaussians4D, scene_arrays, scene_from_arrays
 from recon.losses import Seen
 from recon.optimize import Adam, Decay, check_rates
 from recon.problem import Problem, assemble, scene_groups
-from recon.quiet import uninterrupted
 from recon.regularizers import Draw
-from recon.stage import compose_over, observer
+from recon.stage import Clip, compose_over, feature_image, observer
 from recon.uncertainty import newton_sigma
 
 RECORDS = 200  # rows of history in a fit
-PER_GAUSSIAN = ("means", "quats", "log_scales", "opacity_logits", "sh", "own_knots")
+PER_GAUSSIAN = ("means", "quats", "log_scales", "opacity_logits", "sh", "features", "own_knots")
 
 
 class Diverged(RuntimeError):
@@ -57,10 +56,11 @@ class Run:
             )
             self.groups |= {n: v.to(self.groups[n].device) for n, v in snapshot.groups.items()}
             self.rows = snapshot.history
+        self.densified = 0 if snapshot is None else snapshot.densified
         self.adam = self._adam({} if snapshot is None else snapshot.moments)
         self.decay = Decay()
-        self._since: list[tuple[float, float]] = []
-        self._pull = torch.zeros(2, len(self.scene))
+        self._since = [] if snapshot is None else [(float(a), float(b)) for a, b in snapshot.since]
+        self._pull = torch.zeros(2, len(self.scene)) if snapshot is None else snapshot.pull
 
     def _adam(self, moments: Mapping[str, Tensor]) -> Adam:
         active = check_rates(self.rates, self.groups)
@@ -75,6 +75,16 @@ class Run:
     def world_time(self, values: Mapping[str, Tensor], video: int, frame: int) -> Tensor:
         """World seconds at which a frame was taken, differentiable in its video's clock."""
         return values["clock_rates"][video] * self.problem.times[video][frame] + values["offsets"][video]
+
+    def advance(self, pool: ThreadPoolExecutor, densify: Densify | None) -> None:
+        """A step, and what is due after it: all of it, or none."""
+        self.one_step(pool, probe=densify is not None)
+        if densify is not None and self.total:
+            due = sorted(densify.steps(self.total))
+            # a budget may learn its length only after a moment has passed
+            if self.densified < len(due) and self.step >= due[self.densified]:
+                self.densify(densify)
+                self.densified += 1
 
     def one_step(self, pool: ThreadPoolExecutor, probe: bool = False) -> None:
         """Render a batch, gather gradients in a fixed order, and move."""
@@ -92,13 +102,14 @@ class Run:
                     total[name] = gradient * share if name not in total else total[name].add_(gradient, alpha=share)
         self._guard(total, done, p.pick(self.step))
         fraction = self.step / self.total if self.total else 0.0
-        with uninterrupted():
-            self.adam.step(total, self.decay(fraction))
-            self.step += 1
-            self._since += [(r.loss, r.psnr) for r in done[: p.batch]]
-            for r in done[: p.batch]:
-                if r.pull is not None:
-                    self._pull += r.pull
+        if "clock_rates" in total:  # the reference's clock is the world's
+            total["clock_rates"][p.reference] = 0
+        self.adam.step(total, self.decay(fraction))
+        self.step += 1
+        for r in done[: p.batch]:
+            self._since.append((r.loss, r.psnr))
+            if r.pull is not None:
+                self._pull += r.pull
 
     def look(self, values: dict[str, Tensor], video: int, frame: int, later: float = 0.0) -> Tensor:
         """The image [h,w,3] of a frame's box as the scene gives it, ``later`` seconds after the frame, without a graph."""
@@ -124,19 +135,14 @@ class Run:
         scene = assemble(self.scene, values)
         clip = p.clips[v]
         box = clip.box(k)
-        observe = observer(scene, p.clips, values["offsets"], depth=p.needs_depth, probes=probes if probe else None)
+        observe = observer(scene, p.clips, values["offsets"], depth=p.needs("depth"), probes=probes if probe else None)
         shot = Shot(v, self.world_time(values, v, k), box, clip.size[1], k)
         rendered = compose(observe, p.effects, values)(shot)
-        image = clip.image(k, box)
-        seen = Seen(
-            rendered=compose_over(rendered, clip.behind(box)), alpha=rendered.alpha, depth=rendered.depth, image=image,
-            mask=clip.mask(k, box), video=v, frame=k, t=shot.t, box=box, view=(clip.K, clip.pose(k)),
-            scales=scene.dynamic.scales, footprint=scene.footprint,
-        )  # fmt: skip
+        seen = self.seen(scene, values, rendered, clip, shot)
         parts = [loss.weight * value for loss in p.losses if (value := loss(seen)) is not None]
         held = prior(p.effects, values)
         loss = sum(parts if held is None else [*parts, held], torch.zeros(()))
-        psnr = -10 * math.log10(float((seen.rendered.detach() - image).square().mean()) + 1e-12)
+        psnr = -10 * math.log10(float((seen.rendered.detach() - seen.image).square().mean()) + 1e-12)
         wanted = [values[n] for n in names] + [means for means, _ in probes]
         gradients = torch.autograd.grad(loss, wanted, allow_unused=True) if loss.requires_grad else [None] * len(wanted)
         pull = torch.zeros(2, len(scene)) if probe else None
@@ -145,6 +151,28 @@ class Run:
                 seen_here = (radii > 0).any(-1).cpu()
                 pull += torch.stack([g[0, : len(scene)].norm(dim=-1).cpu() * seen_here, seen_here.float()])
         return Result(float(loss.detach()), psnr, list(gradients[: len(names)]), pull)
+
+    def seen(
+        self, scene: Gaussians4D, values: Mapping[str, Tensor], rendered: Rendered, clip: Clip, shot: Shot
+    ) -> Seen:
+        """A rendered frame beside everything that is given of it; what no loss reads is not computed."""
+        p, k, box, given = self.problem, shot.frame, shot.box, clip.footage
+        rows, columns = slice(box[1], box[3]), slice(box[0], box[2])
+
+        def cut(maps: Mapping[int, np.ndarray] | None) -> Tensor | None:
+            return None if maps is None or k not in maps else torch.as_tensor(maps[k][rows, columns])
+
+        depth, features = cut(given.depth), cut(given.features) if p.needs("features") else None
+        tracks = None if given.tracks is None else given.tracks.get(k)
+        clocks = values["offsets"]
+        return Seen(
+            rendered=compose_over(rendered, clip.behind(box)), alpha=rendered.alpha, depth=rendered.depth,
+            image=clip.image(k, box), mask=clip.mask(k, box), video=shot.video, frame=k, t=shot.t, box=box,
+            view=(clip.K, clip.pose(k)), scales=scene.dynamic.scales, footprint=scene.footprint, given_depth=depth,
+            given_features=features,
+            features=None if features is None else feature_image(scene, clip, k, shot.t, box, clocks),
+            tracks=tracks, means=None if tracks is None else scene.moving(shot.t, clocks).means,
+        )  # fmt: skip
 
     def motion_gradient(self, values: dict[str, Tensor], names: list[str]) -> Result:
         """Losses of the motion itself, at a time of its own."""
@@ -209,10 +237,6 @@ class Run:
     def snapshot(self) -> Snapshot:
         values = {n: v.detach().clone() for n, v in self.values().items()}
         return Snapshot(
-            self.step,
-            self.total or 0,
-            scene_arrays(assemble(self.scene, values)),
-            values,
-            self.adam.moments(),
-            self.rows,
-        )
+            self.step, self.total or 0, scene_arrays(assemble(self.scene, values)), values, self.adam.moments(), self.rows,
+            self.densified, self._pull, np.array(self._since).reshape(-1, 2),
+        )  # fmt: skip

@@ -130,6 +130,16 @@ def observer(
     return observe
 
 
+def feature_image(scene: Gaussians4D, clip: Clip, frame: int, t: Tensor, box: Box, clocks: Tensor | None) -> Tensor:
+    """The moving Gaussians' features [h,w,C] as a frame shows them, weighted by alpha; no effect touches them."""
+    assert scene.features is not None
+    moving = scene.moving(t, clocks)
+    w2c, K = clip.view(frame, box)
+    parts = (moving.means, moving.quats, moving.scales, moving.opacities, scene.features)
+    size = (box[2] - box[0], box[3] - box[1])
+    return render(*parts, w2c, K, *size, near_plane=0.01 * scene.near, depth=None).colors[0]
+
+
 def colours(gaussians: Gaussians, w2c: Tensor) -> Tensor:
     """Colours [N,3], or [1,N,3] where they depend on the view."""
     if gaussians.sh_degree == 0:

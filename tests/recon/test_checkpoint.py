@@ -13,6 +13,7 @@ def snapshot(step: int = 7) -> Snapshot:
     return Snapshot(
         step, 20, {"scene": np.arange(3, dtype=np.uint8)}, {"means": torch.randn(4, 3), "offsets": torch.zeros(2).double()},
         {"means.exp_avg": torch.randn(4, 3), "means.step": torch.tensor(7.0)}, np.random.default_rng(0).normal(size=(2, 6)),
+        1, torch.randn(2, 4), np.ones((3, 2)),
     )  # fmt: skip
 
 
@@ -22,7 +23,8 @@ def test_a_snapshot_comes_back_bit_by_bit(tmp_path):
     before = snapshot()
     keep.save(before)
     after = keep.load()
-    assert (after.step, after.steps) == (7, 20)
+    assert (after.step, after.steps, after.densified) == (7, 20, 1)
+    assert torch.equal(after.pull, before.pull) and np.array_equal(after.since, before.since)
     for part in ("groups", "moments"):
         for name, tensor in getattr(before, part).items():
             found = getattr(after, part)[name]
