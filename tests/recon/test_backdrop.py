@@ -123,6 +123,14 @@ def test_the_floor_is_found_however_the_world_is_turned(capture, with_points):
     assert plain.shell.radius == pytest.approx(3.2, rel=0.15)  # the room's wall is upright, the shell is round
 
 
+@pytest.mark.parametrize("tilt", [(0.03, 0, 0), (0, -0.03, 0)])
+def test_a_floor_tilts_to_where_cameras_agree(capture, tilt):
+    up = Rotation.from_rotvec(tilt).apply([0, 0, 1])
+    views = [View.of(s) for s in stills_of(capture.footage)]
+    floor = find_floor(views, up, np.array([0, 0, 0.7]), 2.7)
+    assert floor is not None and np.linalg.norm(floor.normal - [0, 0, 1]) < 0.02  # .03 at first
+
+
 def test_cameras_agree_about_true_surfaces_only(capture):
     views = [View.of(s) for s in stills_of(capture.footage)]
     grid = np.stack([*np.meshgrid(*[np.linspace(-1.2, 1.2, 30)] * 2), np.zeros((30, 30))], -1).reshape(-1, 3)

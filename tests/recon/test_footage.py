@@ -138,6 +138,15 @@ def test_the_background_is_what_was_behind():
     assert np.array_equal(f.background, wall) and f.background_seen.all()
 
 
+def test_two_glimpses_are_a_background_and_no_ghost():
+    """Something dark stands before a wall for six of eight frames: a plain median would show it."""
+    frames, masks = np.full((8, 48, 64, 3), 180, np.uint8), np.zeros((8, 48, 64), bool)
+    frames[:6, 20:30, 20:30], masks[:6, 20:30, 20:30] = 30, True
+    f = footage_of(video(list(frames)), list(masks), width=64)
+    assert (f.background == 180).all() and f.background_seen.all()
+    assert not footage_of(video(list(frames[:7])), list(masks[:7]), width=64).background_seen[22:28, 22:28].any()
+
+
 def test_background_that_was_never_seen_is_marked():
     wall, frames, masks = moving_square()
     for frame, mask in zip(frames, masks, strict=True):

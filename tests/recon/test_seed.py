@@ -87,6 +87,10 @@ def test_a_scaffold_per_video_carries_what_its_video_saw(capture):
     clock = motion.clock.numpy()[motion.binding.nodes.numpy()]
     assert (clock == clock[:, :1]).all()  # a Gaussian's nodes live on one clock
     assert len(set(clock[:, 0])) == 3 and np.bincount(clock[:, 0]).min() > 20
+    alone = planted(
+        capture, scaffold=ScaffoldOptions(per_video=True), depth=[lambda k: None, capture.depth[1], lambda k: None]
+    ).motion
+    assert set(alone.clock.numpy()[alone.binding.nodes.numpy()].ravel()) == {1}
     t = float(motion.binding.times[0])
     here = whole.tracks([t])[motion.binding.rest.numpy() == 0, 0]
     assert np.median(cKDTree(capture.world.positions([t])[:, 0]).query(here)[0]) < 0.05
