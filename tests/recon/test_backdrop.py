@@ -126,9 +126,9 @@ def test_the_floor_is_found_however_the_world_is_turned(capture, with_points):
 def test_cameras_agree_about_true_surfaces_only(capture):
     views = [View.of(s) for s in stills_of(capture.footage)]
     grid = np.stack([*np.meshgrid(*[np.linspace(-1.2, 1.2, 30)] * 2), np.zeros((30, 30))], -1).reshape(-1, 3)
-    true, wrong = disagreement(views, grid), disagreement(views, grid + [0, 0, 0.4])
+    true, wrong = disagreement(views, grid), disagreement(views, grid + np.array([0, 0, 0.4]))
     assert true < 0.4 and wrong > true + 0.2
-    assert disagreement(views, grid + [0, 0, 50]) == 1.0  # nobody sees that
+    assert disagreement(views, grid + np.array([0, 0, 50])) == 1.0  # nobody sees that
     assert disagreement(views[:1], grid) == 1.0
 
 
@@ -303,7 +303,7 @@ def test_videos_without_a_background_take_no_part(small):
     blind = replace(small.footage[1], masks=None, background=None, background_seen=None)
     found = fit_backdrop([small.footage[0], blind, small.footage[2]], depth=small.depth, steps=5, progress=False)
     assert np.isnan(found.psnr).tolist() == [False, True, False] and (found.gains[1] == 1).all()
-    with pytest.raises(ValueError, match="expected a video whose background shows.*Give masks"):
+    with pytest.raises(ValueError, match=r"expected a video whose background shows.*Give masks"):
         fit_backdrop([blind], progress=False)
 
 
@@ -350,7 +350,7 @@ def test_a_moving_camera_has_no_cached_background(small, fitted):
 def test_a_camera_without_masks_uses_what_never_changes(capture, fitted):
     held = capture.held_out[0]
     blind = replace(held, masks=None, background=None, background_seen=None)
-    median, same = unchanging(blind, threshold=30)
+    _median, same = unchanging(blind, threshold=30)
     assert not (same & (held.masks > 0).any(0) & ~held.background_seen).all() and 0.2 < same.mean() < 0.9
     own = colour_gain(backdrop_of(fitted, held), held.background, held.background_seen)
     drawn = with_backdrop(fitted, blind)
@@ -385,7 +385,7 @@ def test_the_studio_of_the_paper(data):
     train, held = [f for f in footage if f.masks is not None], [f for f in footage if f.masks is None]
     found = fit_backdrop(train, progress=False)
     assert found.psnr.mean() > 35
-    median, same = unchanging(held[0])
+    _median, same = unchanging(held[0])
     drawn = backdrop_of(found, held[0])
     assert psnr(drawn * colour_gain(drawn, median, same), median, same) > 30
     assert found.floor is not None and found.floor.normal @ [0, -1, 0] > 0.999 and abs(found.floor.height) < 0.06
