@@ -35,8 +35,10 @@ from recon.raster.cpu.threads import get_threads
 
 Row = dict[str, Any]
 MAPS: dict[str, FeatureMaps] = {"Lab": LabMaps(), "DAISY": DaisyMaps()}
-APART = 6.0
-"""Pixels at 640 of width between tracks; the 16 that synchronisation asks for leave some fifty in a clip of 1.6 s."""
+APART = (16.0, 12.0, 8.0, 6.0, 4.0)
+"""Pixels at 640 of width between tracks: the first that leaves :data:`COUNT`, so that they cover all that moves. The 16
+that synchronisation asks for leave some fifty in a clip of 1.6 s."""
+COUNT = 200
 BANDS = (0, 55, 95, 120, 181)
 STUDY_MS = (20.0, 16.0)
 """Forward and backward of 64 channels, 9.4k Gaussians, 320 x 180, one thread, as the prototype did it."""
@@ -110,18 +112,11 @@ def sources_of(
     video: Video, footage: Footage, flow: TrackSet, width: int, lifting: Lifting
 ) -> tuple[dict[str, TrackSet], Gaussians4D]:
     """Track sets of one video by name of source, thinned alike; and the scene that the Gaussians are from."""
-    from otsync.tracks import Selection
     from recon.depth import working_depth
 
     options = Alone(steps=lifting.steps)
     scene = fit_alone(footage, flow, working_depth(video, width=width), options=options)
     weights = seen_weights(scene, footage)
-
-    def thinned(tracks: TrackSet) -> TrackSet:
-        from otsync.geometry import seen_pixels
-
-        assert tracks.camera is not None
-        return tracks.take(Selection(apart=APART)(seen_pixels(tracks), tracks.camera.width, tracks.fps or 30.0))
 
     out = {}
     for name, maps in MAPS.items():
@@ -130,6 +125,22 @@ def sources_of(
         out[f"Gaussians, {name} averaged"] = averaged(lifted, footage, maps, options.every)
         out[f"Gaussians, {name} lifted"] = lifted
     return out, scene
+
+
+def thinned(tracks: TrackSet) -> TrackSet:
+    """At most :data:`COUNT` tracks, long-lived ones first, all over the image; which of equals is left to chance, since
+    Gaussians come in the order of their places."""
+    from otsync.geometry import seen_pixels
+    from otsync.tracks import Selection
+
+    assert tracks.camera is not None
+    mixed = tracks.take(np.random.default_rng(0).permutation(len(tracks)))
+    for apart in APART:
+        select = Selection(apart=apart, count=COUNT)
+        found = mixed.take(select(seen_pixels(mixed), tracks.camera.width, tracks.fps or 30.0))
+        if len(found) >= COUNT:
+            break
+    return found
 
 
 def averaged(tracks: TrackSet, footage: Footage, maps: FeatureMaps, every: float) -> TrackSet:
@@ -169,6 +180,20 @@ def matched(sources: Sequence[dict[str, TrackSet]], cameras: Sequence[Any]) -> l
     angle = np.array([view_angle(cameras[i], cameras[j], target) for i, j in pairs])
     count = np.histogram(angle, BANDS)[0]
     rows: list[Row] = [{"matching": "pairs", "tracks": "", "n": None} | _by_angle(count) | {"all": len(pairs)}]
+
+    def add(matching: str, source: str, scores: Sequence[tuple[float, int]]) -> None:
+        precision, n = np.array(scores, float).T
+        mean = binned_statistic(angle, precision, "mean", BANDS)[0]
+        by_angle = _by_angle([round(float(x), 3) if np.isfinite(x) else None for x in mean])
+        head = {"matching": matching, "tracks": source, "n": round(float(n.mean()), 1)}
+        rows.append(head | by_angle | {"all": round(float(precision.mean()), 3)})
+
+    for source in sources[0]:
+        add(
+            "tracks that have a partner at all",
+            source,
+            [within_reach(sources[i][source], sources[j][source]) for i, j in pairs],
+        )
     for matching, (matcher, most) in matchers.items():
         for source in sources[0]:
             scores = []
@@ -176,14 +201,18 @@ def matched(sources: Sequence[dict[str, TrackSet]], cameras: Sequence[Any]) -> l
                 a, b = sources[i][source], sources[j][source]
                 matches = matcher(a, b)
                 scores.append(precision_near(a, b, matches if most is None else matches.best(most)))
-            precision, n = np.array(scores, float).T
-            mean = binned_statistic(angle, precision, "mean", BANDS)[0]
-            rows.append(
-                {"matching": matching, "tracks": source, "n": round(float(n.mean()), 1)}
-                | _by_angle([round(float(x), 3) if np.isfinite(x) else None for x in mean])
-                | {"all": round(float(precision.mean()), 3)}
-            )
+            add(matching, source, scores)
     return rows
+
+
+def within_reach(a: TrackSet, b: TrackSet) -> tuple[float, int]:
+    """(share of a's tracks with any of b's near it at the true time, tracks): what no matching can exceed by much."""
+    xb, near = b.positions(), 0
+    for track in a.positions():
+        distance = np.linalg.norm(xb - track, axis=2)
+        together = np.isfinite(distance).sum(1) >= 5
+        near += bool((np.nanmedian(distance[together], axis=1) < NEAR).any())
+    return near / max(1, len(a)), len(a)
 
 
 def _by_angle(values: Sequence[Any]) -> Row:

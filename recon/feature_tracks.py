@@ -167,11 +167,9 @@ def seen_weights(scene: Gaussians4D, footage: Footage) -> Float[np.ndarray, "N T
 def lifted_frames(footage: Footage, every: float) -> list[int]:
     """Readable frames about ``every`` seconds apart, half of that from the clip's ends."""
     good = np.flatnonzero(~footage.bad)
-    times = footage.times[good]
-    wanted = np.arange(times[0] + every / 2, times[-1] + 1e-9, every)
-    if not len(wanted):
-        wanted = np.array([0.5 * (times[0] + times[-1])])
-    return sorted({int(good[np.argmin(np.abs(times - t))]) for t in wanted})
+    step = float(np.median(np.diff(footage.times))) if len(footage) > 1 else every
+    stride = max(1, round(every / step))
+    return good[min(stride, len(good)) // 2 :: stride].tolist()
 
 
 def before_black(footage: Footage) -> Footage:
