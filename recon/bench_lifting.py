@@ -179,7 +179,7 @@ def matched(sources: Sequence[dict[str, TrackSet]], cameras: Sequence[Any]) -> l
     pairs = list(itertools.combinations(range(len(sources)), 2))
     angle = np.array([view_angle(cameras[i], cameras[j], target) for i, j in pairs])
     count = np.histogram(angle, BANDS)[0]
-    rows: list[Row] = [{"matching": "pairs", "tracks": "", "n": None} | _by_angle(count) | {"all": len(pairs)}]
+    rows: list[Row] = [{"matching": "pairs", "tracks": "", "n": None} | _by_angle(count.tolist()) | {"all": len(pairs)}]
 
     def add(matching: str, source: str, scores: Sequence[tuple[float, int]]) -> None:
         precision, n = np.array(scores, float).T
@@ -216,10 +216,7 @@ def within_reach(a: TrackSet, b: TrackSet) -> tuple[float, int]:
 
 
 def _by_angle(values: Sequence[Any]) -> Row:
-    return {
-        f"<{high}": v if v is None else v.item() if hasattr(v, "item") else v
-        for high, v in zip(BANDS[1:], values, strict=True)
-    }
+    return {f"<{high}": value for high, value in zip(BANDS[1:], values, strict=True)}
 
 
 def lift_cost(scenes: Sequence[Gaussians4D], footage: Footage, lifting: Lifting) -> Row:

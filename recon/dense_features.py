@@ -6,6 +6,7 @@ Any callable of an image and its soft mask will do there, one that asks a networ
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -73,8 +74,9 @@ class DaisyMaps:
                 "opencv-contrib-python-headless, or use LabMaps."
             )
         radius = max(2.0, self.radius * mask.shape[1] / 640)
-        daisy = cv2.xfeatures2d.DAISY_create(
-            radius, self.rings, self.spokes, self.directions, cv2.xfeatures2d.DAISY_NRM_PARTIAL
+        contributed: Any = cv2.xfeatures2d
+        daisy = contributed.DAISY_create(
+            radius, self.rings, self.spokes, self.directions, contributed.DAISY_NRM_PARTIAL
         )
         out = np.zeros((*mask.shape, (self.rings * self.spokes + 1) * self.directions), np.float32)
         row, column = np.nonzero(mask)
