@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from otsync.files import read_npz, write_npz
+from recon.gaussians4d import UNSOUND, scene_from_arrays
 
 FORMAT, VERSION = "otsync.fit", 1
 
@@ -28,7 +29,7 @@ class Snapshot:
         step, steps: done, and in all.
         scene: arrays of the scene as it stood (constants of the motion too: densification changes them).
         groups, moments: the optimiser's parameters and averages.
-        history: one row per record, see :data:`recon.fit.HISTORY`.
+        history: one row per record, see :class:`recon.fit.History`.
     """
 
     step: int
@@ -85,7 +86,8 @@ class Checkpoint:
                 _tensors(parts["moments"]), arrays["history"],
             )  # fmt: skip
             key = about["key"]
-        except (KeyError, TypeError, ValueError, AttributeError, UnicodeDecodeError) as error:
+            scene_from_arrays(snapshot.scene)  # what a fit continues from: here its errors name the file
+        except (*UNSOUND, ValueError) as error:
             raise ValueError(
                 f"{self.path}: not a sound checkpoint; {type(error).__name__}: {error}. Delete it to begin anew."
             ) from None
