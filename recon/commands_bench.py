@@ -28,9 +28,13 @@ class Bench:
     rows: tuple[str, ...] = ("ours", "fixed", "true time")
     """Configurations: see recon/configurations.py."""
     out: Path = Path("bench/out")
-    """Folder for recon.csv and recon.json, written row by row, and the stages."""
+    """Folder for recon.csv, recon.json and recon.md, and the stages; rows that it holds already are kept."""
     cache: Path | None = None
     """Folder where stages are kept; default: stages in --out."""
+    name: str | None = None
+    """Of the recording in the tables; one of the paper's scenes stands beside its figures; default: its folder's."""
+    lpips_weights: Path | None = None
+    """torchvision's weights of AlexNet; without them the LPIPS column says so."""
     protocol: tyro.conf.OmitArgPrefixes[Protocol] = field(default_factory=Protocol)
     allow_outside: bool = False
     """Let the scene name files outside its folder."""
@@ -39,16 +43,21 @@ class Bench:
         from otsync.io import open_scene
         from otsync.types import Offsets
         from recon.bench import run
+        from recon.bench_rows import paper_tables
         from recon.capture import clocks
+        from recon.lpips import Lpips
 
         scene = open_scene(self.scene, allow_outside=self.allow_outside)
         if self.truth is None:
             truth = clocks(scene.names, np.zeros(len(scene.names)), scene.videos[0].fps or 30.0)
         else:
             truth = Offsets.load(self.truth)
-        run(
+        path, lpips = self.scene.resolve(), Lpips.load(self.lpips_weights)
+        name = self.name or (path if path.is_dir() else path.parent).name
+        found = run(
             scene, truth, self.out, protocol=self.protocol, rows=self.rows, cache=self.cache,
-            tell=lambda text: print(text, file=sys.stderr, flush=True),
+            tell=lambda text: print(text, file=sys.stderr, flush=True), name=name, lpips=lpips,
         )  # fmt: skip
-        print(f"wrote {self.out / 'recon.csv'} and {self.out / 'recon.json'}")
+        print(paper_tables(found, name, lpips.reason))
+        print(f"wrote {self.out / 'recon.csv'}, {self.out / 'recon.json'} and {self.out / 'recon.md'}")
         return 0
