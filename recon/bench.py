@@ -207,7 +207,8 @@ def positions_at(tracks: TrackSet, times: np.ndarray) -> np.ndarray:
     after = np.searchsorted(own, times).clip(1, len(own) - 1)
     gap = own[after] - own[after - 1]
     share = (times - own[after - 1]) / gap
-    inside = (share > -NEAR) & (share < 1 + NEAR) & (gap < 1.5 * np.median(np.diff(own)))
+    on_one = np.minimum(np.abs(share), np.abs(1 - share)) < NEAR
+    inside = on_one | (share > 0) & (share < 1) & (gap < 1.5 * np.median(np.diff(own)))
     before, behind, share = positions[:, after - 1], positions[:, after], share[None, :, None]
     # on a frame its neighbour does not matter, which may not have seen the point
     between = np.where(share < NEAR, before, np.where(share > 1 - NEAR, behind, before + share * (behind - before)))
