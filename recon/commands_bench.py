@@ -34,9 +34,13 @@ class Bench:
     rows: tuple[str, ...] = ("ours", "fixed", "true time")
     """Configurations: see recon/configurations.py."""
     out: Path = Path("bench/out")
-    """Folder for recon.csv and recon.json (lifting.csv and lifting.json), and the stages."""
+    """Folder for recon.csv, .json and .md (lifting.csv and .json), and the stages; rows that it holds already are kept."""
     cache: Path | None = None
     """Folder where stages are kept; default: stages in --out."""
+    name: str | None = None
+    """Of the recording in the tables; one of the paper's scenes stands beside its figures; default: its folder's."""
+    lpips_weights: Path | None = None
+    """torchvision's weights of AlexNet; without them the LPIPS column says so."""
     protocol: tyro.conf.OmitArgPrefixes[Protocol] = field(default_factory=Protocol)
     lifting: Lifting = field(default_factory=Lifting)
     allow_outside: bool = False
@@ -47,7 +51,9 @@ class Bench:
         from otsync.types import Offsets
         from recon import bench_lifting
         from recon.bench import run
+        from recon.bench_rows import paper_tables
         from recon.capture import clocks
+        from recon.lpips import Lpips
 
         scene = open_scene(self.scene, allow_outside=self.allow_outside)
         if self.truth is None:  # the first is the reference, which must not be held out
@@ -60,10 +66,16 @@ class Bench:
             bench_lifting.run(
                 scene, truth, self.out, protocol=self.protocol, lifting=self.lifting, cache=self.cache, tell=tell
             )
-        else:
-            run(scene, truth, self.out, protocol=self.protocol, rows=self.rows, cache=self.cache, tell=tell)
-        name = "lifting" if self.suite == "lifting" else "recon"
-        print(f"wrote {self.out / name}.csv and {self.out / name}.json")
+            print(f"wrote {self.out / 'lifting.csv'} and {self.out / 'lifting.json'}")
+            return 0
+        path, lpips = self.scene.resolve(), Lpips.load(self.lpips_weights)
+        name = self.name or (path if path.is_dir() else path.parent).name
+        found = run(
+            scene, truth, self.out, protocol=self.protocol, rows=self.rows, cache=self.cache, tell=tell, name=name,
+            lpips=lpips,
+        )  # fmt: skip
+        print(paper_tables(found, name, lpips.reason))
+        print(f"wrote {self.out / 'recon.csv'}, {self.out / 'recon.json'} and {self.out / 'recon.md'}")
         return 0
 
 
