@@ -8,7 +8,7 @@ hid. Their means are those of that moment, so each moment is a rest of the scaff
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,15 +17,13 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from otsync.types import Offsets
+from recon.depth import Depths, depth_at
 from recon.footage import Footage
 from recon.gaussians import Gaussians
 from recon.gaussians4d import Gaussians4D
 from recon.motion import Scaffold
 
 logger = logging.getLogger("recon.seed")
-
-DepthAt = Callable[[int], Float[np.ndarray, "h w"] | None]
-"""Frame -> z in world units of its working pixels, 0 where unknown; None where the frame has no map."""
 
 INSIDE = 230
 """Masks of 0..255 from which on a pixel shows nothing but what moves: edges mix in the background's colour and depth."""
@@ -88,7 +86,7 @@ def shown_at(footage: Sequence[Footage], offsets: Offsets, t: float, frame_step:
 
 
 def cloud_at(
-    footage: Sequence[Footage], depth: Sequence[DepthAt], offsets: Offsets, t: float, frame_step: float,
+    footage: Sequence[Footage], depth: Sequence[Depths | None], offsets: Offsets, t: float, frame_step: float,
     gains: Float[np.ndarray, "V 3"] | None = None,
 ) -> tuple[Float[np.ndarray, "P 3"], Float[np.ndarray, "P 3"]]:  # fmt: skip
     """Positions and colours of all pixels of what moves, over all videos, in the frames of :func:`shown_at`.
@@ -96,11 +94,21 @@ def cloud_at(
     Colours are divided by the videos' gains.
     """
     points, colors = [np.zeros((0, 3))], [np.zeros((0, 3))]
+<<<<<<< HEAD
     for v, (f, k) in enumerate(zip(footage, shown_at(footage, offsets, t, frame_step), strict=True)):
         z = None if k is None else depth[v](k)
         if k is None or z is None:
+=======
+    for v, f in enumerate(footage):
+        at = offsets.names.index(f.name)
+        k = f.nearest((t - offsets.seconds[at]) / offsets.rates[at])
+        if k is None or abs(offsets.rates[at] * f.times[k] + offsets.seconds[at] - t) > frame_step:
             continue
-        known = np.isfinite(z) & (z > 0)
+        z = depth_at(depth[v], f, k)
+        if z is None:
+>>>>>>> r-scene
+            continue
+        known = z > 0
         if f.masks is not None:
             known &= f.masks[k] > INSIDE
         row, column = np.nonzero(known)
@@ -133,7 +141,7 @@ def seed(
     motion: Scaffold,
     footage: Sequence[Footage],
     offsets: Offsets,
-    depth: Sequence[DepthAt],
+    depth: Sequence[Depths | None],
     *,
     footprint: float,
     frame_step: float,
@@ -149,25 +157,36 @@ def seed(
         footprint: world units of a working pixel. span: (first, last) world seconds. times: see :func:`moments`.
         gains: factors of the videos' colours.
 
-    Raises ValueError when no depth falls on anything that moves.
+    In a scaffold per video (whose clocks are numbered as ``footage``) each video seeds what it sees into its own nodes,
+    and only where those before it have seeded nothing.
+
+    Raises ValueError when no depth falls on anything that moves, and for a video without any.
     """
     options = options or Seeding()
     times = moments(span, frame_step) if times is None else times
     voxel = options.voxel * footprint
     means, colors = torch.zeros(0, 3), np.zeros((0, 3))
+    everyone = range(len(footage))
+    own = set() if motion.clock is None else set(motion.clock.tolist())
+    groups = [list(everyone)] if motion.clock is None else [[v] for v in everyone if v in own]
     for t in times:
-        points, shades = cloud_at(footage, depth, offsets, float(t), frame_step, gains)
-        points, shades = thinned(points, shades, voxel, options.support)
-        if len(means) and len(points):
-            here = motion.warp(means, _upright(len(means)), float(t))[0].detach().numpy()
-            new = cKDTree(here).query(points)[0] > options.reach * voxel
-            points, shades = points[new], shades[new]
-        if not len(points):
-            continue
-        motion = motion.bind(points, float(t))
-        means = torch.cat([means, torch.as_tensor(points, dtype=torch.float32)])
-        colors = np.concatenate([colors, shades])
-        logger.info("seeds at %.3f s: %d, %d in all", t, len(points), len(means))
+        for group in groups:
+            points, shades = thinned(
+                *cloud_at(
+                    [footage[v] for v in group], [depth[v] for v in group], offsets, float(t), frame_step,
+                    None if gains is None else gains[group],
+                ), voxel, options.support,
+            )  # fmt: skip
+            if len(means) and len(points):
+                here = motion.warp(means, _upright(len(means)), float(t))[0].detach().numpy()
+                new = cKDTree(here).query(points)[0] > options.reach * voxel
+                points, shades = points[new], shades[new]
+            if not len(points):
+                continue
+            motion = motion.bind(points, float(t), video=None if motion.clock is None else group[0])
+            means = torch.cat([means, torch.as_tensor(points, dtype=torch.float32)])
+            colors = np.concatenate([colors, shades])
+        logger.info("seeds until %.3f s: %d", t, len(means))
     if not len(means):
         raise ValueError(
             "depth: expected depth where something moves, at one moment at least; found none. Check masks and depth maps."

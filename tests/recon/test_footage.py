@@ -214,7 +214,7 @@ def test_bad_frames_are_left_out_and_named(caplog):
 
 
 def test_no_usable_frame_is_an_error():
-    with pytest.raises(ValueError, match=r"'left': expected frames that can be read.*300 x 300|found none.*64 x 48"):
+    with pytest.raises(ValueError, match=r"'left': expected frames that can be read.*found none.*64 x 48"):
         footage_of(video(clip(width=30)))
     with pytest.raises(ValueError, match=r"floats in 0\.\.1"):
         footage_of(video([f.astype(float) for f in clip()]))

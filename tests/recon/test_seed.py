@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import torch
 from scipy.spatial import cKDTree
 
 from recon.capture import clocks
-from recon.motion import build_scaffold
+from recon.motion import ScaffoldOptions, build_scaffold
 from recon.seed import Seeding, cloud_at, moments, seed, thinned
 from recon.simulate import synthetic
 
@@ -27,7 +30,9 @@ def maps(capture):
 
 def planted(capture, **options):
     footprint = 2.6 / capture.footage[0].K[0, 0]
-    scaffold = build_scaffold(capture.tracks, capture.offsets, footprint=footprint, frame_step=1 / 30)
+    scaffold = build_scaffold(
+        capture.tracks, capture.offsets, footprint=footprint, frame_step=1 / 30, options=options.pop("scaffold", None)
+    )
     return seed(
         scaffold, capture.footage, known(capture), options.pop("depth", maps(capture)), footprint=footprint,
         frame_step=1 / 30, span=(0.0, 11 / 30), **options,
@@ -74,6 +79,45 @@ def test_later_moments_add_only_what_is_new(capture):
     for r, t in enumerate(times):
         here = whole.tracks([t])[whole.motion.binding.rest.numpy() == r, 0]
         assert np.median(cKDTree(capture.world.positions([t])[:, 0]).query(here)[0]) < 0.05
+
+
+def test_a_scaffold_per_video_carries_what_its_video_saw(capture):
+    whole = planted(capture, scaffold=ScaffoldOptions(per_video=True))
+    motion = whole.motion
+    clock = motion.clock.numpy()[motion.binding.nodes.numpy()]
+    assert (clock == clock[:, :1]).all()  # a Gaussian's nodes live on one clock
+    assert len(set(clock[:, 0])) == 3 and np.bincount(clock[:, 0]).min() > 20
+    t = float(motion.binding.times[0])
+    here = whole.tracks([t])[motion.binding.rest.numpy() == 0, 0]
+    assert np.median(cKDTree(capture.world.positions([t])[:, 0]).query(here)[0]) < 0.05
+
+
+def test_depth_may_be_arrays_of_any_size(capture):
+    arrays = planted(capture, depth=list(capture.depth))
+    assert torch.equal(arrays.dynamic.means, planted(capture).dynamic.means)
+    double = [np.repeat(np.repeat(z, 2, 1), 2, 2) for z in capture.depth]
+    assert torch.equal(arrays.dynamic.means, planted(capture, depth=double).dynamic.means)
+
+
+def test_a_video_without_depth_is_named(capture):
+    with pytest.raises(ValueError, match="depth of 'cam1': expected depth maps"):
+        planted(capture, depth=[capture.depth[0], None, capture.depth[2]])
+
+
+def test_one_camera_plants_what_it_sees(capture):
+    footprint = 2.6 / capture.footage[0].K[0, 0]
+    scaffold = build_scaffold(capture.tracks[:1], capture.offsets[:1], footprint=footprint, frame_step=1 / 30)
+    one = seed(
+        scaffold, capture.footage[:1], known(capture), list(capture.depth[:1]), footprint=footprint,
+        frame_step=1 / 30, span=(0.0, 11 / 30),
+    )  # fmt: skip
+    assert 50 < len(one) < len(planted(capture))
+
+
+def test_nothing_that_moves_is_a_clear_error(capture):
+    still = [replace(f, masks=np.zeros_like(f.masks)) for f in capture.footage]
+    with pytest.raises(ValueError, match="expected depth where something moves"):
+        planted(replace(capture, footage=tuple(still)))
 
 
 def test_a_finer_voxel_plants_more(capture):
