@@ -94,19 +94,9 @@ def cloud_at(
     Colours are divided by the videos' gains.
     """
     points, colors = [np.zeros((0, 3))], [np.zeros((0, 3))]
-<<<<<<< HEAD
     for v, (f, k) in enumerate(zip(footage, shown_at(footage, offsets, t, frame_step), strict=True)):
-        z = None if k is None else depth[v](k)
+        z = None if k is None else depth_at(depth[v], f, k)
         if k is None or z is None:
-=======
-    for v, f in enumerate(footage):
-        at = offsets.names.index(f.name)
-        k = f.nearest((t - offsets.seconds[at]) / offsets.rates[at])
-        if k is None or abs(offsets.rates[at] * f.times[k] + offsets.seconds[at] - t) > frame_step:
-            continue
-        z = depth_at(depth[v], f, k)
-        if z is None:
->>>>>>> r-scene
             continue
         known = z > 0
         if f.masks is not None:

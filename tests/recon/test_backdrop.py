@@ -350,11 +350,7 @@ def test_a_moving_camera_has_no_cached_background(small, fitted):
 def test_a_camera_without_masks_uses_what_never_changes(capture, fitted):
     held = capture.held_out[0]
     blind = replace(held, masks=None, background=None, background_seen=None)
-<<<<<<< HEAD
-    _median, same = unchanging(blind, threshold=30)
-=======
     _, same = unchanging(blind, threshold=30)
->>>>>>> r-scene
     assert not (same & (held.masks > 0).any(0) & ~held.background_seen).all() and 0.2 < same.mean() < 0.9
     own = colour_gain(backdrop_of(fitted, held), held.background, held.background_seen)
     drawn = with_backdrop(fitted, blind)
