@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from otsync.types import Camera, Offsets, Status, TrackSet
+from recon.depth import Depths
 from recon.features import FeatureFrame, as_tracks, lift_features
 from recon.fit import LOSSES, fit
 from recon.footage import Footage
@@ -23,7 +24,7 @@ from recon.gaussians4d import Gaussians4D
 from recon.motion import ScaffoldOptions, build_scaffold
 from recon.optimize import RATES, without
 from recon.problem import Loss
-from recon.seed import DepthAt, Seeding, moments
+from recon.seed import Seeding, moments
 from recon.seed import seed as seeded
 
 FeatureMaps = Callable[[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]], Float[np.ndarray, "h w C"]]
@@ -61,7 +62,7 @@ class Alone:
 def feature_tracks(
     footage: Footage,
     tracks: TrackSet,
-    depth: DepthAt,
+    depth: Depths,
     feature_maps: FeatureMaps,
     *,
     steps: int | None = None,
@@ -86,7 +87,7 @@ def feature_tracks(
 
 
 def fit_alone(
-    footage: Footage, tracks: TrackSet, depth: DepthAt, *, options: Alone | None = None, seed: int = 0
+    footage: Footage, tracks: TrackSet, depth: Depths, *, options: Alone | None = None, seed: int = 0
 ) -> Gaussians4D:
     """A 4D scene of what moves in one video, on that video's own clock; for arguments see :func:`feature_tracks`.
 
