@@ -62,7 +62,7 @@ class Run:
         from .report.frames import write_recording_report
 
         options = FitOptions(
-            held_out=self.held_out, width=self.width, budget=self.budget, steps=self.steps, seed=self.seed,
+            held_out=self.held_out, width=self.width, frames=self.frames, budget=self.budget, steps=self.steps, seed=self.seed,
             cache=self.recording.cache, workers=self.recording.workers,
         )  # fmt: skip
         options.length()  # before the work, not after it
@@ -74,11 +74,10 @@ class Run:
         scene.take(self.held_out)  # names that are not there
         cache, progress = Cache(self.recording.cache or self.out / "stages"), Progress(tell)
         with ThreadPoolExecutor(self.recording.workers or os.cpu_count() or 1) as pool:
-            if self.frames is not None:
-                scene = cut(scene, *self.frames)
-            with progress.stage("reading"):
-                scene = readable(scene, cache, pool.map, progress)
-            train = scene.take([n for n in scene.names if n not in self.held_out])
+            part = scene if self.frames is None else cut(scene, *self.frames)
+            with progress.stage("reading"):  # the reconstruction cuts and reads again, from what is kept, and notes it
+                part = readable(part, cache, pool.map, Progress(tell))
+            train = part.take([n for n in part.names if n not in self.held_out])
             if self.reference is not None and self.reference not in train.names:
                 raise ValueError(f"--reference: expected one of {', '.join(train.names)}; found {self.reference!r}.")
             reference = 0 if self.reference is None else train.names.index(self.reference)
@@ -95,6 +94,6 @@ class Run:
                 print(f"{name}: {flag.code}: {flag}", file=sys.stderr)
         try:
             return reconstructed(scene, found.offsets, self.out, options, truth=self.truth, progress=progress)
-        except Diverged as error:
+        except (Diverged, FloatingPointError) as error:
             print(f"otsync: {error}", file=sys.stderr)
             return 1

@@ -28,7 +28,7 @@ def depth_maps(
 ) -> list[Float[np.ndarray, "F h w"]]:
     """Depth along z of the moving foreground, in world units, 0 unknown; float32, one stack of maps per video.
 
-    Videos that came with depth maps keep theirs, reduced to ``width``; the others are measured by visual hull and
+    Videos that came with depth maps keep theirs, reduced to ``width`` (0 where a frame has None); the others are measured by visual hull and
     stereo over the videos that ``offsets`` puts on the reference's clock. A map has its image's field of view, lens
     distortion included. Videos whose clock is unknown, and moments that too few videos saw, have empty maps.
 
@@ -51,7 +51,7 @@ def depth_maps(
     for video, mask, chosen in zip(scene.videos, masks, frames_by_video, strict=True):
         frames = WorkingFrames(video.frames, (video.camera.width, video.camera.height), stages.tracking.width)
         w, h = dense.size(frames)
-        given = [] if video.depth is None else [reduced(np.asarray(video.depth[k]), mask[k], w, h) for k in chosen]
+        given = [] if video.depth is None else [reduced(video.depth[k], mask[k], w, h) for k in chosen]
         out.append(np.stack(given) if given else np.zeros((len(chosen), h, w), np.float32))
     rig_of = [v for v in _on_clock(offsets) if _is_static(scene.videos[v])]
     wanted = [v for v in rig_of if scene.videos[v].depth is None and len(frames_by_video[v])]
@@ -66,9 +66,15 @@ def depth_maps(
 
 
 def reduced(
-    depth: Float[np.ndarray, "H W"], mask: np.ndarray, width: int, height: int
+    depth: Float[np.ndarray, "H W"] | None, mask: np.ndarray, width: int, height: int
 ) -> Float[np.ndarray, "height width"]:
-    """A given map at another size: the nearest value (a mean across an edge lies on no surface), 0 beside the mask."""
+    """A given map at another size: the nearest value (a mean across an edge lies on no surface), 0 beside the mask.
+
+    None, where a frame has no map, becomes one that knows nothing.
+    """
+    if depth is None:
+        return np.zeros((height, width), np.float32)
+    depth = np.asarray(depth)
     inside, uv = mask_pixels(mask, width, height)
     shrink = np.array(depth.shape[::-1]) / np.array(mask.shape[::-1])
     x, y = (uv * shrink).astype(int).T

@@ -58,12 +58,12 @@ class Lift:
 
 
 def depth_at(
-    maps: Sequence[np.ndarray], tracks: TrackSet, raw_uv: Float[np.ndarray, "N T 2"], edge: float = 0.05
+    maps: Sequence[np.ndarray | None], tracks: TrackSet, raw_uv: Float[np.ndarray, "N T 2"], edge: float = 0.05
 ) -> Float[np.ndarray, "N T"]:
     """Depth of every track sample from given maps: the median of the 3x3 pixels around it, 0 at edges and holes.
 
     Args:
-        maps: per frame (H,W), 0 unknown; of any resolution with the camera's field of view.
+        maps: per frame (H,W), 0 unknown, of any resolution with the camera's field of view; None where there is none.
         raw_uv: pixels of the images as they are, with distortion: where the maps are read.
         edge: largest relative range of the nine values; beyond it the point sits on an outline.
     """
@@ -72,9 +72,10 @@ def depth_at(
     around = np.array([(x, y) for y in (-1, 0, 1) for x in (-1, 0, 1)])
     for k in range(tracks.n_frames):
         at = np.flatnonzero(tracks.seen[:, k])
-        if len(at) == 0:
+        given = maps[k] if len(at) else None
+        if given is None:
             continue
-        depth = np.asarray(maps[k])
+        depth = np.asarray(given)
         shrink = np.array([depth.shape[1] / tracks.camera.width, depth.shape[0] / tracks.camera.height])
         pixel = np.floor(raw_uv[at, k] * shrink).astype(int)[:, None] + around
         pixel = np.clip(pixel, 0, [depth.shape[1] - 1, depth.shape[0] - 1])

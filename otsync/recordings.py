@@ -335,7 +335,7 @@ def _too_doubtful(first: Offsets, stages: Stages) -> str:
 
 def _digest(frames: Any) -> str:
     digest = getattr(frames, "digest", None)
-    return digest() if digest is not None else digest_of(*[np.asarray(f) for f in frames])
+    return digest() if digest is not None else digest_of(*[None if f is None else np.asarray(f) for f in frames])
 
 
 class Stopwatch:

@@ -20,17 +20,23 @@ from typing import Any
 import numpy as np
 
 from otsync.bench.record import table, write_rows
+from otsync.files import atomic_write
 from otsync.io import Scene
 from otsync.types import Offsets, TrackSet
+from recon.bench_rows import find, measured_before, paper_tables
 from recon.configurations import CONFIGURATIONS, Configuration
 from recon.effects import Gain
 from recon.evaluate import acceleration, coherence, following_error, offset_error
 from recon.fit import fit
 from recon.gaussians4d import Gaussians4D
 from recon.held_out import Clock, view
+from recon.lpips import Lpips
 from recon.prepare import Plan, Prepared, Progress, prepare
 
 Row = dict[str, Any]
+FIGURES = 2
+"""Version of what the figures mean: rows of another one are not continued. 2: tracks at their videos' own times."""
+
 REACH = 5.0  # footprints within which a held-out track must have a Gaussian, to be followed
 PUBLISHED = (
     "published, 30 cameras, offsets 0-30: .260 frame after refinement; PSNR 26.28 with true time, 25.23 unsynchronised "
@@ -127,7 +133,7 @@ def material_of(
 
 def measure(
     name: str, configuration: Configuration, material: Material, protocol: Protocol, amplitude: float, seed: int,
-    cache: Any, map: Callable[..., Any],
+    cache: Any, map: Callable[..., Any], lpips: Lpips | None = None,
 ) -> Row:  # fmt: skip
     """One row: build from the believed offsets, fit, and hold against the truth."""
     believed = material.believed(amplitude, seed)
@@ -155,35 +161,35 @@ def measure(
     row: Row = {
         "configuration": name, "amplitude": amplitude, "seed": seed, "start": start.mean, "mean": error.mean,
         "max": error.max, "gauge_free": free.mean, "sigma": float(np.nanmedian(found.offsets.sigma) / step),
-        **held_out_figures(found.scene, ready, protocol), **motion_figures(found.scene, ready, material),
+        **held_out_figures(found.scene, ready, lpips), **motion_figures(found.scene, ready, material.kept),
         "images": found.stats["images"], "seconds": seconds, "cpu_seconds": cpu, "gaussians": len(found.scene),
     }  # fmt: skip
     return {k: _rounded(v) for k, v in row.items()}
 
 
-def held_out_figures(scene: Gaussians4D, ready: Prepared, protocol: Protocol) -> Row:
-    """PSNR and SSIM of cameras that no fit has seen, at their true time: whole images, and where things move."""
-    scores = [
-        view(scene, f, ready.clocks.get(f.name, Clock(0.0))).score(most=16, pictures=0).mean for f in ready.held_out
-    ]
-    keys = ("psnr", "ssim", "mask_psnr", "mask_ssim")
+def held_out_figures(scene: Gaussians4D, ready: Prepared, lpips: Lpips | None = None) -> Row:
+    """PSNR, SSIM, LPIPS of cameras that no fit has seen, at their true time: whole images, and where things move."""
+    scores = []
+    for f in ready.held_out:
+        looking = view(scene, f, ready.clocks.get(f.name, Clock(0.0)), layered=ready.layered)
+        scores.append(looking.score(most=16, pictures=0, lpips=lpips).mean)
+    keys = ("psnr", "ssim", "lpips", "mask_psnr", "mask_ssim")
     return {k: float(np.mean([s.get(k, math.nan) for s in scores])) if scores else math.nan for k in keys}
 
 
-def motion_figures(scene: Gaussians4D, ready: Prepared, material: Material) -> Row:
-    """Coherence, following error and acceleration, in footprints: what a scaffold is for."""
+def motion_figures(scene: Gaussians4D, ready: Prepared, kept: Sequence[TrackSet]) -> Row:
+    """Coherence, following error and acceleration, in footprints: what a scaffold is for.
+
+    kept: tracks that no scaffold was built from, on the clocks of ``ready.offsets``.
+    """
     seen = scene.dynamic.opacities.detach() > 0.1
     times = np.arange(math.ceil(scene.span[0] / scene.frame_step), scene.span[1] / scene.frame_step) * scene.frame_step
     tracks = scene.tracks(times)[seen.numpy()]
     unit = scene.footprint
     errors = []
-    for t in material.kept:
+    for t in kept:
         at = ready.offsets.names.index(t.name)
-        frame = np.rint((times - ready.offsets.seconds[at]) / scene.frame_step).astype(int)
-        inside = (frame >= 0) & (frame < t.positions().shape[1])
-        held = np.full((len(t), len(times), 3), np.nan)
-        held[:, inside] = t.positions()[:, frame[inside]]
-        errors.append(held)
+        errors.append(positions_at(t, (times - ready.offsets.seconds[at]) / ready.offsets.rates[at]))
     follow = following_error(np.concatenate(errors), tracks, REACH * unit, horizons=(20,)) if errors else {}
     return {
         "neighbour_change": coherence(tracks) / unit,
@@ -192,35 +198,77 @@ def motion_figures(scene: Gaussians4D, ready: Prepared, material: Material) -> R
     }
 
 
+def positions_at(tracks: TrackSet, times: np.ndarray) -> np.ndarray:
+    """(N,T,3) at seconds of the video's own clock: between two neighbouring frames on the line; nan where not seen."""
+    own, held = tracks.times, np.full((len(tracks), len(times), 3), np.nan)
+    if len(own) < 2:
+        return held
+    positions = tracks.positions()
+    after = np.searchsorted(own, times).clip(1, len(own) - 1)
+    gap = own[after] - own[after - 1]
+    share = (times - own[after - 1]) / gap
+    on_one = np.minimum(np.abs(share), np.abs(1 - share)) < NEAR
+    inside = on_one | (share > 0) & (share < 1) & (gap < 1.5 * np.median(np.diff(own)))
+    before, behind, share = positions[:, after - 1], positions[:, after], share[None, :, None]
+    # on a frame its neighbour does not matter, which may not have seen the point
+    between = np.where(share < NEAR, before, np.where(share > 1 - NEAR, behind, before + share * (behind - before)))
+    held[:, inside] = between[:, inside]
+    return held
+
+
+NEAR = 1e-4
+"""Share of a frame below which a time is the frame's."""
+
+
 def run(
     scene: Scene, truth: Offsets, out: Path, *, protocol: Protocol, rows: Sequence[str] = ("ours", "fixed", "true time"),
-    cache: Path | None = None, tell: Callable[[str], None] = print,
+    cache: Path | None = None, tell: Callable[[str], None] = print, name: str = "recording", lpips: Lpips | None = None,
 ) -> list[Row]:  # fmt: skip
-    """Measure the named configurations; print, and write ``recon.csv`` and ``recon.json`` to ``out`` row by row."""
+    """Measure the named configurations; write ``recon.csv`` and ``recon.json`` to ``out`` row by row.
+
+    Rows that an earlier run into ``out`` has measured by the same protocol are kept. At the end ``recon.md`` holds all
+    in the paper's layout. Returns all rows of the file.
+
+    Args:
+        name: of the recording in the tables; one of the paper's scenes stands beside its figures.
+        lpips: the metric; default: none, and the tables say why.
+    """
     from otsync.priors.cache import Cache
 
     unknown = [r for r in rows if r not in CONFIGURATIONS]
     if unknown:
         raise ValueError(f"rows: expected some of {', '.join(CONFIGURATIONS)}; found {', '.join(unknown)}.")
-    kept, progress = Cache(cache or out / "stages"), Progress(tell)
-    found: list[Row] = []
-    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-        material = material_of(scene, truth, protocol, kept, pool.map, progress)
-        for amplitude in protocol.amplitudes:
-            for seed in protocol.seeds:
-                for name in rows:
-                    found.append(
-                        measure(name, CONFIGURATIONS[name], material, protocol, amplitude, seed, kept, pool.map)
-                    )
-                    tell(table([found[-1]]))
-                    write_rows(out, "recon", found, about(protocol))
+    kept, progress, lpips = Cache(cache or out / "stages"), Progress(tell), lpips or Lpips()
+    description = about(protocol, scene, truth)
+    found = measured_before(out, description)
+    wanted = [
+        (row, amplitude, seed) for amplitude in protocol.amplitudes for seed in protocol.seeds for row in rows
+        if find(found, row, amplitude, seed, lpips.network is not None) is None
+    ]  # fmt: skip
+    if found:
+        tell(f"{len(found)} rows are kept from an earlier run; {len(wanted)} are to be measured")
+    if wanted:
+        with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+            material = material_of(scene, truth, protocol, kept, pool.map, progress)
+            for which in wanted:
+                row = measure(which[0], CONFIGURATIONS[which[0]], material, protocol, *which[1:], kept, pool.map, lpips)
+                found = [r for r in found if (r["configuration"], r["amplitude"], r["seed"]) != which] + [row]
+                tell(table([row]))
+                write_rows(out, "recon", found, description)
+    with atomic_write(out / "recon.md", "w") as stream:
+        stream.write(paper_tables(found, name, lpips.reason, "markdown") + "\n")
     tell(f"{table(found)}\n{PUBLISHED}")
     return found
 
 
-def about(protocol: Protocol) -> Mapping[str, Any]:
-    """What the figures were made with."""
-    return {"protocol": vars(protocol), "published": PUBLISHED, "unit": "frames, dB, footprints"}
+def about(protocol: Protocol, scene: Scene, truth: Offsets) -> Mapping[str, Any]:
+    """What the figures were made with; rows are continued where all of it agrees."""
+    clips = [[v.name, len(v.frames), v.camera.width, v.camera.height] for v in scene.videos]
+    true = {n: round(float(s), 6) for n, s in zip(truth.names, truth.seconds, strict=True)}
+    return {
+        "protocol": vars(protocol), "figures": FIGURES, "recording": {"videos": clips, "truth": true},
+        "published": PUBLISHED, "unit": "frames, dB, footprints",
+    }  # fmt: skip
 
 
 def _rounded(value: Any) -> Any:

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from otsync.files import read_npz, write_npz
+from recon.gaussians4d import UNSOUND, scene_from_arrays
 
 FORMAT, VERSION = "otsync.fit", 1
 
@@ -92,7 +93,8 @@ class Checkpoint:
                 torch.from_numpy(np.array(arrays["pull"])), arrays["since"],
             )  # fmt: skip
             key = about["key"]
-        except (KeyError, TypeError, ValueError, AttributeError, UnicodeDecodeError) as error:
+            scene_from_arrays(snapshot.scene)  # what a fit continues from: here its errors name the file
+        except (*UNSOUND, ValueError) as error:
             raise ValueError(
                 f"{self.path}: not a sound checkpoint; {type(error).__name__}: {error}. Delete it to begin anew."
             ) from None

@@ -6,6 +6,7 @@ interrupted: the same command continues where it stopped.
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 from collections.abc import Callable, Iterable, Iterator
@@ -76,7 +77,14 @@ class FitOptions:
         """Steps or budget, as :func:`recon.fit.fit` takes them."""
         if self.steps is not None and self.budget is not None:
             raise ValueError("--steps, --budget: expected one of them; found both.")
-        return {"steps": self.steps} if self.steps is not None else {"budget": self.budget or 300.0}
+        if self.steps is not None:
+            if self.steps < 0:
+                raise ValueError(f"--steps: expected 0 or more; found {self.steps}.")
+            return {"steps": self.steps}
+        budget = 300.0 if self.budget is None else self.budget
+        if not 0 < budget < math.inf:
+            raise ValueError(f"--budget: expected seconds above 0; found {budget:g}.")
+        return {"budget": budget}
 
 
 @dataclass
@@ -144,7 +152,7 @@ class Render:
     """A video (.mp4, .mov, .mkv), or a folder for PNG frames."""
 
     def run(self) -> int:
-        from recon.export import check_times, frame_times
+        from recon.export import MAX_FRAMES, check_times, frame_times
         from recon.result import load_result
         from recon.showing import rendered, stretched
         from recon.video import check_target, write_images
@@ -153,9 +161,13 @@ class Render:
             raise ValueError("--camera, --path: expected one of them: the name of a video, or orbit.")
         if self.frames is not None and (self.path is None or len(self.times) > 1):
             raise ValueError("--frames: expected with --path, and with at most one moment in --times.")
+        if self.frames is not None and not 1 <= self.frames <= MAX_FRAMES:
+            raise ValueError(f"--frames: expected 1 to {MAX_FRAMES}; found {self.frames}.")
+        if self.fps is not None and not 0 < self.fps <= 1000:
+            raise ValueError(f"--fps: expected frames per second above 0, at most 1000; found {self.fps:g}.")
         check_target(self.out)
         result = load_result(self.result)
-        fps = self.fps or 1.0 / result.scene.frame_step
+        fps = 1.0 / result.scene.frame_step if self.fps is None else self.fps
         times = list(self.times) or frame_times(result.scene, fps).tolist()
         if self.frames is not None:
             times = times * self.frames if len(self.times) == 1 else stretched(result.scene.span, self.frames)
@@ -202,6 +214,8 @@ class Eval:
         from recon.prepare import Progress
         from recon.result import load_result, metrics_of
 
+        if self.views < 1:
+            raise ValueError(f"--views: expected at least 1; found {self.views}.")
         result = load_result(self.result)
         scene = opened(self.scene, self.allow_outside)
         given = None if self.offsets is None else Offsets.load(self.offsets)
@@ -411,9 +425,12 @@ def main(args: list[str] | None = None) -> int:
     )  # fmt: skip
     try:
         return command.run()
-    except Diverged as error:
+    except (Diverged, FloatingPointError) as error:
         print(f"recon: {error}", file=sys.stderr)
         return 1
+    except ModuleNotFoundError as error:
+        print(f"recon: needs {error.name}. Install it: pip install 'otsync[recon,video]'.", file=sys.stderr)
+        return 2
     except (ValueError, OSError) as error:
         print(f"recon: {error}", file=sys.stderr)
         return 2

@@ -9,6 +9,8 @@ from torch import Tensor
 
 from recon.gaussians import Gaussians
 from recon.gaussians4d import Gaussians4D
+from recon.motion import Scaffold
+from recon.motion.density import grow, prune
 
 SPLIT_SHRINK = 1.6
 
@@ -21,11 +23,14 @@ class Densify:
         at: moments, as shares of all steps.
         share: of the Gaussians, that are split (larger than the median) or cloned (smaller).
         min_opacity: fainter ones are dropped.
+        nodes: most nodes that a scaffold gains each time, where its Gaussians are pulled hardest; nodes that carry
+            nothing go. 0: the scaffold keeps its nodes.
     """
 
     at: tuple[float, ...] = (0.3, 0.5)
     share: float = 0.1
     min_opacity: float = 0.05
+    nodes: int = 0
 
     def __post_init__(self) -> None:
         if not all(0 < a < 1 for a in self.at):
@@ -64,6 +69,18 @@ class Densify:
         features = None if scene.features is None else scene.features[old]
         motion = scene.motion.take(old.numpy())
         return replace(scene, dynamic=halves, motion=motion, features=features), old, new | split[old]
+
+    def scaffold(self, scene: Gaussians4D, pull: Tensor) -> tuple[Gaussians4D, Tensor | None]:
+        """The scene on a scaffold with other nodes, and the old node of each (-1: new); None: the nodes stay.
+
+        Args:
+            pull: [N] as above, of the scene's Gaussians.
+        """
+        if not self.nodes or not isinstance(scene.motion, Scaffold):
+            return scene, None
+        grown = grow(scene.motion, scene.dynamic.means, pull, most=self.nodes)
+        kept = prune(grown.scaffold)
+        return replace(scene, motion=kept.scaffold), grown.source[kept.source]
 
 
 def _moved(g: Gaussians, side: Tensor, split: Tensor) -> Gaussians:

@@ -26,9 +26,9 @@ MAX_FRAMES = 100_000
 
 def frame_times(scene: Gaussians4D, fps: float | None = None) -> np.ndarray:
     """World seconds (T,) of the frames over the scene's span, ``fps`` a second; default: the reference's own frames."""
-    step = scene.frame_step if fps is None else 1.0 / fps
-    if not (np.isfinite(step) and step > 0):
+    if fps is not None and not (np.isfinite(fps) and fps > 0):
         raise ValueError(f"fps: expected frames per second above 0; found {fps}.")
+    step = scene.frame_step if fps is None else 1.0 / fps
     count = int((scene.span[1] - scene.span[0]) / step + 1e-6) + 1
     if count > MAX_FRAMES:
         raise ValueError(

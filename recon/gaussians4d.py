@@ -17,9 +17,16 @@ from otsync.files import read_npz, write_npz
 from otsync.types import Camera
 from recon.gaussians import Gaussians
 from recon.motion import Motion, motion_from_arrays
+from recon.motion.arrays import numbers
 from recon.raster import Rendering
 
 FORMAT, VERSION = "otsync.scene4d", 1
+
+UNSOUND = (
+    KeyError, IndexError, TypeError, AttributeError, OverflowError, RecursionError, json.JSONDecodeError,
+    UnicodeDecodeError,
+)  # fmt: skip
+"""What a stranger's header raises, apart from ValueError: JSON of other types, of other lengths, too deep or too large."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +60,9 @@ class Gaussians4D:
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise ValueError(f"{name}: expected a positive number, got {value}")
-        if not self.span[0] <= self.span[1]:
+        if not (math.isfinite(self.near) and self.near >= 0):
+            raise ValueError(f"near: expected a distance of 0 or more, got {self.near}")
+        if not (len(self.span) == 2 and all(map(math.isfinite, self.span)) and self.span[0] <= self.span[1]):
             raise ValueError(f"span: expected (first, last) world seconds in order, got {self.span}")
 
     def __len__(self) -> int:
@@ -91,7 +100,7 @@ class Gaussians4D:
         """Read what :meth:`save` wrote. ValueError names the file for anything else."""
         try:
             return scene_from_arrays(read_npz(path))
-        except (KeyError, TypeError, json.JSONDecodeError, UnicodeDecodeError) as error:
+        except UNSOUND as error:
             raise ValueError(f"{path}: not a sound 4D scene; {type(error).__name__}: {error}. Write it anew.") from None
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
@@ -131,20 +140,31 @@ def scene_arrays(scene: Gaussians4D) -> dict[str, np.ndarray]:
 
 
 def scene_from_arrays(arrays: Mapping[str, np.ndarray]) -> Gaussians4D:
-    """The scene that :func:`scene_arrays` took apart. KeyError or ValueError say what is missing or unsound."""
+    """The scene that :func:`scene_arrays` took apart. One of :data:`UNSOUND` or ValueError say what is missing or wrong."""
     about = json.loads(arrays["scene"].tobytes().decode())
     if not isinstance(about, dict) or about.get("format") != FORMAT or about.get("version") != VERSION:
         raise ValueError(f"expected a 4D scene (format {FORMAT!r}, version {VERSION}); found another. Write it anew.")
-    parts: dict[str, Gaussians] = {}
-    for part in ("dynamic", "static"):
-        if f"{part}.means" in arrays:
-            names = [f.name for f in fields(Gaussians)]
-            parts[part] = Gaussians(**{n: torch.from_numpy(np.array(arrays[f"{part}.{n}"])) for n in names})
+    dynamic = _gaussians(arrays, "dynamic")
     motion = {k[len("motion.") :]: v for k, v in arrays.items() if k.startswith("motion.")}
-    features = arrays.get("features")
+    for name, axis in (("binding_rest", 0), ("own_knots", 1)):
+        if name in motion and (motion[name].ndim <= axis or motion[name].shape[axis] != len(dynamic)):
+            raise ValueError(
+                f"motion.{name}: expected {len(dynamic)} Gaussians along axis {axis}; found shape {motion[name].shape}."
+            )
+    first, last = about["span"]
     return Gaussians4D(
-        dynamic=parts["dynamic"], motion=motion_from_arrays(motion), footprint=float(about["footprint"]),
-        frame_step=float(about["frame_step"]), span=(float(about["span"][0]), float(about["span"][1])),
-        static=parts.get("static"), near=float(about["near"]),
-        features=None if features is None else torch.from_numpy(np.array(features)),
+        dynamic=dynamic, motion=motion_from_arrays(motion), footprint=float(about["footprint"]),
+        frame_step=float(about["frame_step"]), span=(float(first), float(last)),
+        static=_gaussians(arrays, "static") if "static.means" in arrays else None, near=float(about["near"]),
+        features=numbers(arrays, "features", (len(dynamic), None)) if "features" in arrays else None,
     )  # fmt: skip
+
+
+def _gaussians(arrays: Mapping[str, np.ndarray], part: str) -> Gaussians:
+    """The Gaussians whose arrays are named ``part.*``; shapes are checked by their own class."""
+    names = [f"{part}.{f.name}" for f in fields(Gaussians)]
+    means, *others = (numbers(arrays, n, (None,) * np.ndim(arrays[n])) for n in names)
+    found = Gaussians(means, *others)
+    if any(x.dtype != means.dtype for x in others):
+        raise ValueError(f"{part}: expected arrays of one precision; found {[str(x.dtype) for x in (means, *others)]}.")
+    return found

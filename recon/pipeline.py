@@ -24,7 +24,7 @@ from recon.lpips import Lpips
 from recon.optimize import RATES, without
 from recon.prepare import MapLike, Plan, Prepared, Progress, given_clocks, prepare, read_footage, readable
 from recon.report import write_reconstruction_report
-from recon.result import FilmedBy, Result, metrics_of, save_run
+from recon.result import FilmedBy, Result, clear_parts, metrics_of, save_run
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +72,7 @@ def reconstruct(
     plan, progress, cache = plan or Plan(), progress or Progress(), cache or Cache(out / "stages")
     rates = without(RATES, *plan.freeze)  # says what is wrong before the work
     out.mkdir(parents=True, exist_ok=True)
+    clear_parts(out, out / "stages")
     ready = prepare(scene, offsets, tracks, plan=plan, held_out=held_out, cache=cache, map=map, progress=progress)
     true = None if truth is None else true_seconds(truth, ready.offsets)
     effects = (Gain(start=ready.gains), *plan.effects)
@@ -81,22 +82,43 @@ def reconstruct(
             budget=budget, batch=plan.batch, densify=plan.densify, seed=plan.seed, checkpoint=out / "fit.npz",
             save_every=plan.save_every,
         )  # fmt: skip
+    _write_fit(out, found)
     with progress.stage("views"):
-        held = [view(found.scene, f, ready.clocks.get(f.name), layered=ready.layered) for f in ready.held_out]
-        gains = found.parameters["gain"].detach().cpu().numpy().astype(float)
-        scores = [v.score(most=plan.views) for v in held]
-        for n in _some(len(ready.footage), SHOWN_TRAINING):
-            clock = Clock(float(found.offsets.seconds[n]), float(found.offsets.rates[n]), "fitted")
-            looking = view(found.scene, ready.footage[n], clock, gain=gains[n], layered=ready.layered)
-            scores.append(looking.score(most=max(1, plan.views // 4), held_out=False))
-    fitted = [
-        FilmedBy.of(f, Clock(float(found.offsets.seconds[n]), float(found.offsets.rates[n]), "fitted"), gains[n])
-        for n, f in enumerate(ready.footage)
-    ]
-    others = [FilmedBy.of(v.footage, v.clock, v.gain, held_out=True) for v in held]
-    outcome = Outcome(found, ready.offsets, tuple(scores), ready.left_out, true, Lpips().reason)
-    _write(out, outcome, [*fitted, *others], ready, plan, progress)
+        videos, scores = compared(found, ready, plan, progress)
+    outcome = Outcome(found, ready.offsets, scores, ready.left_out, true, Lpips().reason)
+    _write(out, outcome, videos, ready, plan, progress)
     return outcome
+
+
+def compared(
+    found: Reconstruction, ready: Prepared, plan: Plan, progress: Progress
+) -> tuple[tuple[FilmedBy, ...], tuple[ViewScore, ...]]:
+    """Every camera on the fitted scene, and how well the held-out ones and some of the others are shown.
+
+    A camera that cannot be placed or scored is noted and left out: it shall not cost the fit.
+    """
+    gains = found.parameters["gain"].detach().cpu().numpy().astype(float)
+    clocks = [
+        Clock(float(s), float(r), "fitted") for s, r in zip(found.offsets.seconds, found.offsets.rates, strict=True)
+    ]
+    videos = [FilmedBy.of(f, clocks[n], gains[n]) for n, f in enumerate(ready.footage)]
+    scores = []
+    for footage in ready.held_out:
+        try:
+            looking = view(found.scene, footage, ready.clocks.get(footage.name), layered=ready.layered)
+            scores.append(looking.score(most=plan.views))
+        except ValueError as error:
+            progress.note(f"held-out video {footage.name} is not compared: {error}")
+        else:
+            videos.append(FilmedBy.of(footage, looking.clock, looking.gain, held_out=True))
+    for n in _some(len(ready.footage), SHOWN_TRAINING):
+        footage = ready.footage[n]
+        try:
+            looking = view(found.scene, footage, clocks[n], gain=gains[n], layered=ready.layered)
+            scores.append(looking.score(most=max(1, plan.views // 4), held_out=False))
+        except ValueError as error:
+            progress.note(f"video {footage.name} is not compared: {error}")
+    return tuple(videos), tuple(scores)
 
 
 SHOWN_TRAINING = 2
@@ -107,13 +129,22 @@ def _some(count: int, most: int) -> list[int]:
     return sorted({int(i) for i in np.linspace(0, count - 1, min(count, most)).round()})
 
 
+def _write_fit(out: Path, found: Reconstruction) -> None:
+    """Scene and clocks, before anything is done with them that may fail.
+
+    ``run.json`` of an earlier run goes first: from here until the new one is written the folder is not finished, so
+    that a kill cannot leave the old cameras beside the new scene.
+    """
+    (out / "run.json").unlink(missing_ok=True)
+    found.scene.save(out / "scene.npz")
+    found.offsets.save(out / "offsets.json")
+
+
 def _write(
     out: Path, outcome: Outcome, videos: Sequence[FilmedBy], ready: Prepared, plan: Plan, progress: Progress
 ) -> None:
-    """The result folder; run.json last but for the report, since with it the folder counts as finished."""
+    """The rest of the result folder; run.json last but for the report, since with it the folder counts as finished."""
     found = outcome.found
-    found.scene.save(out / "scene.npz")
-    found.offsets.save(out / "offsets.json")
     metrics = metrics_of(outcome.views, found.stats, outcome.lpips_reason)
     if outcome.truth is not None:
         metrics["offset_error"] = offset_figures(found.offsets, outcome.truth)

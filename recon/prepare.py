@@ -34,6 +34,7 @@ from recon.gaussians import Gaussians
 from recon.gaussians4d import Gaussians4D, scene_arrays, scene_from_arrays
 from recon.held_out import Clock
 from recon.motion import ScaffoldOptions, build_scaffold
+from recon.track_sets import of_every_video, tracks_of
 
 Tell = Callable[[str], None]
 MapLike = Callable[..., Any]
@@ -182,13 +183,17 @@ def given_clocks(offsets: Offsets) -> dict[str, Clock]:
 
 
 def only(offsets: Offsets, names: Sequence[str]) -> Offsets:
-    """The offsets of some videos, in that order; the reference is one of them."""
+    """The offsets of some videos on the reference's clock, in that order.
+
+    Where the reference is none of them, the first is named in its place; seconds stay those of world time.
+    """
     at = [offsets.names.index(n) for n in names]
     new = {v: i for i, v in enumerate(at)}
+    reference = new.get(offsets.reference, 0)
     pairs = {k: v for k, v in offsets.alignments.items() if k[0] in new and k[1] in new}
     return replace(
         offsets, names=tuple(names), fps=offsets.fps[at], seconds=offsets.seconds[at], rates=offsets.rates[at],
-        sigma=offsets.sigma[at], reference=new[offsets.reference], component=np.full(len(at), new[offsets.reference]),
+        sigma=offsets.sigma[at], reference=reference, component=np.full(len(at), reference),
         status=tuple(offsets.status[v] for v in at), flags=tuple(offsets.flags[v] for v in at),
         alignments={(new[i], new[j]): a for (i, j), a in pairs.items()}, matches={},
     )  # fmt: skip
@@ -301,7 +306,9 @@ def prepare(
     """Everything that a fit begins with.
 
     Args:
-        offsets: of the recording's videos. tracks: in space, of training videos; default: tracked and lifted here.
+        offsets: of the recording's videos.
+        tracks: in space, one set a video; those of other than training videos are left out, with a note. Default:
+            tracked and lifted here.
         held_out: names of videos that nothing here sees but their own footage.
         cache: an :class:`otsync.priors.cache.Cache`. map: any map-like callable; two threads use two cores.
     """
@@ -316,6 +323,8 @@ def prepare(
     if tracks is None:
         with progress.stage("tracks"):
             tracks = lifted_tracks(train, offsets, cache, map, progress)
+    else:
+        tracks = tracks_of(train, tracks, held_out, progress.note)
     with progress.stage("footage"):
         footage = read_footage(train, plan.width, cache, map, progress)
         held = () if others is None else read_footage(others, plan.width, cache, map, progress)
@@ -348,7 +357,9 @@ def content_key(scene: Scene, tracks: Sequence[TrackSet]) -> tuple[Any, ...]:
         c, depth = video.camera, "none"
         if video.depth is not None:
             own = getattr(video.depth, "digest", None)
-            depth = own() if own is not None else digest_of(*[np.asarray(z) for z in video.depth])
+            depth = (
+                own() if own is not None else digest_of(*[None if z is None else np.asarray(z) for z in video.depth])
+            )
         lens = None if c.distortion is None else c.distortion
         rows.append(digest_of(tracking.key(video, masks), depth, video.times, c.K, c.w2c, lens, c.width, c.height))
     return (*rows, *(keep.digest(t) for t in tracks))
@@ -414,23 +425,23 @@ def seeded(
 ) -> Gaussians4D:  # fmt: skip
     """Build what :func:`initial_scene` keeps."""
     from otsync.depth_maps import depth_maps
-    from recon.seed import moments, seed
+    from recon.seed import moments, seed, shown_at
 
     footprint = world_footprint(tracks, footage)
     frame_step = 1.0 / float(offsets.fps[offsets.reference])
-    at = [offsets.names.index(t.name) for t in tracks]
     motion = build_scaffold(
-        tracks, offsets.seconds[at], footprint=footprint, frame_step=frame_step, options=plan.scaffold,
-        rates=offsets.rates[at], seed=plan.seed,
+        of_every_video(tracks, offsets.names), offsets.seconds, footprint=footprint, frame_step=frame_step,
+        options=plan.scaffold, rates=offsets.rates, seed=plan.seed,
     )  # fmt: skip
     progress.tell(f"scaffold: {len(motion)} nodes of {sum(len(t) for t in tracks)} tracks, footprint {footprint:.4g}")
     worlds = [offsets.rates[v] * f.times + offsets.seconds[v] for v, f in enumerate(footage)]
     span = (float(min(t[0] for t in worlds)), float(max(t[-1] for t in worlds)))
     times = moments(span, frame_step)
     blind = without_depth(scene)
+    shown = zip(*(shown_at(footage, offsets, float(t), frame_step) for t in times), strict=True)
     wanted = [
-        [] if v.name in blind else sorted({int(np.argmin(np.abs(w - t))) for t in times})
-        for v, w in zip(scene.videos, worlds, strict=True)
+        [] if v.name in blind else sorted({k for k in frames if k is not None})
+        for v, frames in zip(scene.videos, shown, strict=True)
     ]
     maps = depth_maps(scene, offsets, wanted, width=plan.width, cache=cache, map=map)
     depth = [

@@ -179,16 +179,19 @@ def views_over_time(views: Sequence[ViewScore]) -> str:
 
 
 def _pictures(views: Sequence[ViewScore]) -> list[str]:
-    """Rendered, filmed, and their difference four times, of the first cameras."""
-    import cv2
-
+    """Rendered, filmed, and their difference four times, of the first cameras; what is missing where there are none."""
+    try:
+        from PIL import Image
+    except ModuleNotFoundError:  # a report without pictures is better than none
+        return ["<p class=s>No pictures: they need pillow; pip install 'otsync[video]'.</p>"]
     parts = []
     for v in [v for v in views if v.pictures][:SHOWN_VIEWS]:
         rows = []
         for rendered, filmed in v.pictures:
             apart = np.clip(4 * np.abs(rendered.astype(int) - filmed), 0, 255).astype(np.uint8)
             height = max(1, round(PICTURE * filmed.shape[0] / filmed.shape[1]))
-            cells = [cv2.resize(x, (PICTURE, height), interpolation=cv2.INTER_AREA) for x in (rendered, filmed, apart)]
+            size, box = (PICTURE, height), Image.Resampling.BOX
+            cells = [np.asarray(Image.fromarray(x).resize(size, box)) for x in (rendered, filmed, apart)]
             rows.append(np.concatenate(cells, 1))
         parts.append(f"<p>{escape(v.name)}: rendered, filmed, four times their difference</p>")
         parts.append(inline_image(np.concatenate(rows), f"{v.name} rendered and filmed"))

@@ -13,7 +13,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
@@ -21,10 +21,12 @@ from otsync.files import read_json, write_json
 from otsync.types import Camera, Offsets
 from recon.footage import Footage
 from recon.gaussians4d import Gaussians4D
-from recon.held_out import Clock, ViewScore
+from recon.held_out import Clock, How, ViewScore
 
 FORMAT, VERSION = "otsync.reconstruction", 1
 MAX_VIDEOS = 10_000
+MAX_SIDE, MAX_PIXELS = 16_384, 2**26
+"""Of one image: what a foreign run.json, or a wish for a width, may ask memory for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,8 +139,8 @@ def load_result(folder: str | os.PathLike[str]) -> Result:
         if not isinstance(rows, list) or not 1 <= len(rows) <= MAX_VIDEOS:
             raise ValueError(f"expected 1 to {MAX_VIDEOS} videos")
         videos = tuple(_filmed_by(row) for row in rows)
-        options, frame = dict(document["options"]), str(document["frame"])
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+        options, frame = _options(document["options"]), str(document["frame"])
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
         raise ValueError(
             f"{folder / 'run.json'}: not a sound reconstruction; {type(error).__name__}: {error}. Run the fit again."
         ) from None
@@ -146,13 +148,70 @@ def load_result(folder: str | os.PathLike[str]) -> Result:
     return Result(scene, offsets, videos, options, frame)
 
 
+def _options(found: dict[str, Any]) -> dict[str, Any]:
+    """What the fit was told, as far as evaluation needs it. ValueError for what is no width or no range of frames."""
+    options = dict(found)
+    if type(options["width"]) is not int or not 1 <= options["width"] <= MAX_SIDE:
+        raise ValueError(f"options.width: expected 1 to {MAX_SIDE} pixels; found {options['width']!r}")
+    frames = options.get("frames")
+    if frames is not None and not (
+        isinstance(frames, list)
+        and len(frames) == 2
+        and all(type(k) is int for k in frames)
+        and 0 <= frames[0] < frames[1]
+    ):
+        raise ValueError(f"options.frames: expected null, or first and last frame; found {frames!r}")
+    return options
+
+
+def check_size(width: int, height: int) -> None:
+    """ValueError for images that nobody renders and no memory holds."""
+    if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE and width * height <= MAX_PIXELS):
+        raise ValueError(
+            f"width, height: expected 1 to {MAX_SIDE} pixels each and {MAX_PIXELS} in all; found {width} x {height}."
+        )
+
+
+def clear_parts(*folders: Path) -> None:
+    """Remove the unfinished files that killed writers left in ``folders`` (see :func:`otsync.files.atomic_write`).
+
+    Those of processes that still live stay: another run may be writing there.
+    """
+    if os.name != "posix":  # elsewhere a process cannot be asked for without harming it
+        return
+    for part in (p for folder in folders for p in folder.glob(".*.part")):
+        pid = part.name.removesuffix(".part").rpartition(".")[2].partition("-")[0]
+        if pid.isdecimal() and not _lives(int(pid)):
+            part.unlink(missing_ok=True)
+
+
+def _lives(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        pass
+    return True
+
+
 def _filmed_by(row: dict[str, Any]) -> FilmedBy:
     c = row["camera"]
+    check_size(int(c["width"]), int(c["height"]))
     readout = None if c["readout"] is None else float(c["readout"])
     camera = Camera(
         np.array(c["K"], float), np.array(c["w2c"], float), int(c["width"]), int(c["height"]), None, readout
     )
-    clock = Clock(float(row["clock"]["offset_seconds"]), float(row["clock"]["rate"]), str(row["clock"]["known"]))  # type: ignore[arg-type]
+    seconds, rate, how = (row["clock"][k] for k in ("offset_seconds", "rate", "known"))
+    clock = Clock(float(seconds), float(rate), how)
+    if (
+        how not in get_args(How)
+        or not math.isfinite(clock.seconds)
+        or not (math.isfinite(clock.rate) and clock.rate > 0)
+    ):
+        raise ValueError(
+            f"clock: expected seconds, a rate above 0, known {' or '.join(get_args(How))}; found {row['clock']}"
+        )
     gain = np.array(row["gain"], float)
     if gain.shape != (3,) or not np.isfinite(gain).all():
         raise ValueError(f"gain: expected three numbers; found {row['gain']!r}")

@@ -23,6 +23,7 @@ from recon.stage import Clip, compose_over, feature_image, observer
 from recon.uncertainty import newton_sigma
 
 RECORDS = 200  # rows of history in a fit
+PER_NODE = ("knots", "knot_quats")
 PER_GAUSSIAN = ("means", "quats", "log_scales", "opacity_logits", "sh", "features", "own_knots")
 
 
@@ -207,16 +208,16 @@ class Run:
         """Split, clone and prune; Adam forgets the new ones' past."""
         values, moments = {n: v.detach() for n, v in self.values().items()}, self.adam.moments()
         pull = self._pull[0] / self._pull[1].clamp_min(1)
-        before = len(self.scene)
-        self.scene, old, fresh = densify(assemble(self.scene, values), pull)
+        denser, old, fresh = densify(assemble(self.scene, values), pull)
+        self.scene, source = densify.scaffold(denser, pull[old])
         self.groups = values | scene_groups(self.scene)
         carried = {}
         for name, moment in moments.items():
             group, _, kind = name.rpartition(".")
-            axis = 1 if group == "own_knots" else 0
-            if kind != "step" and moment.ndim > axis and moment.shape[axis] == before and group in PER_GAUSSIAN:
-                moment = moment.index_select(axis, old)
-                moment[(slice(None),) * axis + (fresh,)] = 0
+            if kind != "step" and group in PER_GAUSSIAN:
+                moment = _carried(moment, 1 if group == "own_knots" else 0, torch.where(fresh, -1, old))
+            elif kind != "step" and group in PER_NODE and source is not None:
+                moment = _carried(moment, 1, source)
             carried[name] = moment
         self.adam = self._adam(carried)
         self._pull = torch.zeros(2, len(self.scene))
@@ -240,3 +241,11 @@ class Run:
             self.step, self.total or 0, scene_arrays(assemble(self.scene, values)), values, self.adam.moments(), self.rows,
             self.densified, self._pull, np.array(self._since).reshape(-1, 2),
         )  # fmt: skip
+
+
+def _carried(moment: Tensor, axis: int, source: Tensor) -> Tensor:
+    """Adam's averages of the rows that stay; zero for new ones (source -1)."""
+    out = moment.index_select(axis, source.clamp_min(0))
+    shape = [1] * out.ndim
+    shape[axis] = -1
+    return out * (source >= 0).reshape(shape)

@@ -54,7 +54,11 @@ class Seeding:
 
 
 def moments(span: tuple[float, float], frame_step: float, apart: float = APART) -> np.ndarray:
-    """World seconds to seed at, whole frames of the reference: the middle first, then from it outwards, then both ends."""
+    """World seconds to seed at: the middle first, then from it outwards, ``apart`` seconds each, then both ends.
+
+    The middle is a whole number of the reference's frames after the first second, which the earliest video begins at:
+    moments lie between the frames of every other video, and of the reference where another began between two of its.
+    """
     first, last = span
     middle = first + frame_step * round((last - first) / 2 / frame_step)
     steps = int((last - first) / 2 // apart)
@@ -66,22 +70,33 @@ def moments(span: tuple[float, float], frame_step: float, apart: float = APART) 
     return np.array([*inside, *ends])
 
 
+def shown_at(footage: Sequence[Footage], offsets: Offsets, t: float, frame_step: float) -> list[int | None]:
+    """Of every video the readable frame believed nearest to world second ``t``.
+
+    None where that is further than one frame of the reference away. Whoever makes depth maps for seeding asks here which
+    frames need one: halfway between two frames another rounding would choose the other.
+    """
+    frames: list[int | None] = []
+    for f in footage:
+        at = offsets.names.index(f.name)
+        k = f.nearest((t - offsets.seconds[at]) / offsets.rates[at])
+        far = k is None or abs(offsets.rates[at] * f.times[k] + offsets.seconds[at] - t) > frame_step
+        frames.append(None if far else k)
+    return frames
+
+
 def cloud_at(
     footage: Sequence[Footage], depth: Sequence[Depths | None], offsets: Offsets, t: float, frame_step: float,
     gains: Float[np.ndarray, "V 3"] | None = None,
 ) -> tuple[Float[np.ndarray, "P 3"], Float[np.ndarray, "P 3"]]:  # fmt: skip
-    """Positions and colours of all pixels of what moves, over all videos, in the frames believed nearest to ``t``.
+    """Positions and colours of all pixels of what moves, over all videos, in the frames of :func:`shown_at`.
 
-    Frames further than one frame of the reference from ``t`` are left out. Colours are divided by the videos' gains.
+    Colours are divided by the videos' gains.
     """
     points, colors = [np.zeros((0, 3))], [np.zeros((0, 3))]
-    for v, f in enumerate(footage):
-        at = offsets.names.index(f.name)
-        k = f.nearest((t - offsets.seconds[at]) / offsets.rates[at])
-        if k is None or abs(offsets.rates[at] * f.times[k] + offsets.seconds[at] - t) > frame_step:
-            continue
-        z = depth_at(depth[v], f, k)
-        if z is None:
+    for v, (f, k) in enumerate(zip(footage, shown_at(footage, offsets, t, frame_step), strict=True)):
+        z = None if k is None else depth_at(depth[v], f, k)
+        if k is None or z is None:
             continue
         known = z > 0
         if f.masks is not None:

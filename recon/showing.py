@@ -12,9 +12,7 @@ from torch import Tensor
 
 from otsync.types import Camera
 from recon.orbit import orbit
-from recon.result import Result
-
-MAX_WIDTH = 16_384
+from recon.result import MAX_SIDE, Result, check_size
 
 
 def rendered(
@@ -56,9 +54,10 @@ def at_width(camera: Camera, width: int | None) -> Camera:
     """The same view with images of another width; its height follows."""
     if width is None or width == camera.width:
         return camera
-    if not 1 <= width <= MAX_WIDTH:
-        raise ValueError(f"width: expected 1 to {MAX_WIDTH} pixels; found {width}.")
+    if not 1 <= width <= MAX_SIDE:
+        raise ValueError(f"width: expected 1 to {MAX_SIDE} pixels; found {width}.")
     height = max(1, round(camera.height * width / camera.width))
+    check_size(width, height)
     K = camera.K * np.array([[width / camera.width], [height / camera.height], [1.0]])
     return replace(camera, K=K, width=width, height=height)
 

@@ -216,3 +216,12 @@ def test_lone_and_deviating_depths_are_dropped():
     expected = plane.copy()
     expected[5, 5] = expected[18, 3] = 0
     np.testing.assert_array_equal(out, expected)
+
+
+def test_frames_without_a_given_map_have_empty_ones(world):
+    """Depth that was given for some frames only: the others are unknown, whatever holds them."""
+    scene, _ = world
+    given = [None, np.full((H, W), 2.0), None, np.full((H, W), 3.0), *[None] * 4]
+    video = replace(scene.videos[0], depth=given)
+    found = depth_maps(replace(scene, videos=(video, *scene.videos[1:])), AT, [[1, 2, 3]] + [[]] * 7, width=160)[0]
+    assert not found[1].any() and (found[0].max(), found[2].max()) == (2, 3) and found.dtype == np.float32

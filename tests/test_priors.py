@@ -247,6 +247,12 @@ def test_depth_at_keeps_off_edges_and_holes():
     np.testing.assert_array_equal(depth_at([depth], tracks, uv)[:, 0], [2, 0, 0])
 
 
+def test_depth_is_unknown_in_frames_without_a_map():
+    uv = np.array([[[10.5, 10.5], [11.5, 10.5]]])
+    tracks = pixel_tracks(uv, None, CAMERA, fps=30.0)
+    np.testing.assert_array_equal(depth_at([None, np.full((H, W), 2.0)], tracks, uv), [[0, 2]])
+
+
 def test_hull_and_stereo_find_the_balls():
     cameras = ring(8)
     centres = np.array([[[0.3, 0.0, 0.1]], [[-0.4, 0.1, -0.2]]])

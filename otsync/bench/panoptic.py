@@ -246,7 +246,7 @@ def matching_table(material: Material, protocol: Protocol, map: MapLike) -> list
     def pair(item: tuple[int, int]) -> dict[str, tuple[float, float, int]]:
         a, b = (material.clip(int(v), 0, material.frames, 1, True) for v in item)
         angle = view_angle(a.camera, b.camera, target)  # type: ignore[arg-type]
-        return {name: (angle, *_precision(a, b, matcher(a, b))) for name, matcher in matchers.items()}
+        return {name: (angle, *precision_near(a, b, matcher(a, b))) for name, matcher in matchers.items()}
 
     for answer in map(pair, pairs[: protocol.matching]):
         for name, value in answer.items():
@@ -262,7 +262,7 @@ def matching_table(material: Material, protocol: Protocol, map: MapLike) -> list
     return rows
 
 
-def _precision(a: TrackSet, b: TrackSet, matches: Matches) -> tuple[float, int]:
+def precision_near(a: TrackSet, b: TrackSet, matches: Matches) -> tuple[float, int]:
     """For clips that start together: (share of near matches among those seen together in five frames, matches)."""
     i, j = matches.pairs.T
     distance = np.linalg.norm(a.positions()[i] - b.positions()[j], axis=2)

@@ -9,6 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from recon.motion.arrays import Arrays, indices, numbers
+
 NODES = 8  # per Gaussian: the nearest one and its topological neighbours
 
 
@@ -58,6 +60,26 @@ class Binding:
             times,
             like.new_zeros(0, n_nodes, 3),
             like.new_zeros(0, n_nodes, 4),
+        )
+
+    @classmethod
+    def from_arrays(cls, arrays: Arrays, n_nodes: int, kind: tuple[type, ...]) -> Binding:
+        """From a scaffold's arrays, named ``binding_*``, in the precision `kind` of its knots.
+
+        KeyError or ValueError for what is missing or unsound. Checked here alone: those made by binding are sound.
+        """
+        times = numbers(arrays, "binding_times", (None,), (np.float64,))
+        rest = indices(arrays, "binding_rest", (None,), len(times))
+        weights = numbers(arrays, "binding_weights", (len(rest), NODES), kind)
+        if not (weights >= 0).all():
+            raise ValueError(f"binding_weights: expected weights >= 0; found {float(weights.min())}.")
+        return cls(
+            rest,
+            indices(arrays, "binding_nodes", (len(rest), NODES), n_nodes),
+            weights,
+            times,
+            numbers(arrays, "binding_positions", (len(times), n_nodes, 3), kind),
+            numbers(arrays, "binding_quats", (len(times), n_nodes, 4), kind),
         )
 
     def __len__(self) -> int:

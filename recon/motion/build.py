@@ -76,6 +76,8 @@ def build_scaffold(
 ) -> Scaffold:
     """Nodes, curves and rotations from the lifted tracks of V videos: float32 tensors on the CPU, nothing bound yet.
 
+    tracks: one set of each video, in the order in which a fit has them: a node's clock is the number of its set, and a
+    scaffold per video expects V clocks. A video without tracks has an empty set.
     offsets, rates [V]: world second = rate · own second + offset. footprint: world size of a working pixel at the
     moving part. frame_step: seconds of one frame of the reference. seed: of the order of tracks seen equally long.
     """

@@ -21,6 +21,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from recon.motion.arrays import numbers
+
 WINDOW = 4  # knots under a path's weights at any time
 MAX_KNOTS = 4096  # of one path: a span of nine minutes at the default spacing; beyond it an offset is wrong
 
@@ -185,7 +187,9 @@ def path_arrays(path: Path) -> dict[str, np.ndarray]:
 def path_from_arrays(arrays: Mapping[str, np.ndarray]) -> Path:
     """What :func:`path_arrays` gave; KeyError where it is missing, ValueError where it makes no path."""
     kinds = {kind.__name__: kind for kind in (HermiteSpline, Sampled)}
-    name, (start, spacing, count) = str(arrays["path"]), np.asarray(arrays["path_knots"], float).reshape(3)
+    name, (start, spacing, count) = str(arrays["path"]), numbers(arrays, "path_knots", (3,)).double().tolist()
     if name not in kinds:
         raise ValueError(f"path: expected one of {sorted(kinds)}; found {name!r}.")
-    return kinds[name](float(start), float(spacing), int(count))
+    if count != int(count):
+        raise ValueError(f"path_knots: expected a whole number of knots; found {count}.")
+    return kinds[name](start, spacing, int(count))

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from otsync.types import TrackSet
+from recon.motion.arrays import numbers
 from recon.motion.nodes import Grid, held
 from recon.motion.paths import Path, path_arrays, path_from_arrays
 from recon.motion.scaffold import Scaffold
@@ -92,8 +93,10 @@ class PerGaussian:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> PerGaussian:
+        """What :meth:`arrays` gave. ValueError where something is missing, unsound or does not fit."""
         try:
-            return cls(path_from_arrays(arrays), torch.from_numpy(np.array(arrays["own_knots"])))
+            path = path_from_arrays(arrays)
+            return cls(path, numbers(arrays, "own_knots", (path.count, None, 3)))
         except KeyError as error:
             raise ValueError(f"arrays: expected those of a motion per Gaussian; found no {error}.") from None
 

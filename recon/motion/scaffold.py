@@ -13,6 +13,7 @@ from torch import Tensor
 
 from recon.motion import fused
 from recon.motion import warp as warping
+from recon.motion.arrays import indices, numbers, scalar
 from recon.motion.binding import NODES, Binding
 from recon.motion.paths import WINDOW, Path, path_arrays, path_from_arrays
 from recon.motion.rotations import unit
@@ -223,27 +224,31 @@ class Scaffold:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> Scaffold:
-        """What :meth:`arrays` gave. ValueError where something is missing or does not fit."""
-        bound = ("rest", "nodes", "weights", "times", "positions", "quats")
-
-        def tensor(name: str) -> Tensor:
-            return torch.from_numpy(np.array(arrays[name]))
-
-        def perhaps(name: str) -> Tensor | None:
-            return tensor(name) if name in arrays else None
-
+        """What :meth:`arrays` gave. ValueError where something is missing, unsound or does not fit."""
         try:
+            path = path_from_arrays(arrays)
+            knots = numbers(arrays, "knots", (path.count, None, 3))
+            m, kind = knots.shape[1], (np.asarray(arrays["knots"]).dtype.type,)  # kernels take one precision
+            edges = indices(arrays, "edges", (m, None), m)
+            clock = offsets = rates = None
+            if "offsets" in arrays:
+                offsets = numbers(arrays, "offsets", (None,), (np.float64,))
+                rates = numbers(arrays, "rates", offsets.shape, (np.float64,))
+                if not (rates > 0).all():
+                    raise ValueError(f"rates: expected numbers > 0; found {rates.tolist()}.")
+            if "clock" in arrays:
+                clock = indices(arrays, "clock", (m,), 0 if offsets is None else len(offsets))
             return cls(
-                path_from_arrays(arrays),
-                knots=tensor("knots"),
-                knot_quats=tensor("knot_quats"),
-                edges=tensor("edges"),
-                edge_weights=tensor("edge_weights"),
-                unit=float(arrays["unit"]),
-                binding=Binding(*(tensor(f"binding_{name}") for name in bound)),
-                clock=perhaps("clock"),
-                offsets=perhaps("offsets"),
-                rates=perhaps("rates"),
+                path,
+                knots=knots,
+                knot_quats=numbers(arrays, "knot_quats", (path.count, m, 4), kind),
+                edges=edges,
+                edge_weights=numbers(arrays, "edge_weights", edges.shape, kind),
+                unit=scalar(arrays, "unit"),
+                binding=Binding.from_arrays(arrays, m, kind),
+                clock=clock,
+                offsets=offsets,
+                rates=rates,
                 blend=str(arrays["blend"]),
             )
         except (KeyError, TypeError) as error:

@@ -9,7 +9,9 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from otsync.types import TrackSet
-from recon.motion import Binding, HermiteSpline, Scaffold
+from recon.gaussians import Gaussians
+from recon.gaussians4d import Gaussians4D
+from recon.motion import Binding, HermiteSpline, Motion, Scaffold
 
 FOOTPRINT = 0.0133
 FRAME = 1 / 30
@@ -74,6 +76,15 @@ def random_gaussians(n: int, dtype: torch.dtype = torch.float32, seed: int = 1) 
     """Means [n,3] and quaternions [n,4] of any length."""
     rng = np.random.default_rng(seed)
     return torch.from_numpy(rng.normal(size=(n, 3))).to(dtype), torch.from_numpy(rng.normal(size=(n, 4))).to(dtype)
+
+
+def random_scene(motion: Motion | None = None, n: int = 200, features: bool = False) -> Gaussians4D:
+    """n Gaussians carried by `motion`, by default a random scaffold, and three static ones."""
+    static = Gaussians(*random_gaussians(3), torch.zeros(3, 3), torch.zeros(3), torch.zeros(3, 1, 3))
+    dynamic = Gaussians(*random_gaussians(n), torch.zeros(n, 3), torch.zeros(n), torch.zeros(n, 4, 3))
+    extra = torch.ones(n, 5) if features else None
+    motion = random_scaffold() if motion is None else motion
+    return Gaussians4D(dynamic, motion, FOOTPRINT, FRAME, (0.0, 0.8), static, features=extra)
 
 
 def leaves(tensors: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:

@@ -393,7 +393,7 @@ def test_the_studio_of_the_paper(data):
     train, held = [f for f in footage if f.masks is not None], [f for f in footage if f.masks is None]
     found = fit_backdrop(train, progress=False)
     assert found.psnr.mean() > 35
-    median, same = unchanging(held[0])
+    _median, same = unchanging(held[0])
     drawn = backdrop_of(found, held[0])
     assert psnr(drawn * colour_gain(drawn, median, same), median, same) > 30
     assert found.floor is not None and found.floor.normal @ [0, -1, 0] > 0.999 and abs(found.floor.height) < 0.06

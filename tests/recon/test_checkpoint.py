@@ -6,12 +6,16 @@ import numpy as np
 import pytest
 import torch
 
+from otsync.files import read_npz, write_npz
 from recon.checkpoint import Checkpoint, Snapshot, key_of
+from recon.gaussians4d import scene_arrays
+
+from .motion_worlds import random_scene
 
 
 def snapshot(step: int = 7) -> Snapshot:
     return Snapshot(
-        step, 20, {"scene": np.arange(3, dtype=np.uint8)}, {"means": torch.randn(4, 3), "offsets": torch.zeros(2).double()},
+        step, 20, scene_arrays(random_scene()), {"means": torch.randn(4, 3), "offsets": torch.zeros(2).double()},
         {"means.exp_avg": torch.randn(4, 3), "means.step": torch.tensor(7.0)}, np.random.default_rng(0).normal(size=(2, 6)),
         1, torch.randn(2, 4), np.ones((3, 2)),
     )  # fmt: skip
@@ -29,7 +33,9 @@ def test_a_snapshot_comes_back_bit_by_bit(tmp_path):
         for name, tensor in getattr(before, part).items():
             found = getattr(after, part)[name]
             assert found.dtype == tensor.dtype and torch.equal(found, tensor)
-    assert np.array_equal(after.scene["scene"], before.scene["scene"]) and np.array_equal(after.history, before.history)
+    assert after.scene.keys() == before.scene.keys()
+    assert all(np.array_equal(after.scene[k], v) for k, v in before.scene.items())
+    assert np.array_equal(after.history, before.history)
 
 
 def test_a_checkpoint_of_another_fit_is_refused(tmp_path):
@@ -55,6 +61,30 @@ def test_damage_is_a_clear_error(tmp_path, damage):
         with open(path, "wb") as stream:
             np.savez(stream, a=np.zeros(3))
     with pytest.raises(ValueError, match=r"fit\.npz"):
+        keep.load()
+
+
+@pytest.mark.parametrize("part", ["scene", "fit"])
+def test_a_header_of_other_things_is_a_clear_error(tmp_path, part):
+    """The scene that a fit continues from is read with the rest, so that its errors name the file too."""
+    for header in (b"[" * 100_000, b"[]", b"null", b'{"format":', b"\xff"):
+        before = snapshot()
+        before.scene["scene"] = np.frombuffer(header, np.uint8) if part == "scene" else before.scene["scene"]
+        keep = Checkpoint(tmp_path / "fit.npz", "key")
+        keep.save(before)
+        if part == "fit":
+            arrays = read_npz(tmp_path / "fit.npz")
+            write_npz(tmp_path / "fit.npz", arrays | {"fit": np.frombuffer(header, np.uint8)})
+        with pytest.raises(ValueError, match=r"fit\.npz: not a sound checkpoint"):
+            keep.load()
+
+
+def test_a_scene_whose_indices_lead_nowhere_is_refused(tmp_path):
+    before = snapshot()
+    before.scene["motion.binding_nodes"] = before.scene["motion.binding_nodes"] + 1000
+    keep = Checkpoint(tmp_path / "fit.npz", "key")
+    keep.save(before)
+    with pytest.raises(ValueError, match=r"fit\.npz.*binding_nodes: expected indices"):
         keep.load()
 
 

@@ -141,8 +141,8 @@ def test_a_fit_does_not_depend_on_threads(capture, scene, batch):
 
 
 @pytest.mark.parametrize(
-    "densify", [None, Densify((0.3,), share=0.2), Densify((0.8,), share=0.2), Densify((0.6,), share=0.2)],
-    ids=["plain", "densified before", "densified after", "densified then"],
+    "densify", [None, Densify((0.3,), share=0.2), Densify((0.8,), share=0.2), Densify((0.6,), share=0.2), Densify((0.3,), nodes=9)],
+    ids=["plain", "densified before", "densified after", "densified then", "nodes too"],
 )  # fmt: skip
 def test_a_stopped_fit_continues_with_the_same_bits(capture, scene, tmp_path, monkeypatch, densify):
     options = {"steps": 10, "batch": 2, "densify": densify}
@@ -244,6 +244,12 @@ def test_densification_splits_what_is_pulled_and_drops_what_is_faint(scene):
     for parent in (20, 30):
         rows = torch.nonzero(old == parent)[:, 0]
         assert torch.allclose(denser.dynamic.means[rows].mean(0), scene.dynamic.means[parent], atol=1e-6)
+
+
+def test_a_scaffold_gains_nodes_where_it_is_pulled(capture, scene):
+    result = fit(scene, capture.footage, believed(capture), steps=6, densify=Densify((0.5,), nodes=5))
+    assert len(scene.motion) - 20 < len(result.scene.motion) <= len(scene.motion) + 5
+    assert len(result.scene.motion) != len(scene.motion) and np.isfinite(result.history.loss).all()
 
 
 def test_joint_rendering_where_no_background_is_cached(capture, scene):

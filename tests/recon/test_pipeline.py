@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -19,7 +22,7 @@ from recon.footage import footage_of
 from recon.gaussians4d import Gaussians4D
 from recon.pipeline import reconstruct
 from recon.prepare import Plan, Progress, lifted_tracks, only, prepare, readable, split, world_footprint
-from recon.result import load_result
+from recon.result import clear_parts, load_result
 
 from .worlds import CAMERAS, FRAMES, SIZE, capture, write_world
 
@@ -125,6 +128,46 @@ def test_held_out_videos_change_nothing_in_the_fit(done, world, start, tmp_path)
     reconstruct(scene, start, tmp_path, plan=QUICK, steps=60)
     one, two = read_npz(done[1] / "scene.npz"), read_npz(tmp_path / "scene.npz")
     assert all(np.array_equal(one[k], two[k]) for k in one)
+
+
+def test_a_camera_that_cannot_be_compared_does_not_cost_the_fit(done, world, start, tmp_path):
+    shutil.copytree(done[1] / "stages", tmp_path / "stages")
+    at = start.names.index("held0")
+    far = replace(start, seconds=start.seconds + 9.0 * (np.arange(len(start)) == at))
+    progress = Progress()
+    outcome = reconstruct(open_scene(world), far, tmp_path, plan=QUICK, held_out=("held0",), steps=3, progress=progress)
+    assert any("held-out video held0 is not compared" in n and "Check its offset" in n for n in progress.notes)
+    assert not any(v.held_out for v in outcome.views) and outcome.views
+    assert [v.name for v in load_result(tmp_path).videos] == ["cam0", "cam1", "cam2"]
+    assert "held0 is not compared" in (tmp_path / "report.html").read_text()
+
+
+@pytest.mark.parametrize("killed_in", ["view", "metrics_of", "save_run"])
+def test_a_kill_while_writing_leaves_scene_and_clocks_but_nothing_finished(
+    done, world, start, tmp_path, monkeypatch, killed_in
+):
+    def killed(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    shutil.copytree(done[1], tmp_path, dirs_exist_ok=True)
+    (tmp_path / "scene.npz").unlink()
+    monkeypatch.setattr(f"recon.pipeline.{killed_in}", killed)
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct(open_scene(world), start, tmp_path, plan=QUICK, held_out=("held0",), steps=60)
+    assert (tmp_path / "scene.npz").exists() and (tmp_path / "offsets.json").exists()
+    with pytest.raises(FileNotFoundError, match="expected a finished reconstruction"):
+        load_result(tmp_path)
+
+
+def test_what_killed_writers_left_is_removed(tmp_path):
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    dead = [tmp_path / f".scene.npz.{gone.pid}-7.part", tmp_path / f".v.mp4.{gone.pid}.part"]
+    stay = [tmp_path / f".scene.npz.{os.getpid()}-7.part", tmp_path / ".notes.part", tmp_path / "scene.npz"]
+    for path in (*dead, *stay):
+        path.touch()
+    clear_parts(tmp_path, tmp_path / "nowhere")
+    assert sorted(tmp_path.iterdir()) == sorted(stay)
 
 
 def test_frozen_offsets_stay(world, start, done, tmp_path):

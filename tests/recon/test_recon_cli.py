@@ -11,6 +11,7 @@ import sys
 import time
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import av
 import numpy as np
@@ -22,6 +23,7 @@ from otsync.files import read_npz
 from otsync.io import open_scene
 from otsync.types import Offsets, TrackSet
 from recon.cli import main
+from recon.prepare import only
 from recon.result import load_result
 
 from .test_pipeline import same_files
@@ -120,6 +122,14 @@ def test_eval_repeats_the_figures_of_the_run(world, result, tmp_path, capsys):
         (["render", "nowhere", "--camera", "cam0"], "expected a finished reconstruction"),
         (["export", "RESULT", "--format", "ply", "--at", "-4"], "which the videos cover"),
         (["eval", "RESULT", "WORLD", "--held-out", "cam9"], "expected some of"),
+        (["render", "RESULT", "--path", "orbit", "--times", "0.1", "--frames", "-3"], "--frames: expected 1 to"),
+        (["render", "RESULT", "--camera", "cam0", "--fps", "0"], "--fps: expected"),
+        (["render", "RESULT", "--camera", "cam0", "--times", "0.1", "--fps", "-2"], "--fps: expected"),
+        (["render", "RESULT", "--camera", "cam0", "--width", "16384"], "pixels each and"),
+        (["export", "RESULT", "--format", "tracks", "--fps", "0"], "fps: expected frames per second above 0"),
+        (["eval", "RESULT", "WORLD", "--views", "0"], "--views: expected at least 1"),
+        (["fit", "WORLD", "--offsets", "WORLD/start.json", "--budget", "0"], "--budget: expected seconds above 0"),
+        (["fit", "WORLD", "--offsets", "WORLD/start.json", "--steps", "-1"], "--steps: expected 0 or more"),
         (["fit", "WORLD", "--offsets", "nowhere.json"], "no such file"),
         (["fit", "nowhere", "--offsets", "WORLD/start.json"], "nowhere"),
         (["fit", "WORLD", "--offsets", "WORLD/start.json", "--steps", "3", "--budget", "4"], "expected one of them"),
@@ -154,6 +164,51 @@ def test_a_damaged_result_is_named(result, tmp_path, capsys):
     (tmp_path / "odd" / "run.json").write_text(json.dumps(run))
     assert main(["render", str(tmp_path / "odd"), "--camera", "cam0"]) == 2
     assert "not a sound reconstruction" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("where", "value"),
+    [
+        (("options",), {}),
+        (("options", "width"), 0),
+        (("options", "width"), "320"),
+        (("options", "frames"), 5),
+        (("options", "frames"), [4]),
+        (("options", "frames"), [4, "x"]),
+        (("videos", 0, "camera", "width"), 2_000_000),
+        (("videos", 0, "camera", "height"), 2_000_000),
+        (("videos", 0, "camera", "width"), float("inf")),
+        (("videos", 0, "clock", "known"), "guess"),
+        (("videos", 0, "clock", "known"), ["given"]),
+        (("videos", 0, "clock", "offset_seconds"), float("nan")),
+        (("videos", 0, "clock", "rate"), 0),
+    ],
+)
+def test_a_strangers_run_json_is_refused_when_it_makes_no_sense(result, tmp_path, where, value):
+    document = json.loads((result / "run.json").read_text())
+    part = document
+    for key in where[:-1]:
+        part = part[key]
+    part[where[-1]] = value
+    for name in ("scene.npz", "offsets.json"):
+        shutil.copy(result / name, tmp_path / name)
+    (tmp_path / "run.json").write_text(json.dumps(document))
+    with pytest.raises(ValueError, match=r"run\.json: not a sound reconstruction"):
+        load_result(tmp_path)
+
+
+def test_a_backdrop_that_diverges_and_a_package_that_lacks_are_said(world, tmp_path, monkeypatch, capsys):
+    for error, code, says in (
+        (FloatingPointError("backdrop: the loss is no number at step 3"), 1, "backdrop: the loss is no number"),
+        (ModuleNotFoundError("No module named 'cv2'", name="cv2"), 2, "needs cv2. Install it"),
+    ):
+
+        def failing(*args, error=error, **kwargs):
+            raise error
+
+        monkeypatch.setattr("recon.pipeline.prepare", failing)
+        assert fit(world, tmp_path / "r") == code
+        assert says in capsys.readouterr().err
 
 
 def test_offsets_that_are_not_to_be_trusted_end_in_one(world, tmp_path, capsys):
@@ -198,14 +253,33 @@ def test_every_help_has_an_example(capsys):
     assert "Example: otsync run" in " ".join(capsys.readouterr().out.split())
 
 
-def test_bench_writes_a_row_for_every_configuration(world, tmp_path, capsys):
+def test_bench_writes_a_row_for_every_configuration(world, tmp_path, monkeypatch, capsys):
     args = ["bench", str(world), "--truth", str(world / "truth.json"), "--held-out", "held0", "--width", str(SIZE[0]),
             "--steps", "4", "--backdrop-steps", "5", "--rows", "ours", "true time", "--out", str(tmp_path)]  # fmt: skip
     assert main(args) == 0
     rows = json.loads((tmp_path / "recon.json").read_text())["rows"]
     assert [r["configuration"] for r in rows] == ["ours", "true time"]
     assert rows[1]["start"] == 0 < rows[0]["start"] < 1
-    assert "ours" in capsys.readouterr().err
+    told = capsys.readouterr()
+    assert "ours" in told.err
+    # the paper's layout, with a column that says what is missing
+    for text in (told.out, (tmp_path / "recon.md").read_text()):
+        assert "otsync, unsync." in text and "LPIPS: no weights given." in text and f"{rows[0]['psnr']:.2f}" in text
+
+    # again, with a row more: those that are there are kept
+    def measured(name, *args, **kwargs):
+        assert name == "fixed", "measured again"
+        return {**rows[0], "configuration": name}
+
+    monkeypatch.setattr("recon.bench.measure", measured)
+    assert main([*args[:-4], "ours", "fixed", "true time", "--out", str(tmp_path)]) == 0
+    again = json.loads((tmp_path / "recon.json").read_text())["rows"]
+    assert again[:2] == rows and [r["configuration"] for r in again] == ["ours", "true time", "fixed"]
+    assert "2 rows are kept from an earlier run; 1 are to be measured" in capsys.readouterr().err
+    # another protocol is neither mixed with them nor written over them
+    assert main([*args, "--steps", "5"]) == 2
+    assert "protocol differs: steps 4, now 5" in capsys.readouterr().err
+    assert json.loads((tmp_path / "recon.json").read_text())["rows"] == again
     assert main([*args[:-4], "theirs", "--out", str(tmp_path)]) == 2
     assert "rows: expected some of ours" in capsys.readouterr().err
 
@@ -237,7 +311,7 @@ def test_a_run_killed_at_any_moment_ends_with_the_same_files(world, tmp_path):
             killed += 1
         assert killed and code == 0
         assert same_files(tmp_path / "whole", out)
-        assert not list(out.glob(".*.part")) or killed  # a killed writer may leave a part, never under the file's name
+        assert not [*out.glob(".*.part"), *(out / "stages").glob(".*.part")]  # what killed writers left is removed
 
 
 @pytest.mark.slow
@@ -252,6 +326,33 @@ def test_ctrl_c_exits_with_130_and_says_how_to_go_on(world, tmp_path):
     run.send_signal(signal.SIGINT)
     _, told = run.communicate(timeout=60)
     assert run.returncode == 130 and b"continues from here" in told and b"Traceback" not in told
+
+
+def test_run_tells_the_reconstruction_which_frames(world, tmp_path, monkeypatch):
+    """Evaluation compares only the frames that the scene was made from, so run.json must name them."""
+    start = Offsets.load(world / "start.json")
+    part = only(start, ("cam0", "cam1", "cam2"))
+    lengths = []
+
+    def synchronized(scene, **kwargs):
+        lengths.append([len(v.frames) for v in scene.videos])
+        return SimpleNamespace(offsets=part, route="tracks", why=(), seconds={})
+
+    monkeypatch.setattr("otsync.recordings.synchronize_scene", synchronized)
+    monkeypatch.setattr("otsync.report.frames.write_recording_report", lambda *args: None)
+    out = tmp_path / "r"
+    args = ["run", str(world), "--out", str(out), "--steps", "2", "--width", str(SIZE[0]), "--frames", "2", "12",
+            "--held-out", "held0"]  # fmt: skip
+    assert otsync(args) == 0
+    assert lengths == [[10] * 3]
+    assert json.loads((out / "run.json").read_text())["options"]["frames"] == [2, 12]
+    times = load_result(out).video("cam1").times
+    np.testing.assert_allclose(times, np.arange(2, 12) / 30)  # cut once, not twice
+    before = json.loads((out / "metrics.json").read_text())
+    assert main(["eval", str(out), str(world)]) == 0
+    after = json.loads((out / "eval.json").read_text())
+    assert after["views"][0]["frames"] == before["views"][0]["frames"] <= 10
+    assert after["held_out"]["psnr"] == pytest.approx(before["held_out"]["psnr"], abs=1e-6)
 
 
 def test_run_says_what_it_cannot_do(world, tmp_path, capsys):

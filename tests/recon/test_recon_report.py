@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 
 import numpy as np
 import pytest
@@ -78,6 +79,17 @@ def test_the_page_is_one_small_file_without_a_script(coarse, tmp_path):
     ):
         assert text in page, text
     assert page.count("<img") == 2 and page.count("<svg") == 2
+
+
+def test_a_page_needs_no_opencv_and_goes_without_pictures_where_pillow_lacks(coarse, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    args = (reconstruction(coarse), coarse, ["a", "b", "<c>"], [score("h", True)])
+    write_reconstruction_report(tmp_path / "r.html", *args)
+    assert (tmp_path / "r.html").read_text().count("<img") == 1
+    monkeypatch.setitem(sys.modules, "PIL", None)
+    write_reconstruction_report(tmp_path / "r.html", *args)
+    page = (tmp_path / "r.html").read_text()
+    assert "<img" not in page and "they need pillow" in page and "27.50" in page
 
 
 def test_the_page_is_the_same_for_the_same_fit(coarse, tmp_path):

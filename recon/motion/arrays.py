@@ -1,0 +1,50 @@
+"""Tensors from a stranger's arrays: compiled kernels follow their indices and shapes without looking, so we look here."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from torch import Tensor
+
+FLOATS = (np.float32, np.float64)
+
+Arrays = Mapping[str, np.ndarray]
+
+
+def numbers(arrays: Arrays, name: str, shape: tuple[int | None, ...], dtypes: tuple[type, ...] = FLOATS) -> Tensor:
+    """A copy of finite numbers of one of ``dtypes`` and of ``shape`` (None: any length).
+
+    KeyError where there is no such array, ValueError naming it where it is another.
+    """
+    array = np.asarray(arrays[name])
+    fits = array.ndim == len(shape) and all(n is None or n == m for n, m in zip(shape, array.shape, strict=True))
+    if not fits or array.dtype not in [np.dtype(kind) for kind in dtypes]:
+        raise ValueError(
+            f"{name}: expected {' or '.join(kind.__name__ for kind in dtypes)} of shape ({_text(shape)}); found "
+            f"{array.dtype} of shape {array.shape}."
+        )
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name}: expected finite numbers; found nan or infinity.")
+    return torch.from_numpy(np.array(array, order="C"))
+
+
+def indices(arrays: Arrays, name: str, shape: tuple[int | None, ...], count: int) -> Tensor:
+    """A copy of int64 indices 0..count - 1 of ``shape``; errors as of :func:`numbers`."""
+    found = numbers(arrays, name, shape, (np.int64,))
+    if found.numel() and not 0 <= int(found.min()) <= int(found.max()) < count:
+        raise ValueError(f"{name}: expected indices 0 to {count - 1}; found {int(found.min())} to {int(found.max())}.")
+    return found
+
+
+def scalar(arrays: Arrays, name: str) -> float:
+    """A finite number > 0; errors as of :func:`numbers`."""
+    value = float(numbers(arrays, name, ()))
+    if not value > 0:
+        raise ValueError(f"{name}: expected a number > 0; found {value}.")
+    return value
+
+
+def _text(shape: tuple[int | None, ...]) -> str:
+    return ", ".join("any" if n is None else str(n) for n in shape)

@@ -1,0 +1,127 @@
+"""What the benchmark of configurations measures, and that rows which took hours are never lost or mixed."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from otsync.types import TrackSet
+from recon import bench
+from recon.bench_rows import find, measured_before, paper_tables
+from recon.capture import clocks
+from recon.gaussians4d import Gaussians4D
+from recon.held_out import Clock
+from recon.motion import HermiteSpline, PerGaussian
+
+from .worlds import FRAMES, capture
+
+STEP = 1 / 30
+
+
+@pytest.fixture(scope="module")
+def truth() -> Gaussians4D:
+    """The simulated world itself, its motion splined through every frame."""
+    c = capture()
+    path = HermiteSpline.of(-0.1, 2.1, STEP, 0.1)
+    rest = c.world.moving(0.2)
+    knots = torch.as_tensor(c.world.positions(np.asarray(path.times)), dtype=torch.float32).transpose(0, 1)
+    return Gaussians4D(
+        rest, PerGaussian(path, knots - rest.means), footprint=0.02, frame_step=STEP, span=(0.0, 2.0),
+        static=c.world.static, near=c.near,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("clock", ["fps", "timestamps", "rate", "cut"])
+def test_held_out_tracks_are_compared_at_their_own_times(truth, clock):
+    """The Gaussians' own tracks are followed as on the reference's clock, whatever clock they are given on."""
+    offset, rate, fps = 0.013, 1.0, 30.0
+    own = np.arange(60) * STEP
+    if clock == "fps":
+        fps = 25.0
+        own = np.arange(50) / fps
+    elif clock == "timestamps":
+        own = own + 0.3 * STEP * np.sin(np.arange(60))
+    elif clock == "rate":
+        rate = 1.2
+    else:
+        own = own[7:]
+    tracks = TrackSet(truth.tracks(rate * own + offset)[::40], timestamps=own, name="b")
+    offsets = replace(clocks(("a", "b"), np.array([0.0, offset]), fps), rates=np.array([1.0, rate]))
+    figures = bench.motion_figures(truth, SimpleNamespace(offsets=offsets), [tracks])  # type: ignore[arg-type]
+    plain = TrackSet(truth.tracks(np.arange(60) * STEP)[::40], fps=30.0, name="a")
+    wanted = bench.motion_figures(truth, SimpleNamespace(offsets=offsets), [plain])  # type: ignore[arg-type]
+    assert figures["follow_20"] == pytest.approx(wanted["follow_20"], abs=0.1)  # footprints
+
+
+def test_positions_between_frames_lie_on_the_line_and_not_where_nothing_was_seen():
+    xyz = np.arange(6.0)[None, :, None] * np.ones((1, 1, 3))
+    xyz[0, 3] = np.nan
+    tracks = TrackSet(xyz, timestamps=np.array([0.0, 1, 2, 3, 4, 9]), name="a")
+    found = bench.positions_at(tracks, np.array([-0.5, 0.0, 0.5, 2.0, 2.5, 3.0, 4.0, 6.0, 9.0, 9.5]))[0, :, 0]
+    nan = np.nan
+    np.testing.assert_allclose(found, [nan, 0, 0.5, 2, nan, nan, 4, nan, 5, nan])
+    assert np.isnan(bench.positions_at(TrackSet(xyz[:, :1], fps=1.0, name="a"), np.zeros(2))).all()
+
+
+@pytest.mark.parametrize("layered", [True, False])
+def test_held_out_views_are_drawn_as_the_fit_drew_them(truth, monkeypatch, layered):
+    seen = []
+    real = bench.view
+
+    def looking(*args, **options):
+        seen.append(options.get("layered", True))
+        return real(*args, **options)
+
+    monkeypatch.setattr(bench, "view", looking)
+    ready = SimpleNamespace(held_out=capture().held_out, clocks={"held0": Clock(0.0)}, layered=layered)
+    figures = bench.held_out_figures(replace(truth, span=(0.0, (FRAMES - 1) * STEP)), ready)  # type: ignore[arg-type]
+    assert seen == [layered] and figures["psnr"] > 20 and np.isnan(figures["lpips"])
+
+
+def row(name: str, amplitude: float = 1.0, seed: int = 0, **figures: float | None) -> dict:
+    base = {"start": 0.5, "mean": 0.1, "max": 0.2, "psnr": 25.0, "ssim": 0.9, "lpips": None, "mask_psnr": 20.0,
+            "mask_ssim": 0.8, "neighbour_change": 0.3, "follow_20": 2.0}  # fmt: skip
+    return {"configuration": name, "amplitude": amplitude, "seed": seed, **base, **figures}
+
+
+def test_rows_are_continued_only_where_they_were_measured_alike(tmp_path):
+    about = {"protocol": {"width": 320, "seeds": (0,), "amplitudes": (1.0,), "frames": (2, 9)}, "figures": 2}
+    assert measured_before(tmp_path, about) == []
+    rows = [row("ours"), row("fixed", seed=1)]
+    (tmp_path / "recon.json").write_text(json.dumps({**about, "rows": rows}))
+    more = {**about, "protocol": {**about["protocol"], "seeds": (0, 1), "amplitudes": (3.0,)}}
+    assert measured_before(tmp_path, more) == rows
+    for other in ({"figures": 3}, {"protocol": {**about["protocol"], "width": 160}}):
+        with pytest.raises(ValueError, match=r"differs: .*now (3|160)"):
+            measured_before(tmp_path, {**about, **other})
+    for text in ("[]", '{"rows": 3}', '{"rows": [{"seed": 1}]}', "{"):
+        (tmp_path / "recon.json").write_text(text)
+        with pytest.raises(ValueError, match=r"recon\.json: expected"):
+            measured_before(tmp_path, about)
+
+
+def test_a_row_without_lpips_is_measured_again_once_there_are_weights():
+    rows = [row("ours"), row("fixed", lpips=0.1)]
+    assert find(rows, "ours", 1.0, 0, lpips=False) is rows[0]
+    assert find(rows, "ours", 1.0, 0, lpips=True) is None
+    assert find(rows, "fixed", 1.0, 0, lpips=True) is rows[1]
+    assert find(rows, "ours", 1.0, 1, lpips=False) is None
+
+
+def test_tables_in_the_papers_layout_average_seeds_and_say_why_lpips_lacks():
+    rows = [row("ours", psnr=24.0, max=0.2), row("ours", seed=1, psnr=25.0, max=0.7), row("true time", psnr=27.5),
+            row("w/o spline"), row("ours", amplitude=30.0, psnr=None, mean=None)]  # fmt: skip
+    small, large = paper_tables(rows, "tennis", "no weights given").split("errors of up to 30 frames")
+    views = next(line.split() for line in small.splitlines() if line.split()[:2] == ["tennis", "PSNR"])
+    assert views[2:] == ["26.41", "27.30", "27.50", "23.14", "26.32", "24.50"]
+    lpips = next(line.split() for line in small.splitlines() if "LPIPS   " in line)
+    assert lpips[-1] == "–" == lpips[4] and "LPIPS: no weights given." in small
+    offsets = next(line.split() for line in small.splitlines() if line.split()[:2] == ["tennis", "13.355"])
+    assert offsets[-4:] == ["0.500", "–", "0.100", "0.700"]
+    assert "w/o spline" in small and "2 seeds" in small and "27.50" not in large and "w/o spline" not in large
+    assert paper_tables([row("ours", lpips=0.123)], "kitchen").count("0.123") == 1
