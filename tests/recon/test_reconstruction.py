@@ -25,12 +25,12 @@ def refined(seed: int, steps: int, rates=RATES):
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [101, 102, 103])
 def test_offsets_and_held_out_views(seed):
-    error, held, result = refined(seed, 1200)
+    error, held, result = refined(seed, 3000)
     print(f"seed {seed}: mean {error.mean:.4f} max {error.max:.4f} held-out {held['psnr']:.2f} / {held['mask_psnr']:.2f} dB, "
           f"{result.stats['seconds']:.0f} s, {result.stats['gaussians']:.0f} Gaussians")  # fmt: skip
     assert error.mean <= 0.06 and error.max <= 0.12
     assert held["psnr"] >= 33.5 and held["mask_psnr"] >= 28
-    fixed = refined(seed, 1200, without(RATES, "offsets"))[1]
+    fixed = refined(seed, 3000, without(RATES, "offsets"))[1]
     print(f"seed {seed}: held fixed {fixed['psnr']:.2f} / {fixed['mask_psnr']:.2f} dB")
     assert held["mask_psnr"] >= fixed["mask_psnr"] + 0.7
 
