@@ -34,6 +34,7 @@ from recon.gaussians import Gaussians
 from recon.gaussians4d import Gaussians4D, scene_arrays, scene_from_arrays
 from recon.held_out import Clock
 from recon.motion import ScaffoldOptions, build_scaffold
+from recon.seed import Seeding, moments, seed, shown_at
 from recon.track_sets import of_every_video, tracks_of
 
 Tell = Callable[[str], None]
@@ -46,8 +47,8 @@ class Plan:
 
     Args:
         width: working pixels. frames: first and last (exclusive) frame of every video; None: all.
-        scaffold: how the motion is built. losses, effects, densify: of the fit; effects get the gains of the backdrop
-            by themselves.
+        scaffold: how the motion is built. seeding: how densely Gaussians begin.
+        losses, effects, densify: of the fit; effects get the gains of the backdrop by themselves.
         freeze: parameter groups that the fit holds, "offsets" for instance.
         batch: images a step, each on a thread of its own.
         views: frames of every camera that are compared at the end. backdrop_steps: of the fit of the static part.
@@ -57,6 +58,7 @@ class Plan:
     width: int = 320
     frames: tuple[int, int] | None = None
     scaffold: ScaffoldOptions = field(default_factory=ScaffoldOptions)
+    seeding: Seeding = field(default_factory=Seeding)
     losses: tuple[Loss, ...] = LOSSES
     effects: tuple[Effect, ...] = ()
     densify: Densify | None = None
@@ -405,7 +407,7 @@ def initial_scene(
     """The scene before any refinement: a scaffold through the tracks, and what the depth maps show of it; kept."""
     clocks = (np.round(offsets.seconds, 6).tolist(), np.round(offsets.rates, 9).tolist(), offsets.reference)
     gains = np.ones((len(footage), 3)) if static is None else static.gains
-    key = (*content_key(scene, tracks), clocks, gains.tolist(), plan.width, plan.scaffold, plan.seed)
+    key = (*content_key(scene, tracks), clocks, gains.tolist(), plan.width, plan.scaffold, plan.seeding, plan.seed)
 
     def build() -> dict[str, np.ndarray]:
         built = seeded(scene, offsets, tracks, footage, gains, plan, cache, map, progress)
@@ -425,7 +427,6 @@ def seeded(
 ) -> Gaussians4D:  # fmt: skip
     """Build what :func:`initial_scene` keeps."""
     from otsync.depth_maps import depth_maps
-    from recon.seed import moments, seed, shown_at
 
     footprint = world_footprint(tracks, footage)
     frame_step = 1.0 / float(offsets.fps[offsets.reference])
@@ -450,4 +451,5 @@ def seeded(
     ]
     return seed(
         motion, footage, offsets, depth, footprint=footprint, frame_step=frame_step, span=span, times=times, gains=gains,
+        options=plan.seeding,
     )  # fmt: skip
