@@ -13,7 +13,7 @@ import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +55,7 @@ class Protocol:
             measured with all of them: few cameras are few images, not another front-end.
         amplitudes: frames; errors are drawn uniformly within them, one seed after another.
         seeds: of the draws. steps: of the fit, of ``batch`` images each; budget: wall seconds instead.
-        width: working pixels. seeding: how densely Gaussians begin.
+        width: working pixels. voxel: footprints between Gaussians at the start, see :class:`recon.seed.Seeding`.
         held_out_tracks: share of the tracks that no scaffold sees.
     """
 
@@ -68,7 +68,7 @@ class Protocol:
     budget: float | None = None
     batch: int = 2
     width: int = 320
-    seeding: Seeding = field(default_factory=Seeding)
+    voxel: float = 2.7
     held_out_tracks: float = 0.1
     backdrop_steps: int = 1500
 
@@ -147,7 +147,7 @@ def measure(
     margin = max(configuration.scaffold.margin, (amplitude + 1) / float(believed.fps[believed.reference]))
     plan = Plan(
         width=protocol.width, scaffold=replace(configuration.scaffold, margin=margin), losses=configuration.losses,
-        seeding=protocol.seeding, batch=protocol.batch, backdrop_steps=protocol.backdrop_steps,
+        seeding=Seeding(voxel=protocol.voxel), batch=protocol.batch, backdrop_steps=protocol.backdrop_steps,
     )  # fmt: skip
     ready = prepare(
         material.scene, built_from, material.tracks, plan=plan, held_out=material.held_out, cache=cache, map=map
@@ -272,7 +272,7 @@ def about(protocol: Protocol, scene: Scene, truth: Offsets) -> Mapping[str, Any]
     clips = [[v.name, len(v.frames), v.camera.width, v.camera.height] for v in scene.videos]
     true = {n: round(float(s), 6) for n, s in zip(truth.names, truth.seconds, strict=True)}
     return {
-        "protocol": asdict(protocol), "figures": FIGURES, "recording": {"videos": clips, "truth": true},
+        "protocol": vars(protocol), "figures": FIGURES, "recording": {"videos": clips, "truth": true},
         "published": PUBLISHED, "unit": "frames, dB, footprints",
     }  # fmt: skip
 
