@@ -40,6 +40,8 @@ class Run:
     """Seconds for the fit, after everything is prepared; default: 300."""
     steps: int | None = None
     """Steps of the fit instead of seconds: the result is then the same on any machine of a kind."""
+    exposure: float = 0.0
+    """Seconds that the shutters were open, where moving things are blurred; 0: sharp. Readouts are in the scene."""
     seed: int = 0
     truth: Path | None = None
     """True offsets, where they are known: adds errors to tables and reports."""
@@ -63,7 +65,7 @@ class Run:
 
         options = FitOptions(
             held_out=self.held_out, width=self.width, frames=self.frames, budget=self.budget, steps=self.steps, seed=self.seed,
-            cache=self.recording.cache, workers=self.recording.workers,
+            exposure=self.exposure, cache=self.recording.cache, workers=self.recording.workers,
         )  # fmt: skip
         options.length()  # before the work, not after it
         scene = opened(self.scene, self.allow_outside or self.recording.allow_outside)

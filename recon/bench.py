@@ -25,7 +25,7 @@ from otsync.io import Scene
 from otsync.types import Offsets, TrackSet
 from recon.bench_rows import find, measured_before, paper_tables
 from recon.configurations import CONFIGURATIONS, Configuration
-from recon.effects import Gain
+from recon.effects import Gain, with_declared
 from recon.evaluate import acceleration, coherence, following_error, offset_error
 from recon.fit import fit
 from recon.gaussians4d import Gaussians4D
@@ -155,7 +155,8 @@ def measure(
     began = time.perf_counter(), time.process_time()
     found = fit(
         configuration.motion(ready.initial), ready.footage, ready.offsets, losses=plan.losses,
-        effects=(Gain(start=ready.gains),), rates=configuration.rates, steps=protocol.steps if protocol.budget is None else None,
+        effects=(*with_declared((), [f.readout for f in ready.footage]), Gain(start=ready.gains)),
+        rates=configuration.rates, steps=protocol.steps if protocol.budget is None else None,
         budget=protocol.budget, batch=protocol.batch,
     )  # fmt: skip
     seconds, cpu = time.perf_counter() - began[0], time.process_time() - began[1]

@@ -21,7 +21,6 @@ from recon.commands_bench import Bench
 from recon.density import Densify
 from recon.export import Format
 from recon.motion import ScaffoldOptions
-from recon.seed import Seeding
 
 if TYPE_CHECKING:
     from otsync.io import Scene
@@ -55,7 +54,12 @@ class FitOptions:
     densify: Densify | None = None
     """Split what is pulled hardest, drop what is faint; off unless asked for."""
     scaffold: ScaffoldOptions = field(default_factory=ScaffoldOptions)
-    seeding: Seeding = field(default_factory=Seeding)
+    voxel: float = 2.7
+    """Working pixels between the Gaussians that what moves begins with: finer is slower and shows more."""
+    sh_degree: int = 0
+    """Harmonics of the colours of what moves, 1 to 4 where they depend on the view (sheen); 0: they do not."""
+    exposure: float = 0.0
+    """Seconds that the shutters were open, where moving things are blurred; 0: sharp. Readouts are in the scene."""
     save_every: float = 60.0
     """Seconds between two savings of the fit, from the last of which a killed run continues."""
     allow_outside: bool = False
@@ -67,10 +71,13 @@ class FitOptions:
 
     def plan(self) -> Plan:
         """The pipeline's form of this."""
+        from recon.effects import MotionBlur
         from recon.prepare import Plan
+        from recon.seed import Seeding
 
         return Plan(
-            width=self.width, frames=self.frames, scaffold=self.scaffold, seeding=self.seeding, densify=self.densify, freeze=self.freeze,
+            effects=(MotionBlur(self.exposure),) if self.exposure else (),
+            width=self.width, frames=self.frames, scaffold=self.scaffold, seeding=Seeding(self.voxel, sh_degree=self.sh_degree), densify=self.densify, freeze=self.freeze,
             batch=self.batch, seed=self.seed, backdrop_steps=self.backdrop_steps,
             save_every=self.save_every,
         )  # fmt: skip
@@ -299,15 +306,30 @@ class Simulate:
     height: int = 96
     max_offset: float = 1.0
     """Largest offset, in frames."""
+    gain: float = 0.0
+    """Cameras differ in exposure and white balance: standard deviation of the logarithm. 0, like all below: absent."""
+    noise: float = 0.0
+    """White noise beyond the usual 1 %, in 0..1."""
+    exposure: float = 0.0
+    """Seconds that shutters are open: motion blur."""
+    readout: float = 0.0
+    """Seconds from the first to the last row: rolling shutter, which scene.json then declares."""
+    sheen: float = 0.0
+    """Strength of a lamp that what moves reflects, in 0..1: colours depend on the view."""
     seed: int = 0
 
     def run(self) -> int:
         from recon.capture import write_capture
-        from recon.simulate import synthetic
+        from recon.simulate import Blur, Exposure, MoreNoise, Rolling, Sheen, synthetic
 
+        wanted = ((Sheen, self.sheen), (Blur, self.exposure), (Rolling, self.readout), (Exposure, self.gain),
+                  (MoreNoise, self.noise))  # fmt: skip
+        if not all(0 <= size < math.inf for _, size in wanted):
+            raise ValueError("--gain, --noise, --exposure, --readout, --sheen: expected numbers of 0 or more.")
         capture = synthetic(
             self.seed, cameras=self.cameras, held_out=self.held_out, frames=self.frames,
             size=(self.width, self.height), offsets=self.max_offset,
+            effects=tuple(effect(size) for effect, size in wanted if size),
         )  # fmt: skip
         write_capture(capture, self.out)
         held = " ".join(f.name for f in capture.held_out)

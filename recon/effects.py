@@ -98,6 +98,29 @@ def initial_parameters(effects: Sequence[Effect], n_videos: int) -> dict[str, Te
     return out
 
 
+def with_declared(effects: Sequence[Effect], readouts: Sequence[float | None]) -> tuple[Effect, ...]:
+    """``effects``, and after them the rolling shutter that the videos' cameras declare; the same where none does.
+
+    A shutter among ``effects`` stands for all of them.
+    """
+    if not any(readouts) or any(isinstance(e, RollingShutter) for e in effects):
+        return tuple(effects)
+    return (*effects, RollingShutter(tuple(float(r or 0.0) for r in readouts)))
+
+
+def optics(effects: Sequence[Effect], readout: float | None, video: int | None = None) -> tuple[Effect, ...]:
+    """What blurs and slants the images of one camera, for a look through it alone, as its video 0.
+
+    Args:
+        readout: that the camera declares. video: its place among those ``effects`` are of; None: none of them, so that
+            only what holds for all is known of it.
+    """
+    own = [
+        alone for e in effects if isinstance(e, MotionBlur | RollingShutter) and (alone := e.alone(video)) is not None
+    ]
+    return with_declared(own, [readout])
+
+
 def prior(effects: Sequence[Effect], params: Params) -> Tensor | None:
     """Sum of the effects' priors; None when no effect has one."""
     terms = [term for effect in effects if (term := effect.prior(params)) is not None]
@@ -178,6 +201,11 @@ class MotionBlur:
         _check_count("exposure", self.exposure, n_videos)
         return {}
 
+    def alone(self, video: int | None) -> MotionBlur | None:
+        """As it is for one video; None: for one that it does not tell of."""
+        own = _of_one(self.exposure, video)
+        return None if own is None else replace(self, exposure=own)
+
     def prior(self, params: Params) -> Tensor | None:
         """None."""
         return None
@@ -219,6 +247,11 @@ class RollingShutter:
         """Nothing to learn."""
         _check_count("readout", self.readout, n_videos)
         return {}
+
+    def alone(self, video: int | None) -> RollingShutter | None:
+        """As it is for one video; None: for one that it does not tell of."""
+        own = _of_one(self.readout, video)
+        return None if own is None else replace(self, readout=own)
 
     def prior(self, params: Params) -> Tensor | None:
         """None."""
@@ -266,6 +299,10 @@ def _stack(parts: Sequence[Rendered]) -> Rendered:
 
 def _of_video(seconds: float | tuple[float, ...], video: int) -> float:
     return seconds[video] if isinstance(seconds, tuple) else seconds
+
+
+def _of_one(seconds: float | tuple[float, ...], video: int | None) -> float | None:
+    return seconds if not isinstance(seconds, tuple) else None if video is None else seconds[video]
 
 
 def _check_seconds(name: str, seconds: float | tuple[float, ...]) -> None:

@@ -54,15 +54,23 @@ class Gaussians:
             raise ValueError(f"sh: expected shape ({n}, 1 | 4 | 9 | 16 | 25, 3), got {tuple(self.sh.shape)}")
 
     @classmethod
-    def from_colors(cls, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor) -> Gaussians:
+    def from_colors(
+        cls, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, *, sh_degree: int = 0
+    ) -> Gaussians:
         """From activated values: scales >= 0 [N,3], opacities in 0..1 [N], colours [N,3] seen alike from everywhere.
+
+        sh_degree: 0..4, of the harmonics that there is room for; above the constant they are 0.
 
         Scales below 1e-12 and opacities within 1e-6 of 0 and 1 become these limits, whose logarithms are finite.
         """
         if (scales < 0).any() or (opacities < 0).any() or (opacities > 1).any():
             raise ValueError("scales, opacities: expected scales >= 0 and opacities in 0..1, got values beyond")
         scales, opacities = scales.clamp_min(1e-12), opacities.clamp(1e-6, 1 - 1e-6)
-        return cls(means, quats, scales.log(), opacities.logit(), ((colors - 0.5) / sh.C0)[:, None])
+        if sh_degree not in range(sh.MAX_DEGREE + 1):
+            raise ValueError(f"sh_degree: expected 0 to {sh.MAX_DEGREE}, got {sh_degree}")
+        constant = ((colors - 0.5) / sh.C0)[:, None]
+        rest = constant.new_zeros(len(means), (sh_degree + 1) ** 2 - 1, 3)
+        return cls(means, quats, scales.log(), opacities.logit(), torch.cat([constant, rest], 1))
 
     def __len__(self) -> int:
         return len(self.means)

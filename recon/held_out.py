@@ -7,7 +7,7 @@ for which the rendered motion differs least from the filmed one.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -17,6 +17,8 @@ from jaxtyping import Float
 from scipy.optimize import minimize_scalar
 from torch import Tensor
 
+from recon.effects import Effect, Rendered, Shot, compose
+from recon.effects import optics as optics_of
 from recon.evaluate import mean_scores, score_image
 from recon.footage import Footage
 from recon.gaussians import Gaussians
@@ -78,6 +80,7 @@ def view(
     *,
     gain: Float[np.ndarray, " 3"] | None = None,
     layered: bool = True,
+    optics: tuple[Effect, ...] | None = None,
 ) -> View:
     """A camera on the scene's clock.
 
@@ -85,9 +88,11 @@ def view(
         clock: of the camera; None: not known, all of the scene's span is searched.
         gain: of the camera; None: found.
         layered: see :class:`View`.
+        optics: see :func:`recon.effects.optics`; None: the rolling shutter that the camera declares.
     """
     own = np.ones(3) if gain is None else gain
-    looking = View(scene, footage, clock or Clock(0.0), own, _static_views(scene, footage), layered)
+    optics = optics_of((), footage.readout) if optics is None else optics
+    looking = View(scene, footage, clock or Clock(0.0), own, _static_views(scene, footage), layered, optics)
     if gain is None:
         looking = looking.with_gain()
     return looking.scanned() if clock is None else looking
@@ -99,7 +104,7 @@ class View:
 
     layered: what moves is drawn over what is static, as a fit of fixed cameras assumes it: there the floor's splats,
     whose depth nothing but the cameras' parallax tells, would otherwise hide the feet that stand on it. False: one
-    rendering of both, for fits that did so (moving cameras).
+    rendering of both, for fits that did so (moving cameras). optics: what blurs and slants what moves in its images.
     """
 
     scene: Gaussians4D
@@ -108,6 +113,7 @@ class View:
     gain: Float[np.ndarray, " 3"]
     static: Tensor | None
     layered: bool = True
+    optics: tuple[Effect, ...] = ()
 
     def world(self, frame: int, seconds: float | None = None) -> float:
         """World seconds of a frame, also under another offset."""
@@ -116,11 +122,25 @@ class View:
     def image(self, t: float, frame: int = 0) -> Tensor:
         """[h,w,3] at world second ``t`` by the pose of ``frame``, times the gain, 0..1."""
         if self.layered and self.static is not None:
-            rgb, alpha = _draw(self.scene.moving(t), self.footage, frame, 0.01 * self.scene.near)
+            rgb, alpha = self._through(self.scene.moving, t, frame, 0.01 * self.scene.near)
             out = rgb + (1 - alpha) * self.static[frame if len(self.static) > 1 else 0]
         else:
-            out = _draw(self.scene.at(t), self.footage, frame, self.scene.near)[0]
+            out = self._through(self.scene.at, t, frame, self.scene.near)[0]
         return (out * torch.as_tensor(self.gain, dtype=out.dtype)).clamp(0, 1)
+
+    def _through(
+        self, at: Callable[[float], Gaussians], t: float, frame: int, near: float,
+        box: tuple[int, int, int, int] | None = None,
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
+        """Colours [h,w,3] and alpha [h,w,1] of the Gaussians ``at`` a time, through the camera's optics."""
+
+        def observe(shot: Shot) -> Rendered:
+            return Rendered(*_draw(at(float(shot.t)), self.footage, frame, near, shot.box))
+
+        w, h = self.footage.size
+        shot = Shot(0, torch.tensor(t, dtype=torch.float64), box or (0, 0, w, h), h, frame)
+        seen = compose(observe, self.optics, {})(shot)
+        return seen.rgb, seen.alpha
 
     def with_gain(self) -> View:
         """The gain for which the static part matches best where nothing ever moves; 1 where that cannot be told."""
@@ -160,8 +180,8 @@ class View:
             x0, y0, x1, y1 = (int(x) for x in self.footage.boxes[k])
             filmed = torch.as_tensor(self.footage.images[k, y0:y1, x0:x1]).float() / 255
             behind = self._behind(int(k))[y0:y1, x0:x1]
-            moving = self.scene.moving(self.world(int(k), seconds))
-            rgb, alpha = _draw(moving, self.footage, int(k), 0.01 * self.scene.near, (x0, y0, x1, y1))
+            box, near = (x0, y0, x1, y1), 0.01 * self.scene.near
+            rgb, alpha = self._through(self.scene.moving, self.world(int(k), seconds), int(k), near, box)
             drawn = rgb * gain + (1 - alpha) * behind
             with_motion += float((drawn - filmed).square().sum())
             without += float((behind - filmed).square().sum())

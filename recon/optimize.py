@@ -20,6 +20,7 @@ RATES: Mapping[str, float] = {
     "log_scales": 6e-3,
     "opacity_logits": 0.03,
     "sh": 0.02,
+    "sh_rest": 1e-3,
     "knots": 0.075,
     "own_knots": 0.075,
     "knot_quats": 2e-3,

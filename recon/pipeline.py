@@ -16,7 +16,7 @@ from otsync.files import write_json
 from otsync.io import Scene
 from otsync.io.mend import cut
 from otsync.types import Offsets, TrackSet
-from recon.effects import Gain
+from recon.effects import Effect, Gain, MotionBlur, optics, with_declared
 from recon.evaluate import offset_error
 from recon.fit import Reconstruction, fit
 from recon.held_out import Clock, ViewScore, view
@@ -75,7 +75,7 @@ def reconstruct(
     clear_parts(out, out / "stages")
     ready = prepare(scene, offsets, tracks, plan=plan, held_out=held_out, cache=cache, map=map, progress=progress)
     true = None if truth is None else true_seconds(truth, ready.offsets)
-    effects = (Gain(start=ready.gains), *plan.effects)
+    effects = (*with_declared(plan.effects, [f.readout for f in ready.footage]), Gain(start=ready.gains))
     with progress.stage("fit"):
         found = fit(
             ready.initial, ready.footage, ready.offsets, losses=plan.losses, effects=effects, rates=rates, steps=steps,
@@ -105,7 +105,10 @@ def compared(
     scores = []
     for footage in ready.held_out:
         try:
-            looking = view(found.scene, footage, ready.clocks.get(footage.name), layered=ready.layered)
+            looking = view(
+                found.scene, footage, ready.clocks.get(footage.name), layered=ready.layered,
+                optics=optics(plan.effects, footage.readout),
+            )  # fmt: skip
             scores.append(looking.score(most=plan.views))
         except ValueError as error:
             progress.note(f"held-out video {footage.name} is not compared: {error}")
@@ -114,7 +117,10 @@ def compared(
     for n in _some(len(ready.footage), SHOWN_TRAINING):
         footage = ready.footage[n]
         try:
-            looking = view(found.scene, footage, clocks[n], gain=gains[n], layered=ready.layered)
+            looking = view(
+                found.scene, footage, clocks[n], gain=gains[n], layered=ready.layered,
+                optics=optics(plan.effects, footage.readout, n),
+            )  # fmt: skip
             scores.append(looking.score(most=max(1, plan.views // 4), held_out=False))
         except ValueError as error:
             progress.note(f"video {footage.name} is not compared: {error}")
@@ -150,7 +156,7 @@ def _write(
         metrics["offset_error"] = offset_figures(found.offsets, outcome.truth)
     write_json(out / "metrics.json", metrics)
     options = {"width": plan.width, "frames": plan.frames, "seed": plan.seed, "freeze": list(plan.freeze),
-               "layered": ready.layered}  # fmt: skip
+               "layered": ready.layered, "exposure": common_exposure(plan.effects)}  # fmt: skip
     save_run(
         out, videos, options=options, frame=ready.frame, notes=progress.notes, seconds=progress.seconds,
     )  # fmt: skip
@@ -158,6 +164,11 @@ def _write(
         out / "report.html", found, outcome.coarse, [f.name for f in ready.footage], outcome.views,
         seconds=progress.seconds, notes=progress.notes, truth=outcome.truth, lpips_reason=outcome.lpips_reason,
     )  # fmt: skip
+
+
+def common_exposure(effects: Sequence[Effect]) -> float:
+    """Seconds that all shutters were open, as far as ``effects`` tell; 0: sharp, or each its own."""
+    return next((e.exposure for e in effects if isinstance(e, MotionBlur) and not isinstance(e.exposure, tuple)), 0.0)
 
 
 def offset_figures(offsets: Offsets, true: np.ndarray) -> dict[str, Any]:
@@ -203,11 +214,15 @@ def evaluate(
     part = readable(part, cache, map, progress)
     known = {v.name: v for v in result.videos}
     scores = []
+    exposure = float(result.options.get("exposure") or 0.0)
+    blur = (MotionBlur(exposure),) if exposure else ()
     for footage in read_footage(part, int(result.options["width"]), cache, map, progress):
         own = known.get(footage.name)
         clock, gain = (None, None) if own is None else (own.clock, own.gain)
         if offsets is not None and (own is None or own.held_out):
             clock = given_clocks(offsets).get(footage.name, clock)
-        looking = view(result.scene, footage, clock, gain=gain, layered=result.layered)
+        looking = view(
+            result.scene, footage, clock, gain=gain, layered=result.layered, optics=optics(blur, footage.readout)
+        )
         scores.append(looking.score(most=most, lpips=lpips, held_out=own is None or own.held_out))
     return tuple(scores), lpips.reason

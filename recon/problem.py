@@ -133,8 +133,13 @@ class Problem:
 
 
 def scene_groups(scene: Gaussians4D) -> dict[str, Tensor]:
-    """The parameter groups of a scene: the dynamic Gaussians' by their own names, the static ones' with a prefix."""
+    """The parameter groups of a scene: the dynamic Gaussians' by their own names, the static ones' with a prefix.
+
+    What depends on the view is a group of its own, as in 3DGS: few cameras are soon fitted by it instead of by shape.
+    """
     out = {f.name: getattr(scene.dynamic, f.name) for f in fields(scene.dynamic)}
+    if scene.dynamic.sh_degree:
+        out["sh"], out["sh_rest"] = scene.dynamic.sh[:, :1], scene.dynamic.sh[:, 1:]
     out |= scene.motion.parameters()
     if scene.features is not None:
         out["features"] = scene.features
@@ -145,7 +150,10 @@ def scene_groups(scene: Gaussians4D) -> dict[str, Tensor]:
 
 def assemble(scene: Gaussians4D, groups: Mapping[str, Tensor]) -> Gaussians4D:
     """The scene with the groups' values."""
-    dynamic = replace(scene.dynamic, **{f.name: groups[f.name] for f in fields(scene.dynamic)})
+    own = {f.name: groups[f.name] for f in fields(scene.dynamic)}
+    if "sh_rest" in groups:
+        own["sh"] = torch.cat([groups["sh"], groups["sh_rest"]], 1)
+    dynamic = replace(scene.dynamic, **own)
     motion = scene.motion.with_parameters({n: groups[n] for n in scene.motion.parameters()})
     static = scene.static
     if static is not None:

@@ -24,7 +24,7 @@ from recon.uncertainty import newton_sigma
 
 RECORDS = 200  # rows of history in a fit
 PER_NODE = ("knots", "knot_quats")
-PER_GAUSSIAN = ("means", "quats", "log_scales", "opacity_logits", "sh", "features", "own_knots")
+PER_GAUSSIAN = ("means", "quats", "log_scales", "opacity_logits", "sh", "sh_rest", "features", "own_knots")
 
 
 class Diverged(RuntimeError):

@@ -40,6 +40,8 @@ class Seeding:
         voxel: footprints between seeds. support: pixels that must have seen a voxel, so that stray depths seed nothing.
         reach: voxels within which a warped Gaussian counts as being there already.
         scale: standard deviation, in voxels. opacity: at the start.
+        sh_degree: 1 to 4 where the colours of what moves depend on the direction they are seen from (sheen, strong
+            lamps), in the world's directions; 0: they do not, and nothing is computed for it.
     """
 
     voxel: float = 2.7
@@ -47,6 +49,7 @@ class Seeding:
     reach: float = 1.3
     scale: float = 0.55
     opacity: float = 0.8
+    sh_degree: int = 0
 
     def __post_init__(self) -> None:
         if not (self.voxel > 0 and self.reach > 0 and self.scale > 0 and self.support >= 1 and 0 < self.opacity < 1):
@@ -184,7 +187,7 @@ def seed(
     n = len(means)
     gaussians = Gaussians.from_colors(
         means, _upright(n), torch.full((n, 3), options.scale * voxel), torch.full((n,), options.opacity),
-        torch.as_tensor(colors, dtype=torch.float32),
+        torch.as_tensor(colors, dtype=torch.float32), sh_degree=options.sh_degree,
     )  # fmt: skip
     return Gaussians4D(gaussians, motion, footprint, frame_step, span)
 

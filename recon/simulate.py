@@ -50,7 +50,7 @@ class World:
     Args:
         scene: the rigid parts and their poses.
         part: (N,) part of every moving Gaussian; six parts a body.
-        local: (N,3) its position in the part's frame, m.
+        local: (N,3) its position in the part's frame, m. normals: (N,3) which way the surface faces there, unit.
         colors: (N,3) RGB in 0..1.
         static: floor and wall.
     """
@@ -58,6 +58,7 @@ class World:
     scene: Scene
     part: Int[np.ndarray, " N"]
     local: Float[np.ndarray, "N 3"]
+    normals: Float[np.ndarray, "N 3"]
     colors: Float[np.ndarray, "N 3"]
     static: Gaussians
 
@@ -70,6 +71,10 @@ class World:
         """Of the moving Gaussians at world ``times`` (s)."""
         R, p = self.scene.pose(np.asarray(times, float))
         return np.einsum("ntij,nj->nti", R[self.part], self.local) + p[self.part]
+
+    def facing(self, t: float) -> Float[np.ndarray, "N 3"]:
+        """Normals of the surfaces that the moving Gaussians lie on, at world time ``t`` (s)."""
+        return np.einsum("nij,nj->ni", self.scene.pose(np.array([t]))[0][self.part, 0], self.normals)
 
     def moving(self, t: float) -> Gaussians:
         """The moving Gaussians at world time ``t`` (s)."""
@@ -219,7 +224,28 @@ class Rolling:
         return rolled
 
 
-Effect = Exposure | MoreNoise | Blur | Rolling
+@dataclass(frozen=True)
+class Sheen:
+    """A lamp that what moves reflects: ``size * max(0, n . h) ** sharpness`` on every channel (Blinn 1977).
+
+    h: half-way between the directions of the lamp, which is far away, and of the camera.
+    """
+
+    size: float = 0.3
+    sharpness: float = 6.0
+    lamp: tuple[float, float, float] = (0.3, -0.4, 0.87)
+
+    def light(self, means: np.ndarray, normals: np.ndarray, eye: np.ndarray) -> Float[np.ndarray, "N 1"]:
+        """What it adds to the colours that the camera at ``eye`` sees."""
+        to_eye = eye - means
+        half = to_eye / np.linalg.norm(to_eye, axis=1, keepdims=True) + np.asarray(self.lamp) / np.linalg.norm(
+            self.lamp
+        )
+        half /= np.maximum(np.linalg.norm(half, axis=1, keepdims=True), 1e-9)
+        return self.size * np.maximum((normals * half).sum(1, keepdims=True), 0) ** self.sharpness
+
+
+Effect = Exposure | MoreNoise | Blur | Rolling | Sheen
 
 
 @dataclass(frozen=True, eq=False)
@@ -263,7 +289,7 @@ class Film:
             backdrop, wall = self._render(self.world.static, NEAR)
             images, masks, depths = [], [], []
             for t in times:
-                body, z = self._render(self.world.moving(float(t)), 0.01)
+                body, z = self._render(self._moving(float(t)), 0.01)
                 seen = self._see(body)(float(t))
                 image = (seen.rgb + (1 - seen.alpha) * backdrop.rgb).numpy() * self.gain
                 for size, rng in self.noise:
@@ -280,10 +306,19 @@ class Film:
         if not optics:
             return lambda t: now
 
-        see: See = lambda t: self._render(self.world.moving(t), 0.01)[0]  # noqa: E731
+        see: See = lambda t: self._render(self._moving(t), 0.01)[0]  # noqa: E731
         for effect in optics:
             see = effect(see, self.camera)
         return see
+
+    def _moving(self, t: float) -> Gaussians:
+        """What moves, in the colours that this camera sees."""
+        moving = self.world.moving(t)
+        for lamp in (e for e in self.effects if isinstance(e, Sheen)):
+            R, shift = self.camera.w2c[:3, :3], self.camera.w2c[:3, 3]
+            light = lamp.light(moving.means.numpy(), self.world.facing(t), -R.T @ shift)
+            moving = replace(moving, sh=moving.sh + torch.as_tensor(light / sh.C0, dtype=torch.float32)[:, None])
+        return moving
 
     def _render(self, gaussians: Gaussians, near: float) -> tuple[Instant, np.ndarray]:
         """What the camera sees of them, and the expected depth [h,w], 0 where there is nothing."""
@@ -307,12 +342,12 @@ def _world(seed: int) -> World:
         return np.concatenate([R for R, _ in poses]), np.concatenate([p for _, p in poses])
 
     rng = stream(seed, "surface")
-    part, local, _ = sample_surface(parts, 2200, rng)
+    part, local, normals = sample_surface(parts, 2200, rng)
     base = rng.uniform(0.1, 0.9, (len(parts), 3))
     wave = rng.normal(0, 18, (len(parts), 3, 3))
     texture = 0.18 * np.sin(np.einsum("ni,nij->nj", local, wave[part])) + 0.05 * rng.standard_normal((len(part), 3))
     return World(
-        Scene(parts, pose, distance=2.6, center=(0, 0, 0.7)), part, local, np.clip(base[part] + texture, 0, 1),
+        Scene(parts, pose, distance=2.6, center=(0, 0, 0.7)), part, local, normals, np.clip(base[part] + texture, 0, 1),
         _room(stream(seed, "room")),
     )  # fmt: skip
 

@@ -16,7 +16,9 @@ from recon.effects import (
     Shot,
     compose,
     initial_parameters,
+    optics,
     prior,
+    with_declared,
 )
 from recon.raster import render
 
@@ -220,3 +222,20 @@ def test_order_is_from_the_scene_outwards():
 def test_bad_effects_are_refused_by_name(make, says):
     with pytest.raises(ValueError, match=says):
         make()
+
+
+def test_a_declared_readout_becomes_a_shutter_once():
+    blur = MotionBlur(0.01)
+    assert with_declared((blur,), [None, 0.0]) == (blur,)
+    assert with_declared((blur,), [None, 0.02]) == (blur, RollingShutter((0.0, 0.02)))
+    own = RollingShutter(0.03)
+    assert with_declared((own,), [0.02, 0.02]) == (own,)
+
+
+def test_the_optics_of_one_camera():
+    effects = (Gain(), MotionBlur((0.01, 0.02)), RollingShutter(0.03))
+    assert optics(effects, None, 1) == (MotionBlur(0.02), RollingShutter(0.03))
+    # another camera's shutter is not known, and gains are no optics
+    assert optics(effects, 0.01) == (RollingShutter(0.03),)
+    assert optics(effects[:2], 0.01) == (RollingShutter((0.01,)),)
+    assert optics((), None) == ()

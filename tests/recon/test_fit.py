@@ -164,6 +164,18 @@ def test_a_stopped_fit_continues_with_the_same_bits(capture, scene, tmp_path, mo
     assert same(whole, again)
 
 
+def test_view_dependent_colours_are_a_group_of_their_own(capture, scene, tmp_path):
+    sh = torch.cat([scene.dynamic.sh, scene.dynamic.sh.new_zeros(len(scene), 3, 3)], 1)
+    shiny = replace(scene, dynamic=replace(scene.dynamic, sh=sh))
+    found = fit(shiny, capture.footage, believed(capture), steps=6, densify=Densify((0.5,), share=0.2))
+    assert found.scene.dynamic.sh.shape[1:] == (4, 3) and found.scene.dynamic.sh[:, 1:].abs().max() > 0
+    held = fit(shiny, capture.footage, believed(capture), steps=6, rates=without(RATES, "sh_rest"))
+    assert not held.scene.dynamic.sh[:, 1:].any() and not torch.equal(held.scene.dynamic.sh[:, :1], sh[:, :1])
+    # as long as they are zero they change no bit of the rest
+    plain = fit(scene, capture.footage, believed(capture), steps=6)
+    np.testing.assert_allclose(held.offsets.seconds, plain.offsets.seconds, atol=1e-7)
+
+
 def test_a_finished_fit_is_read_back(capture, scene, tmp_path):
     options = {"steps": 3, "checkpoint": tmp_path / "fit.npz"}
     assert same(*(fit(scene, capture.footage, believed(capture), **options) for _ in range(2)))

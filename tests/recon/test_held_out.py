@@ -11,8 +11,9 @@ import torch
 from recon.gaussians4d import Gaussians4D
 from recon.held_out import Clock, view
 from recon.motion import HermiteSpline, PerGaussian
+from recon.simulate import Rolling, synthetic
 
-from .worlds import FRAMES, capture
+from .worlds import CAMERAS, FRAMES, SIZE, capture
 
 STEP = 1 / 30
 
@@ -71,3 +72,13 @@ def test_nothing_that_moves_leaves_the_clock_unknown(truth):
     still = replace(f, masks=np.zeros_like(f.masks), boxes=np.zeros_like(f.boxes))
     with pytest.raises(ValueError, match="its clock cannot be found"):
         view(truth, still)
+
+
+def test_a_declared_readout_is_looked_through(truth):
+    """The clock of a camera whose rows are read one after the other is found, and its images are slanted alike."""
+    world = {"cameras": CAMERAS, "held_out": 1, "frames": FRAMES, "size": SIZE, "offsets": 0.8}
+    rolled = synthetic(5, **world, effects=(Rolling(0.03),)).held_out[0]
+    assert rolled.readout == 0.03
+    through, plain = view(truth, rolled, Clock(0.0)), view(truth, rolled, Clock(0.0), optics=())
+    assert through.score(most=6).mean["mask_psnr"] > plain.score(most=6).mean["mask_psnr"] + 1
+    assert abs(view(truth, rolled).clock.seconds) < 0.06 * STEP

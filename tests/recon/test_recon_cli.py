@@ -243,6 +243,35 @@ def test_simulate_writes_a_recording_that_the_printed_command_fits(tmp_path, cap
     assert "holds scene.json" in capsys.readouterr().err
 
 
+def test_declared_readouts_and_given_exposures_reach_the_fit(tmp_path, monkeypatch, capsys):
+    import recon.pipeline
+    from recon.effects import Gain, MotionBlur, RollingShutter
+
+    world, seen, fit = tmp_path / "w", [], recon.pipeline.fit
+
+    def spied(*args, **kwargs):
+        seen.append(kwargs["effects"])
+        return fit(*args, **kwargs)
+
+    monkeypatch.setattr(recon.pipeline, "fit", spied)
+    assert main(["simulate", str(world), "--cameras", "2", "--held-out", "1", "--frames", "6", "--width", "64",
+                 "--height", "40", "--readout", "0.02", "--exposure", "0.01", "--sheen", "0.2"]) == 0  # fmt: skip
+    assert open_scene(world).videos[0].camera.readout == 0.02
+    args = ["fit", str(world), "--offsets", str(world / "start.json"), "--out", str(tmp_path / "r"), "--width", "64",
+            "--tracks", *map(str, sorted((world / "tracks").glob("*.npz"))), "--steps", "3", "--backdrop-steps", "9",
+            "--held-out", "held0"]  # fmt: skip
+    assert main([*args, "--exposure", "0.01", "--sh-degree", "1"]) == 0
+    assert [type(e) for e in seen[0]] == [MotionBlur, RollingShutter, Gain]
+    assert seen[0][0].exposure == 0.01 and seen[0][1].readout == (0.02, 0.02)
+    result = load_result(tmp_path / "r")
+    assert result.scene.dynamic.sh_degree == 1 and result.options["exposure"] == 0.01
+    told = json.loads((tmp_path / "r" / "metrics.json").read_text())
+    assert main(["eval", str(tmp_path / "r"), str(world), "--out", str(tmp_path / "eval.json")]) == 0
+    assert json.loads((tmp_path / "eval.json").read_text())["held_out"] == told["held_out"]
+    assert main(["simulate", str(tmp_path / "x"), "--noise", "nan"]) == 2
+    assert "--noise" in capsys.readouterr().err
+
+
 def test_every_help_has_an_example(capsys):
     for verb in ("fit", "render", "eval", "export", "simulate", "bench"):
         with pytest.raises(SystemExit) as stop:

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from recon.evaluate import psnr
 from recon.raster import render, sh
-from recon.simulate import DEPTH_NOISE, FPS, NEAR, TRACK_NOISE, Blur, Exposure, MoreNoise, Rolling, synthetic
+from recon.simulate import DEPTH_NOISE, FPS, NEAR, TRACK_NOISE, Blur, Exposure, MoreNoise, Rolling, Sheen, synthetic
 
 SMALL = {"cameras": 3, "held_out": 1, "frames": 9, "size": (80, 48)}
 
@@ -182,6 +182,25 @@ def test_rows_are_read_one_after_the_other(capture):
         for s in (-1, 1)
     }
     assert psnr(whole[1], rolled.images[4, ::4]) > psnr(whole[-1], rolled.images[4, ::4]) + 1
+
+
+def test_sheen_is_brightest_half_way_between_lamp_and_camera():
+    lamp, eye = np.array([0.0, 0, 1]), np.array([[3.0, 0, 3.0]])
+    half = np.array([np.sin(np.pi / 8), 0, np.cos(np.pi / 8)])
+    normals = np.stack([half, [0.0, 0, 1], -half])
+    light = Sheen(0.4, 6.0, tuple(lamp)).light(np.zeros((3, 3)), normals, eye[0])[:, 0]
+    np.testing.assert_allclose(light, [0.4, 0.4 * np.cos(np.pi / 8) ** 6, 0], atol=1e-12)
+
+
+def test_sheen_changes_what_moves_and_nothing_else(capture):
+    shiny = synthetic(3, **SMALL, effects=(Sheen(0.4),))
+    np.testing.assert_array_equal(shiny.depth, capture.depth)
+    for plain, other in zip(capture.footage, shiny.footage, strict=True):
+        np.testing.assert_array_equal(plain.masks, other.masks)
+        brighter = other.images.astype(int) - plain.images
+        still = plain.masks == 0
+        assert brighter[~still].max() > 20 and brighter[~still].min() >= -1
+        assert np.abs(brighter[still]).mean() < 1
 
 
 def test_bad_arguments():

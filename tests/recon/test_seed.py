@@ -133,3 +133,11 @@ def test_no_depth_is_a_clear_error(capture):
         planted(capture, depth=[lambda k: None] * 3)
     with pytest.raises(ValueError, match="Seeding: expected"):
         Seeding(voxel=0)
+
+
+def test_room_for_colours_that_depend_on_the_view(capture):
+    plain, shiny = planted(capture), planted(capture, options=Seeding(sh_degree=2))
+    assert shiny.dynamic.sh.shape == (len(plain), 9, 3) and plain.dynamic.sh_degree == 0
+    assert torch.equal(shiny.dynamic.sh[:, :1], plain.dynamic.sh) and not shiny.dynamic.sh[:, 1:].any()
+    with pytest.raises(ValueError, match="sh_degree: expected 0 to 4"):
+        planted(capture, options=Seeding(sh_degree=5))
