@@ -334,8 +334,12 @@ def test_a_run_killed_at_any_moment_ends_with_the_same_files(world, tmp_path):
             except subprocess.TimeoutExpired:
                 run.send_signal(signal.SIGKILL)
                 code = run.wait()
-            if code == 0:
+            if code == 0 and killed:
                 break
+            if code == 0:  # the machine was busier before: sooner, and from the beginning
+                shutil.rmtree(out)
+                whole /= 2
+                continue
             assert code == -signal.SIGKILL, run.stderr.read().decode()
             killed += 1
         assert killed and code == 0
