@@ -46,7 +46,7 @@ ALLOWED = {
     "partners": {"types", "costs", "match", "position_costs"},
     "epipolar": {"types", "clock", "splines", "align", "geometry", "kernels_tracks"},
     "epipolar_fit": {"types", "clock", "splines", "epipolar", "geometry", "trust"},
-    "check": {"types", "geometry", "io"},
+    "check": {"types", "geometry", "io", "shutter"},
 }
 
 

@@ -219,7 +219,9 @@ def test_a_readout_longer_than_a_frame_is_refused():
         synchronize([tracks, tracks])
 
 
-def test_one_frame_and_points_behind_the_camera_pass():
+def test_no_track_one_frame_and_points_behind_the_camera_pass():
+    none = at_frame_times(TrackSet(np.ones((0, 5, 3)), fps=FPS, camera=camera()))
+    assert len(none) == 0 and none.camera.readout is None
     one = at_frame_times(TrackSet(np.ones((2, 1, 3)), fps=FPS, camera=camera()))
     assert one.camera.readout is None and (one.xyz == 1).all()
     behind = TrackSet(np.ones((2, 5, 3)) * [1, 1, -1], fps=FPS, camera=camera())
