@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 from .clock import CommonClock, common_clock
 from .costs import frame_cost, velocity
 from .scan import MIN_OVERLAP, LikelihoodScan, unanswered, vertex
+from .shutter import at_frame_times
 from .types import Alignment, Matches, Refused, Status, TrackSet, check_same_world
 
 VELOCITY_HALF = 3
@@ -43,6 +44,7 @@ def align(
     b.check("b", xyz=needs_xyz)
     check_same_world(a, b)
     matches.check("matches", len(a), len(b))
+    a, b = at_frame_times(a), at_frame_times(b)
     started = time.perf_counter()
     found = (aligner or LikelihoodScan())(a, b, matches)
     found.stats.setdefault("seconds", time.perf_counter() - started)

@@ -13,6 +13,7 @@ import numpy as np
 from .geometry import common_target
 from .io.frames import VideoFrames
 from .io.scene import Paths, Scene, camera_from, read_document, scene_from_document, video_frames
+from .shutter import LONGEST
 from .types import Camera, Video
 
 MIRRORED = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -153,7 +154,7 @@ def _files(scene: Scene, every_frame: bool) -> Iterable[Finding]:
 
 
 def _clock(entry: dict[str, Any], video: Video, paths: Paths) -> Iterable[Finding]:
-    """Declared fps against timestamps, and against the container's."""
+    """Declared fps against timestamps, and against the container's; a readout longer than a frame."""
     if entry.get("timestamps") is not None and entry.get("fps") is not None and len(video.frames) > 1:
         told, seen = float(entry["fps"]), 1.0 / float(np.median(np.diff(video.times)))
         if abs(told / seen - 1) > 0.005:
@@ -171,6 +172,12 @@ def _clock(entry: dict[str, Any], video: Video, paths: Paths) -> Iterable[Findin
                     "Delete fps to use the container's timestamps, unless you know that it lies (slow motion).",
                 )  # fmt: skip
     steps = np.diff(video.times)
+    readout = video.camera.readout
+    if readout is not None and len(steps) and readout > LONGEST * np.median(steps):
+        yield Finding(
+            "error", video.name, f"camera.readout is {readout:g} s; a frame lasts {float(np.median(steps)):.4g} s.",
+            "Give the seconds from the first to the last row (phones: 0.005 to 0.03), or leave it out.",
+        )  # fmt: skip
     if len(steps) and steps.max() > 1.9 * np.median(steps):
         yield Finding(
             "warning", video.name, f"{int((steps > 1.9 * np.median(steps)).sum())} gaps in the timestamps.",

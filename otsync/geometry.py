@@ -1,4 +1,4 @@
-"""Two-view geometry of calibrated cameras: fundamental matrices, epipolar residuals, undistorted pixels."""
+"""Two-view geometry of calibrated cameras: fundamental matrices, epipolar residuals, pixels with and without the lens."""
 
 from __future__ import annotations
 
@@ -54,6 +54,35 @@ def undistort(camera: Camera, uv: Float[np.ndarray, "*N 2"]) -> Float[np.ndarray
     return out.reshape(uv.shape)
 
 
+def distort(camera: Camera, uv: Float[np.ndarray, "*N 2"]) -> Float[np.ndarray, "*N 2"]:
+    """Pixels of the image as it is, from those of the ideal pinhole with the same K; nan stays nan.
+
+    (OpenCV's model: radial, tangential, thin prism, tilted sensor.)
+    """
+    if camera.distortion is None or not np.any(camera.distortion):
+        return uv
+    k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4, tilt_x, tilt_y = np.pad(
+        camera.distortion, (0, 14 - len(camera.distortion))
+    )
+    K = camera.K
+    ideal = np.concatenate([uv, np.ones_like(uv[..., :1])], -1) @ np.linalg.inv(K).T
+    x, y = ideal[..., 0], ideal[..., 1]
+    r2 = x**2 + y**2
+    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    bent = np.stack(
+        [
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2) + r2 * (s1 + r2 * s2),
+            y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y + r2 * (s3 + r2 * s4),
+            np.ones_like(x),
+        ],
+        -1,
+    )
+    if tilt_x or tilt_y:
+        bent = bent @ _tilt(tilt_x, tilt_y).T
+    flat = bent @ K.T
+    return flat[..., :2] / flat[..., 2:]
+
+
 def seen_pixels(tracks: TrackSet) -> Float[np.ndarray, "N T 2"]:
     """``uv`` in float64 with nan where not visible. ValueError when the set holds none."""
     if tracks.uv is None:
@@ -77,6 +106,13 @@ def common_target(cameras: list[Camera]) -> Float[np.ndarray, " 3"]:
         A += across
         b += across @ np.atleast_2d(camera.center)[0]
     return np.linalg.solve(A, b)
+
+
+def _tilt(x: float, y: float) -> Float[np.ndarray, "3 3"]:
+    """The homography of a sensor tilted by angles about its axes, as OpenCV defines it."""
+    cx, sx, cy, sy = np.cos(x), np.sin(x), np.cos(y), np.sin(y)
+    R = np.array([[cy, 0, -sy], [0, 1, 0], [sy, 0, cy]]) @ np.array([[1, 0, 0], [0, cx, sx], [0, -sx, cx]])
+    return np.array([[R[2, 2], 0, -R[0, 2]], [0, R[2, 2], -R[1, 2]], [0, 0, 1]]) @ R
 
 
 def _pose(camera: Camera, frame: int) -> tuple[np.ndarray, np.ndarray]:

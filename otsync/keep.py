@@ -59,6 +59,7 @@ def digest(tracks: TrackSet) -> str:
     ]
     if camera is not None:
         parts += [camera.K, camera.w2c, camera.distortion, camera.width, camera.height]
+        parts += [camera.readout] if camera.readout else []
     return digest_of(*parts)
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
+from .shutter import at_frame_times
 from .types import TrackSet
 
 
@@ -29,7 +30,11 @@ class Lift:
     least: int = 8
 
     def __call__(self, tracks: TrackSet, depth: Float[np.ndarray, "N T"]) -> TrackSet:
-        """``tracks`` (undistorted uv, camera) with xyz, sigma and visibility where the depth (0 unknown) is sound."""
+        """``tracks`` (undistorted uv, camera) with xyz, sigma and visibility where the depth (0 unknown) is sound.
+
+        Pixels and depth are the image's own, whose rows a rolling shutter reads at their times; what comes back is at
+        the frames' times, as a global shutter's, where the camera declares its readout.
+        """
         if tracks.uv is None or tracks.camera is None:
             raise ValueError("tracks: expected pixels (uv) and a camera to lift them; one is missing.")
         if depth.shape != tracks.seen.shape:
@@ -43,9 +48,7 @@ class Lift:
         camera = tracks.camera
         rays = np.concatenate([tracks.uv, np.ones((*z.shape, 1))], 2) @ np.linalg.inv(camera.K).T
         local = rays * z[..., None]
-        R, t = camera.w2c[..., :3, :3], camera.w2c[..., :3, 3]
-        xyz = (local - t) @ R if camera.w2c.ndim == 2 else np.einsum("ntj,tji->nti", local - t, R)
-        xyz = smooth_in_time(xyz, self.smooth * fps)
+        xyz = smooth_in_time(camera.to_world(local), self.smooth * fps)
         seen = np.isfinite(xyz[..., 0])
         # the lateral error of half a pixel and the scatter of the depth, which smoothing over ~2.7 samples calms
         lateral = 0.5 * z / camera.K[0, 0]
@@ -54,7 +57,7 @@ class Lift:
         lifted = replace(
             tracks, xyz=np.where(seen[..., None], xyz, 0.0), visible=seen, sigma=np.where(seen, sigma, 0.0)
         )
-        return lifted.take(np.flatnonzero(keep))
+        return at_frame_times(lifted.take(np.flatnonzero(keep)))
 
 
 def depth_at(

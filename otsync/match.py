@@ -19,6 +19,7 @@ from jaxtyping import Float
 
 from .costs import Cosine, Cost, fill_unseen, total_cost, track_distance
 from .frontier import ANCHORED_FROM, fitting
+from .shutter import at_frame_times
 from .sinkhorn import MARGINAL_ERROR, sinkhorn
 from .types import Matches, Refused, Status, TrackSet, in_order
 from .vouch import vouch
@@ -56,6 +57,7 @@ def match(
     """
     a.check("a", xyz=False)
     b.check("b", xyz=False)
+    a, b = at_frame_times(a), at_frame_times(b)
     if matcher is not None and budget is not None:
         raise ValueError("matcher, budget: expected one of them; found both. A budget chooses the matcher.")
     matcher = matcher or matcher_for(len(a), len(b), budget)

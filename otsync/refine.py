@@ -15,6 +15,7 @@ import numpy as np
 from .clock import nominal_fps, strongest
 from .costs import binary_scale
 from .fit import Clock, Fit, fit_clock, overlap_seconds, velocity_correlation
+from .shutter import at_frame_times
 from .splines import SMOOTHING, TrackSplines
 from .trust import Trust
 from .types import Alignment, Matches, Refused, Status, TrackSet, check_same_world, gravest, in_order
@@ -61,6 +62,7 @@ def refine(
     b.check("b", xyz=needs_xyz)
     check_same_world(a, b)
     matches.check("matches", len(a), len(b))
+    a, b = at_frame_times(a), at_frame_times(b)
     started = time.perf_counter()
     found = (refiner or SplineRefine())(a, b, matches, alignment)
     found.stats.setdefault("refine_seconds", time.perf_counter() - started)

@@ -18,6 +18,7 @@ from .match import Matcher, match
 from .refine import Refiner, SplineRefine, refine
 from .rematch import SynchronousMatching
 from .settle import Answer, Settled, settle
+from .shutter import at_frame_times
 from .trust import Trust
 from .types import Alignment, Matches, Offsets, Status, TrackSet, gravest
 
@@ -46,7 +47,7 @@ def synchronize(
     form components with references of their own.
 
     Args:
-        tracks: one set per video, all in one world frame.
+        tracks: one set per video, all in one world frame. Rolling shutters of declared ``readout`` are undone here.
         reference: index of the video whose clock is the world's; "auto" takes the one with the surest pairs.
         matcher, aligner, refiner: the algorithms of each stage; None takes the default, :class:`Unrefined` as refiner
             leaves the aligner's answers as they are.
@@ -69,6 +70,7 @@ def synchronize(
     if rate not in ("fixed", "fit"):
         raise ValueError(f"rate: expected 'fixed' or 'fit'; found {rate!r}.")
     started = time.perf_counter()
+    tracks = [at_frame_times(t) for t in tracks]
     graph = graph or Graph()
     refiner = with_rate(refiner, rate)
     centre = most_seen(tracks) if chosen is None else chosen

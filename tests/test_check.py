@@ -92,6 +92,7 @@ def set_camera(videos, key, value):
         (lambda v: v[1].update(depth={"frames": "d1/*.png", "scale": 1}), "error", "times 0.001"),
         (lambda v: v[1].update(frames="nowhere/*.jpg"), "error", "no files"),
         (lambda v: v[1].update(range=[0, 20], depth=None), "warning", "few"),
+        (lambda v: set_camera(v, "readout", 20.0), "error", "phones: 0.005 to 0.03"),
         (lambda v: v[1].update(fps=25, timestamps=[k / 30 for k in range(50)]), "error", "25"),
     ],
 )

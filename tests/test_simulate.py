@@ -129,6 +129,16 @@ def test_depth_errors_leave_the_pixels_alone():
     assert np.abs(lateral[0].uv - exact[0].uv).max() > 2
 
 
+def test_tilted_cameras_see_the_scene_elsewhere_in_the_image():
+    level, tilted = (simulate("juggle", videos=6, effects=(), rig=Rig(tilt=t), seed=1)[0] for t in (0.0, 12.0))
+    up = []
+    for a, b in zip(level, tilted, strict=True):
+        np.testing.assert_allclose(a.camera.center, b.camera.center, atol=1e-9)
+        np.testing.assert_allclose(a.camera.w2c[0, :3], b.camera.w2c[0, :3], atol=1e-9)  # about the image's horizontal
+        up.append(np.degrees(np.arcsin(b.camera.w2c[2, 2]) - np.arcsin(a.camera.w2c[2, 2])))
+    assert np.abs(up).max() <= 12 and min(up) < -2 and max(up) > 2
+
+
 def test_cameras_stand_on_a_circle_and_look_at_the_scene():
     tracks, _ = simulate("juggle", videos=4, effects=(), rig=Rig(angle=30, spread=0, distance=5), seed=0)
     centers = np.array([t.camera.center for t in tracks])

@@ -196,13 +196,19 @@ def test_rolling_shutter_shows_every_row_at_its_time():
     exact, worse, truth, _ = with_and_without(
         effects.RollingShutter(readout), tracks=40, motion="football", offsets=[0.4, 0], rates=[1.1, 1]
     )
-    row = np.clip(exact.uv[..., 1] / 720 - 0.5, -0.5, 0.5)
+    row = np.clip(worse.uv[..., 1] / 720 - 0.5, -0.5, 0.5)
     for k in (3, 50, 149):
         for i in range(0, 40, 7):
             want = truth.positions(0, 0.4 + 1.1 * (exact.times[k : k + 1] + row[i, k] * readout))[i, 0]
             np.testing.assert_allclose(worse.xyz[i, k], want, atol=2e-5)
     assert np.abs(worse.xyz - exact.xyz).max() > 0.01
     assert worse.camera.readout == readout
+
+
+def test_every_video_may_draw_a_readout_of_its_own():
+    tracks, _ = simulate("softball", effects=(effects.RollingShutter((0.01, 0.02)),), videos=3, tracks=5, frames=4)
+    drawn = [t.camera.readout for t in tracks]
+    assert len(set(drawn)) == 3 and all(0.01 <= r <= 0.02 for r in drawn)
 
 
 def test_clock_drift_moves_the_instants():

@@ -1,4 +1,4 @@
-"""Synchronisation: aligners x refiners x graphs, by preset and band, accuracy against time; and what is promised.
+"""Synchronisation: aligners x refiners x graphs, by preset and band, accuracy against time; shutters; and promises.
 
 ``otsync bench sync --promises`` measures every promise on fresh seeds and fails when one is missed.
 """
@@ -20,6 +20,7 @@ from ..types import Status
 from . import record
 from .record import Row, table, write_rows
 from .sync_acceptance import WRONG, acceptance, pair_rows
+from .sync_shutter import READOUT, shutter_rows
 from .sync_worlds import BANDS, FPS, FRESH, many, motions, pair_cases
 
 METHODS: dict[str, tuple[Aligner, Refiner]] = {
@@ -79,6 +80,9 @@ def run(
     graphs = graph_rows(chosen)
     print(f"8 videos, errors in frames:\n{table(graphs)}\n", flush=True)
     write_rows(out, "sync_graphs", graphs, about)
+    shutters = shutter_rows(chosen)
+    print(f"Rolling shutters of {READOUT[0]:g} to {READOUT[1]:g} s, errors in frames:\n{table(shutters)}\n", flush=True)
+    write_rows(out, "sync_shutter", shutters, about)
     plot(summary, out / "sync.png")
     figures = figures_of(summary, graphs)
     if rebase:

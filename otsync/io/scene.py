@@ -12,6 +12,10 @@ A document::
 Paths are relative to the file's folder and may not leave it. ``w2c`` is world-to-camera, OpenCV axes, 4x4 or one per
 frame. ``range`` [first, stop) keeps some frames; a video file's clock comes from its container unless fps or
 timestamps are given. ``labels``: images of whole numbers that mean the same thing or class in every video, 0 none.
+
+A camera may have ``distortion`` (OpenCV's coefficients) and ``readout``: the seconds that a rolling shutter takes from
+the image's first to its last row (phones: 0.005 to 0.03; measure it, or leave it out, as for images that were turned
+after they were taken). Synchronisation undoes it.
 """
 
 from __future__ import annotations

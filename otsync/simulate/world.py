@@ -33,6 +33,7 @@ class Rig:
         distance: m from the middle of the scene; None: the motion class's own (3.2, more for teams).
         height: m above the floor.
         focal, width, height_px: of the images, pixels.
+        tilt: degrees, at most, by which each looks above or below the middle of the scene, at random.
     """
 
     angle: float = 40.0
@@ -42,6 +43,7 @@ class Rig:
     focal: float = 720.0
     width: int = 1280
     height_px: int = 720
+    tilt: float = 0.0
 
     def camera(self, scene: Scene, video: int, seed: int) -> Camera:
         """Camera of ``video``, in world coordinates."""
@@ -53,6 +55,9 @@ class Rig:
         eye = center + distance * np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
         eye[2] = self.height
         z = center - eye
+        if self.tilt:
+            up = np.radians(self.tilt) * stream(seed, video, "tilt").uniform(-1, 1)
+            z[2] = np.linalg.norm(z[:2]) * np.tan(np.arctan2(z[2], np.linalg.norm(z[:2])) + up)
         z /= np.linalg.norm(z)
         x = np.cross(z, [0.0, 0.0, 1.0])
         x /= np.linalg.norm(x)

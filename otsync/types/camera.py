@@ -27,7 +27,8 @@ class Camera:
         w2c: world to camera, ``x_cam = R x_world + t``; (4,4) when static, (T,4,4) when it moves.
         width, height: of the image, in pixels.
         distortion: OpenCV's coefficients (k1, k2, p1, p2, k3, ...), or None.
-        readout: seconds from the first to the last row of a rolling shutter, or None for a global one.
+        readout: seconds from the first to the last row of a rolling shutter, or None for a global one (or an unknown
+            one). Rows are read from the top of the image as it is, the middle one at the frame's time.
     """
 
     K: Float[np.ndarray, "3 3"]
@@ -82,6 +83,11 @@ class Camera:
         if self.w2c.ndim == 2:
             return xyz @ R.T + t
         return np.einsum("tij,ntj->nti", R, xyz) + t
+
+    def to_world(self, local: Float[np.ndarray, "N T 3"]) -> Float[np.ndarray, "N T 3"]:
+        """Points in camera axes to the world: the inverse of :meth:`to_camera`."""
+        R, t = self.w2c[..., :3, :3], self.w2c[..., :3, 3]
+        return (local - t) @ R if self.w2c.ndim == 2 else np.einsum("ntj,tji->nti", local - t, R)
 
     def project(self, xyz: Float[np.ndarray, "N T 3"]) -> Float[np.ndarray, "N T 2"]:
         """World points to pixels, without distortion; nan at and behind the camera plane."""

@@ -26,10 +26,11 @@ class TrackSet:
         fps: frames per second of the video's own clock; or
         timestamps: seconds of every frame on that clock, strictly increasing (variable frame rate, dropped frames).
         name: of the video, for tables and files.
-        uv: pixels, (N,T,2).
+        uv: pixels, (N,T,2), of the ideal pinhole: without lens distortion.
         sigma: one standard deviation of position, world units, (N,T).
         labels: (N,) integer instance or class, or (N,L) soft memberships.
-        camera: who filmed.
+        camera: who filmed. Where it declares a ``readout``, samples are at their rows' times until the verbs bring
+            them to the frames' (:func:`otsync.shutter.at_frame_times`).
         frame: name of the world frame of ``xyz``. Two sets that declare different ones are never aligned; position
             costs of a matcher ask both to declare the same.
 

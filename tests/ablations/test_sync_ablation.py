@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from otsync import DTW, ConstantShift, LikelihoodScan, align, refine
+from otsync.bench.sync_shutter import shutter_rows
 from otsync.bench.sync_worlds import FPS, MOVING, pair_case
 
 SEEDS = (5100, 5101)
@@ -35,3 +36,17 @@ def test_refinement_goes_below_the_frame():
     scanned, refined = (errors(1, "mid", LikelihoodScan(), r) for r in (False, True))
     assert refined.mean() < 0.6 * scanned.mean()
     assert refined.mean() < 0.06
+
+
+@pytest.mark.parametrize(
+    ("preset", "videos", "share"),
+    [
+        ("clean", 2, 0.25),
+        pytest.param("mid", 2, 0.5, marks=pytest.mark.slow),
+        pytest.param("mid", 8, 0.5, marks=pytest.mark.slow),
+    ],
+)
+def test_a_declared_readout_makes_a_rolling_shutter_global(preset, videos, share):
+    rows = {r["shutter"]: r["mean"] for r in shutter_rows(SEEDS[:1], (preset,), (videos,), MOVING)}
+    assert rows["rolling, declared"] < share * rows["rolling, not declared"]
+    assert rows["rolling, declared"] < 1.1 * rows["global"] + 0.002
