@@ -23,6 +23,7 @@ import torch
 
 from otsync.io import Scene
 from otsync.io.mend import cut, keep_frames, unreadable
+from otsync.shutter import at_frame_times
 from otsync.types import Offsets, TrackSet, Video
 from recon.backdrop import StaticFit, fit_backdrop, with_backdrop
 from recon.density import Densify
@@ -326,7 +327,7 @@ def prepare(
         with progress.stage("tracks"):
             tracks = lifted_tracks(train, offsets, cache, map, progress)
     else:
-        tracks = tracks_of(train, tracks, held_out, progress.note)
+        tracks = tuple(at_frame_times(t) for t in tracks_of(train, tracks, held_out, progress.note))
     with progress.stage("footage"):
         footage = read_footage(train, plan.width, cache, map, progress)
         held = () if others is None else read_footage(others, plan.width, cache, map, progress)

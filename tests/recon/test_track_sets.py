@@ -10,7 +10,7 @@ import torch
 
 import otsync.priors.cache
 import otsync.recordings
-import recon.seed
+import recon.prepare
 from otsync.io import open_scene
 from otsync.priors.cache import Cache
 from otsync.recordings import Stages
@@ -131,7 +131,7 @@ def test_every_frame_that_seeding_asks_for_has_its_depth(given, monkeypatch, shi
             cloud_at(footage, [of(maps) for maps in depth], offsets, float(t), frame_step)
         return None
 
-    monkeypatch.setattr(recon.seed, "seed", watched)
+    monkeypatch.setattr(recon.prepare, "seed", watched)
     early = replace(offsets, seconds=np.array([0, shift, 0]) * STEP)
     begun(given, capture().tracks, offsets=early)
     assert len(asked) >= 6 and all(z is not None for z in asked)
@@ -213,3 +213,12 @@ def test_a_scene_begins_from_depth_of_some_frames(given):
     whole = begun(given, capture().tracks)
     thin = begun((replace(scene, videos=some), *given[1:]), capture().tracks)
     assert 50 < len(thin) <= len(whole)
+
+
+def test_given_tracks_of_a_rolling_shutter_are_brought_to_their_frames_times(world):
+    plain = capture().tracks
+    rolled = [replace(t, camera=replace(t.camera, readout=0.02)) for t in plain[:1]]
+    plan, start = replace(PER_VIDEO, scaffold=ScaffoldOptions()), Offsets.load(world / "start.json")
+    ready = prepare(open_scene(world), start, [*rolled, *plain[1:]], plan=plan, held_out=("held0",))
+    assert ready.tracks[0].camera.readout is None and not np.array_equal(ready.tracks[0].xyz, plain[0].xyz)
+    assert ready.tracks[1] is plain[1]  # nothing declared, nothing done
