@@ -48,12 +48,10 @@ class Run:
     recording: RecordingOptions = field(default_factory=RecordingOptions)
 
     def run(self) -> int:
-        try:
-            from recon.cli import FitOptions, opened, reconstructed, tell
-            from recon.fit import Diverged
-            from recon.prepare import Progress, readable
-        except ModuleNotFoundError as error:
-            raise ValueError(f"run: needs {error.name}. Install it: pip install 'otsync[recon,video]'.") from None
+        from recon.cli import FitOptions, opened, reconstructed, tell
+        from recon.fit import Diverged
+        from recon.prepare import Progress, readable
+
         from .cli import table
         from .files import write_json
         from .io.mend import cut

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
+from otsync.command_line import run_command
 from recon.commands_bench import Bench
 from recon.density import Densify
 from recon.export import Format
@@ -412,31 +413,12 @@ def progress(items: Iterable[Any], total: int, what: str, unit: str) -> Iterator
 
 def main(args: list[str] | None = None) -> int:
     """Entry point of the ``recon`` command."""
-    from otsync import __version__
-    from recon.fit import Diverged
+    from recon.running import Diverged
 
-    args = sys.argv[1:] if args is None else args
-    if args == ["--version"]:
-        print(f"recon {__version__}")
-        return 0
-    command = tyro.extras.subcommand_cli_from_dict(
-        COMMANDS, prog="recon", description=__doc__, args=args,
-        config=(tyro.conf.AvoidSubcommands,) if not args else (),
+    return run_command(
+        "recon", COMMANDS, args, description=__doc__, refused=(Diverged, FloatingPointError),
+        interrupted="the same command continues from here.",
     )  # fmt: skip
-    try:
-        return command.run()
-    except (Diverged, FloatingPointError) as error:
-        print(f"recon: {error}", file=sys.stderr)
-        return 1
-    except ModuleNotFoundError as error:
-        print(f"recon: needs {error.name}. Install it: pip install 'otsync[recon,video]'.", file=sys.stderr)
-        return 2
-    except (ValueError, OSError) as error:
-        print(f"recon: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("recon: interrupted; the same command continues from here.", file=sys.stderr)
-        return 130
 
 
 if __name__ == "__main__":

@@ -46,6 +46,7 @@ ALLOWED = {
     "epipolar": {"types", "clock", "splines", "align", "geometry", "kernels_tracks"},
     "epipolar_fit": {"types", "clock", "splines", "epipolar", "geometry", "trust"},
     "check": {"types", "geometry", "io"},
+    "command_line": {"__version__"},
 }
 
 
