@@ -50,7 +50,8 @@ class Run:
     def run(self) -> int:
         from recon.cli import FitOptions, opened, reconstructed, tell
         from recon.fit import Diverged
-        from recon.prepare import Progress, readable
+        from recon.intake import readable
+        from recon.plan import Progress
 
         from .cli import table
         from .files import write_json

@@ -66,7 +66,8 @@ def run(
 ) -> list[Row]:  # fmt: skip
     """Measure; print, and write ``lifting.csv`` and ``lifting.json`` to ``out``."""
     from otsync.priors.cache import Cache
-    from recon.prepare import Progress, read_footage
+    from recon.initial import read_footage
+    from recon.plan import Progress
 
     if np.ptp(truth.seconds) > 0:
         raise ValueError(

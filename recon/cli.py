@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from otsync.types import Offsets
     from recon.held_out import ViewScore
     from recon.pipeline import Outcome
-    from recon.prepare import Plan, Progress
+    from recon.plan import Plan, Progress
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class FitOptions:
 
     def plan(self) -> Plan:
         """The pipeline's form of this."""
-        from recon.prepare import Plan
+        from recon.plan import Plan
 
         return Plan(
             width=self.width, frames=self.frames, scaffold=self.scaffold, densify=self.densify, freeze=self.freeze,
@@ -212,7 +212,7 @@ class Eval:
         from otsync.priors.cache import Cache
         from otsync.types import Offsets
         from recon.pipeline import evaluate, offset_figures, true_seconds
-        from recon.prepare import Progress
+        from recon.plan import Progress
         from recon.result import load_result, metrics_of
 
         if self.views < 1:
@@ -352,7 +352,7 @@ def reconstructed(
     from otsync.priors.cache import Cache
     from otsync.types import Offsets
     from recon.pipeline import reconstruct
-    from recon.prepare import Progress
+    from recon.plan import Progress
 
     known = None if truth is None else Offsets.load(truth)
     with ThreadPoolExecutor(options.workers or os.cpu_count() or 1) as pool:

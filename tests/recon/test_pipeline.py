@@ -20,8 +20,11 @@ from otsync.types import Offsets, Status, TrackSet
 from recon.capture import clocks
 from recon.footage import footage_of
 from recon.gaussians4d import Gaussians4D
+from recon.initial import lifted_tracks, world_footprint
+from recon.intake import only, readable, split
 from recon.pipeline import reconstruct
-from recon.prepare import Plan, Progress, lifted_tracks, only, prepare, readable, split, world_footprint
+from recon.plan import Plan, Progress
+from recon.prepare import prepare
 from recon.result import clear_parts, load_result
 
 from .worlds import CAMERAS, FRAMES, SIZE, capture, write_world

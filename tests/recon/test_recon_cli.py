@@ -23,7 +23,7 @@ from otsync.files import read_npz
 from otsync.io import open_scene
 from otsync.types import Offsets, TrackSet
 from recon.cli import main
-from recon.prepare import only
+from recon.intake import only
 from recon.result import load_result
 
 from .test_pipeline import same_files

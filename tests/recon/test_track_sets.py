@@ -17,20 +17,12 @@ from otsync.recordings import Stages
 from otsync.types import Offsets
 from recon.fit import fit
 from recon.gaussians4d import Gaussians4D, scene_arrays
+from recon.initial import content_key, lifted_tracks, read_footage, seeded
+from recon.intake import given_clocks, only, split
 from recon.motion import ScaffoldOptions
 from recon.optimize import RATES
-from recon.prepare import (
-    Plan,
-    Progress,
-    content_key,
-    given_clocks,
-    lifted_tracks,
-    only,
-    prepare,
-    read_footage,
-    seeded,
-    split,
-)
+from recon.plan import Plan, Progress
+from recon.prepare import prepare
 from recon.seed import cloud_at, shown_at
 from recon.track_sets import of_every_video, tracks_of
 
