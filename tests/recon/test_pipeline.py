@@ -322,7 +322,7 @@ def test_one_track_carries_the_whole_scene(world, start, tmp_path):
 
 
 def test_stages_are_shared_with_the_synchronisation_before(world, start, tmp_path, monkeypatch):
-    """What otsync sync has tracked, masked and measured is neither tracked nor masked again."""
+    """What otsync sync has tracked and masked is neither tracked nor masked again."""
     cache = Cache(tmp_path)
     train, _, offsets, _ = split(open_scene(world), start, ("held0",), Progress())
     synchronize_scene(train, cache=cache)
