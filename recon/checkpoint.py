@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -108,13 +107,3 @@ class Checkpoint:
 
 def _tensors(arrays: Mapping[str, np.ndarray]) -> dict[str, Tensor]:
     return {name: torch.from_numpy(np.array(array)) for name, array in arrays.items()}
-
-
-def key_of(arrays: Iterable[np.ndarray], *options: Any) -> str:
-    """A hash of all that decides a fit's result: its arrays, and the text of its options."""
-    digest = hashlib.blake2b(repr(options).encode(), digest_size=16)
-    for array in arrays:
-        array = np.ascontiguousarray(array)
-        digest.update(f"{array.dtype}{array.shape}".encode())
-        digest.update(array.view(np.uint8).reshape(-1).data if array.size else b"")
-    return digest.hexdigest()
