@@ -52,9 +52,10 @@ class Progress:
         self.tell, self.notes, self.seconds = tell, [], {}  # type: Tell, list[str], dict[str, float]
 
     def note(self, text: str) -> None:
-        """Something that the user should know when reading the result."""
-        self.notes.append(text)
-        self.tell(f"note: {text}")
+        """Something that the user should know when reading the result; said once, however often it is found."""
+        if text not in self.notes:
+            self.notes.append(text)
+            self.tell(f"note: {text}")
 
     @contextmanager
     def stage(self, name: str):
