@@ -28,6 +28,7 @@ from .match import (
     PartialFGW,
     match,
 )
+from .progress import counted
 from .refine import SplineRefine, Unrefined
 from .sync import synchronize, unique_names
 from .types import Offsets, Refused, Status, TrackSet
@@ -303,15 +304,13 @@ def with_progress(tracks: list[TrackSet], what: str, workers: int = 1, **options
     from concurrent.futures import ProcessPoolExecutor
     from multiprocessing import get_context
 
-    from tqdm import tqdm
-
     if workers < 1:
         raise ValueError(f"--workers: expected at least 1; found {workers}.")
 
     def progress(run: Callable[..., Iterable[Any]]) -> Callable[..., Iterable[Any]]:
         def mapped(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterable[Any]:
             items = list(items)
-            return tqdm(run(function, items), total=len(items), desc=what, unit="pair", disable=None, leave=False)
+            return counted(run(function, items), what, "pair", len(items))
 
         return mapped
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import tyro
 
 from otsync.command_line import run_command
+from otsync.progress import counted
 from recon.commands_bench import Bench
 from recon.density import Densify
 from recon.export import Format
@@ -174,7 +175,7 @@ class Render:
             times = times * self.frames if len(self.times) == 1 else stretched(result.scene.span, self.frames)
         check_times(result.scene, times)
         images = rendered(result, times, self.camera, turns=self.turns, width=self.width)
-        count = write_images(progress(images, len(times), "rendering", "image"), self.out, fps)
+        count = write_images(counted(images, "rendering", "image", len(times)), self.out, fps)
         print(f"wrote {count} images to {self.out}")
         return 0
 
@@ -402,13 +403,6 @@ def view_table(views: tuple[ViewScore, ...], lpips_reason: str = "") -> str:
         cells = "".join(f" {v.mean[k]:10.{d}f}" if np.isfinite(v.mean[k]) else f" {'–':>10}" for k, d in keys)
         lines.append(f"{v.name:{width}}  {'held out' if v.held_out else 'training':9}{cells}  {v.clock.how}")
     return "\n".join(lines + ([f"LPIPS is left out: {lpips_reason}"] if lpips_reason else []))
-
-
-def progress(items: Iterable[Any], total: int, what: str, unit: str) -> Iterator[Any]:
-    """A bar on a terminal."""
-    from tqdm import tqdm
-
-    return tqdm(items, total=total, desc=what, unit=unit, disable=None, leave=False)
 
 
 def main(args: list[str] | None = None) -> int:
