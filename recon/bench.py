@@ -13,7 +13,7 @@ import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,7 @@ from recon.held_out import Clock, view
 from recon.lpips import Lpips
 from recon.plan import Plan, Progress
 from recon.prepare import Prepared, prepare
+from recon.seed import Seeding
 
 Row = dict[str, Any]
 FIGURES = 2
@@ -50,10 +51,13 @@ class Protocol:
     """What is measured.
 
     Args:
-        frames: first and last (exclusive) frame of the window. cameras: that train; None: all that are not held out.
+        frames: first and last (exclusive) frame of the window.
+        cameras: that train; None: all that are not held out. Depth, and with it the tracks' positions, is always
+            measured with all of them: few cameras are few images, not another front-end.
         amplitudes: frames; errors are drawn uniformly within them, one seed after another.
         seeds: of the draws. steps: of the fit, of ``batch`` images each; budget: wall seconds instead.
-        width: working pixels. held_out_tracks: share of the tracks that no scaffold sees.
+        width: working pixels. seeding: how densely Gaussians begin.
+        held_out_tracks: share of the tracks that no scaffold sees.
     """
 
     frames: tuple[int, int] | None = None
@@ -65,6 +69,7 @@ class Protocol:
     budget: float | None = None
     batch: int = 2
     width: int = 320
+    seeding: Seeding = field(default_factory=Seeding)
     held_out_tracks: float = 0.1
     backdrop_steps: int = 1500
 
@@ -110,17 +115,18 @@ def material_of(
 
     if protocol.frames is not None:
         scene = cut(scene, *protocol.frames)
-    train = scene.take(protocol.cameras or [n for n in scene.names if n not in protocol.held_out])
-    known = only(truth, train.names)
+    rig = scene.take([n for n in scene.names if n not in protocol.held_out])
+    chosen = protocol.cameras or rig.names
+    known = only(truth, rig.names)
     with progress.stage("tracks"):
-        tracks = lifted_tracks(train, known, cache, map, progress)
+        tracks = [t for t in lifted_tracks(rig, known, cache, map, progress) if t.name in chosen]
+    train = rig.take(chosen)
     if any(v.depth is None for v in train.videos):
         with progress.stage("depth"):
-            every = [range(len(v.frames)) for v in train.videos]
-            maps = depth_maps(train, known, every, width=protocol.width, cache=cache, map=map)
-            train = replace(
-                train, videos=tuple(replace(v, depth=list(z)) for v, z in zip(train.videos, maps, strict=True))
-            )
+            every = [range(len(v.frames)) if v.name in chosen else [] for v in rig.videos]
+            maps = depth_maps(rig, known, every, width=protocol.width, cache=cache, map=map)
+            depth = dict(zip(rig.names, maps, strict=True))
+            train = replace(train, videos=tuple(replace(v, depth=list(depth[v.name])) for v in train.videos))
     held = scene.take(protocol.held_out) if protocol.held_out else None
     if held is not None:
         train = replace(train, videos=(*train.videos, *held.videos), masks=(*train.masks, *held.masks), labels=())
@@ -143,7 +149,7 @@ def measure(
     margin = max(configuration.scaffold.margin, (amplitude + 1) / float(believed.fps[believed.reference]))
     plan = Plan(
         width=protocol.width, scaffold=replace(configuration.scaffold, margin=margin), losses=configuration.losses,
-        batch=protocol.batch, backdrop_steps=protocol.backdrop_steps,
+        seeding=protocol.seeding, batch=protocol.batch, backdrop_steps=protocol.backdrop_steps,
     )  # fmt: skip
     ready = prepare(
         material.scene, built_from, material.tracks, plan=plan, held_out=material.held_out, cache=cache, map=map
@@ -268,7 +274,7 @@ def about(protocol: Protocol, scene: Scene, truth: Offsets) -> Mapping[str, Any]
     clips = [[v.name, len(v.frames), v.camera.width, v.camera.height] for v in scene.videos]
     true = {n: round(float(s), 6) for n, s in zip(truth.names, truth.seconds, strict=True)}
     return {
-        "protocol": vars(protocol), "figures": FIGURES, "recording": {"videos": clips, "truth": true},
+        "protocol": asdict(protocol), "figures": FIGURES, "recording": {"videos": clips, "truth": true},
         "published": PUBLISHED, "unit": "frames, dB, footprints",
     }  # fmt: skip
 

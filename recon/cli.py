@@ -23,6 +23,7 @@ from recon.commands_bench import Bench
 from recon.density import Densify
 from recon.export import Format
 from recon.motion import ScaffoldOptions
+from recon.seed import Seeding
 
 if TYPE_CHECKING:
     from otsync.io import Scene
@@ -56,6 +57,7 @@ class FitOptions:
     densify: Densify | None = None
     """Split what is pulled hardest, drop what is faint; off unless asked for."""
     scaffold: ScaffoldOptions = field(default_factory=ScaffoldOptions)
+    seeding: Seeding = field(default_factory=Seeding)
     save_every: float = 60.0
     """Seconds between two savings of the fit, from the last of which a killed run continues."""
     allow_outside: bool = False
@@ -70,7 +72,7 @@ class FitOptions:
         from recon.plan import Plan
 
         return Plan(
-            width=self.width, frames=self.frames, scaffold=self.scaffold, densify=self.densify, freeze=self.freeze,
+            width=self.width, frames=self.frames, scaffold=self.scaffold, seeding=self.seeding, densify=self.densify, freeze=self.freeze,
             batch=self.batch, seed=self.seed, backdrop_steps=self.backdrop_steps,
             save_every=self.save_every,
         )  # fmt: skip

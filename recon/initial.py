@@ -25,6 +25,7 @@ from recon.gaussians4d import Gaussians4D, scene_arrays, scene_from_arrays
 from recon.intake import only
 from recon.motion import build_scaffold
 from recon.plan import MapLike, Plan, Progress
+from recon.seed import moments, seed, shown_at
 from recon.track_sets import of_every_video
 
 MANY: dict[str, Any] = {"count": 700, "min_life": 10, "apart": 4.0}
@@ -180,7 +181,7 @@ def initial_scene(
     """The scene before any refinement: a scaffold through the tracks, and what the depth maps show of it; kept."""
     clocks = (np.round(offsets.seconds, 6).tolist(), np.round(offsets.rates, 9).tolist(), offsets.reference)
     gains = np.ones((len(footage), 3)) if static is None else static.gains
-    key = (*content_key(scene, tracks), clocks, gains.tolist(), plan.width, plan.scaffold, plan.seed)
+    key = (*content_key(scene, tracks), clocks, gains.tolist(), plan.width, plan.scaffold, plan.seeding, plan.seed)
 
     def build() -> dict[str, np.ndarray]:
         built = seeded(scene, offsets, tracks, footage, gains, plan, cache, map, progress)
@@ -200,7 +201,6 @@ def seeded(
 ) -> Gaussians4D:  # fmt: skip
     """Build what :func:`initial_scene` keeps."""
     from otsync.depth_maps import depth_maps
-    from recon.seed import moments, seed, shown_at
 
     footprint = world_footprint(tracks, footage)
     frame_step = 1.0 / float(offsets.fps[offsets.reference])
@@ -225,4 +225,5 @@ def seeded(
     ]
     return seed(
         motion, footage, offsets, depth, footprint=footprint, frame_step=frame_step, span=span, times=times, gains=gains,
+        options=plan.seeding,
     )  # fmt: skip

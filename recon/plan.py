@@ -12,6 +12,7 @@ from recon.density import Densify
 from recon.effects import Effect
 from recon.fit import LOSSES, Loss
 from recon.motion import ScaffoldOptions
+from recon.seed import Seeding
 
 Tell = Callable[[str], None]
 MapLike = Callable[..., Any]
@@ -23,8 +24,8 @@ class Plan:
 
     Args:
         width: working pixels. frames: first and last (exclusive) frame of every video; None: all.
-        scaffold: how the motion is built. losses, effects, densify: of the fit; effects get the gains of the backdrop
-            by themselves.
+        scaffold: how the motion is built. seeding: how densely Gaussians begin.
+        losses, effects, densify: of the fit; effects get the gains of the backdrop by themselves.
         freeze: parameter groups that the fit holds, "offsets" for instance.
         batch: images a step, each on a thread of its own.
         views: frames of every camera that are compared at the end. backdrop_steps: of the fit of the static part.
@@ -34,6 +35,7 @@ class Plan:
     width: int = 320
     frames: tuple[int, int] | None = None
     scaffold: ScaffoldOptions = field(default_factory=ScaffoldOptions)
+    seeding: Seeding = field(default_factory=Seeding)
     losses: tuple[Loss, ...] = LOSSES
     effects: tuple[Effect, ...] = ()
     densify: Densify | None = None

@@ -10,7 +10,7 @@ import torch
 
 import otsync.priors.cache
 import otsync.recordings
-import recon.seed
+import recon.initial
 from otsync.io import open_scene
 from otsync.priors.cache import Cache
 from otsync.recordings import Stages
@@ -123,7 +123,7 @@ def test_every_frame_that_seeding_asks_for_has_its_depth(given, monkeypatch, shi
             cloud_at(footage, [of(maps) for maps in depth], offsets, float(t), frame_step)
         return None
 
-    monkeypatch.setattr(recon.seed, "seed", watched)
+    monkeypatch.setattr(recon.initial, "seed", watched)
     early = replace(offsets, seconds=np.array([0, shift, 0]) * STEP)
     begun(given, capture().tracks, offsets=early)
     assert len(asked) >= 6 and all(z is not None for z in asked)
