@@ -13,7 +13,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -112,7 +112,7 @@ class Fit:
     """Track sets in space (.npz), one a video, that the motion begins with; default: tracked and lifted here."""
     truth: Path | None = None
     """truth.json of a simulated world: adds errors to table and report."""
-    fit: tyro.conf.OmitArgPrefixes[FitOptions] = field(default_factory=FitOptions)
+    fit: Annotated[FitOptions, tyro.conf.arg(name="")] = field(default_factory=FitOptions)
 
     def run(self) -> int:
         from otsync.types import Offsets, TrackSet

@@ -253,6 +253,14 @@ def test_every_help_has_an_example(capsys):
     assert "Example: otsync run" in " ".join(capsys.readouterr().out.split())
 
 
+def test_options_of_parts_are_told_apart_by_the_part(capsys):
+    """A scaffold and a seeding both have a reach."""
+    with pytest.raises(SystemExit):
+        main(["fit", "--help"])
+    told = capsys.readouterr().out
+    assert "--scaffold.reach" in told and "--seeding.reach" in told and "--held-out" in told
+
+
 def test_bench_writes_a_row_for_every_configuration(world, tmp_path, monkeypatch, capsys):
     args = ["bench", str(world), "--truth", str(world / "truth.json"), "--held-out", "held0", "--width", str(SIZE[0]),
             "--steps", "4", "--backdrop-steps", "5", "--rows", "ours", "true time", "--out", str(tmp_path)]  # fmt: skip
