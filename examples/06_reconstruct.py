@@ -12,7 +12,7 @@ from otsync.types import Offsets, TrackSet
 from recon.capture import write_capture
 from recon.export import export, frame_times
 from recon.pipeline import reconstruct
-from recon.prepare import Plan, Progress
+from recon.plan import Plan, Progress
 from recon.result import load_result
 from recon.showing import rendered
 from recon.simulate import synthetic

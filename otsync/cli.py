@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
-from . import __version__
 from .align import DTW, ConstantShift, LikelihoodScan
 from .anchored import AnchoredFGW
+from .command_line import run_command
 from .commands_recordings import Check, Init, RecordingOptions, sync_recording
 from .commands_run import Run
 from .graph import Graph
@@ -28,6 +28,7 @@ from .match import (
     PartialFGW,
     match,
 )
+from .progress import counted
 from .refine import SplineRefine, Unrefined
 from .sync import synchronize, unique_names
 from .types import Offsets, Refused, Status, TrackSet
@@ -271,12 +272,7 @@ class Bench:
                 return match_limits.run(self.out, first_seed=self.first_seed or 9500)
             return sync_bench.run(self.out, promises=True, first_seed=self.first_seed or sync_bench.FRESH)
         suites = SUITES.values() if self.suite == "all" else [SUITES[self.suite]]
-        try:
-            modules = [importlib.import_module(name) for name in suites]
-        except ModuleNotFoundError as error:
-            raise ValueError(
-                f"bench {self.suite}: needs {error.name}. Install it: pip install 'otsync[recon]'."
-            ) from None
+        modules = [importlib.import_module(name) for name in suites]
         return max(module.run(self.out, gate=self.gate, rebase=self.rebase) for module in modules)
 
 
@@ -308,15 +304,13 @@ def with_progress(tracks: list[TrackSet], what: str, workers: int = 1, **options
     from concurrent.futures import ProcessPoolExecutor
     from multiprocessing import get_context
 
-    from tqdm import tqdm
-
     if workers < 1:
         raise ValueError(f"--workers: expected at least 1; found {workers}.")
 
     def progress(run: Callable[..., Iterable[Any]]) -> Callable[..., Iterable[Any]]:
         def mapped(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterable[Any]:
             items = list(items)
-            return tqdm(run(function, items), total=len(items), desc=what, unit="pair", disable=None, leave=False)
+            return counted(run(function, items), what, "pair", len(items))
 
         return mapped
 
@@ -369,28 +363,10 @@ def refusal(verb: str, status: Status, flags: tuple[Status, ...]) -> int:
 
 def main(args: list[str] | None = None) -> int:
     """Entry point of the ``otsync`` command."""
-    args = sys.argv[1:] if args is None else args
-    if args == ["--version"]:
-        print(f"otsync {__version__}")
-        return 0
-    command = tyro.extras.subcommand_cli_from_dict(
-        COMMANDS,
-        prog="otsync",
-        description=__doc__,
-        args=args,
-        config=(tyro.conf.AvoidSubcommands,) if not args else (),
-    )
-    try:
-        return command.run()
-    except Refused as error:
-        print(f"otsync: {error}", file=sys.stderr)
-        return 1
-    except (ValueError, OSError) as error:
-        print(f"otsync: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("otsync: interrupted; nothing half-written is left.", file=sys.stderr)
-        return 130
+    return run_command(
+        "otsync", COMMANDS, args, description=__doc__, refused=(Refused,),
+        interrupted="nothing half-written is left.",
+    )  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -50,12 +50,11 @@ class Run:
     recording: RecordingOptions = field(default_factory=RecordingOptions)
 
     def run(self) -> int:
-        try:
-            from recon.cli import FitOptions, opened, reconstructed, tell
-            from recon.fit import Diverged
-            from recon.prepare import Progress, readable
-        except ModuleNotFoundError as error:
-            raise ValueError(f"run: needs {error.name}. Install it: pip install 'otsync[recon,video]'.") from None
+        from recon.cli import FitOptions, opened, reconstructed, tell
+        from recon.fit import Diverged
+        from recon.intake import readable
+        from recon.plan import Progress
+
         from .cli import table
         from .files import write_json
         from .io.mend import cut
@@ -77,8 +76,8 @@ class Run:
         cache, progress = Cache(self.recording.cache or self.out / "stages"), Progress(tell)
         with ThreadPoolExecutor(self.recording.workers or os.cpu_count() or 1) as pool:
             part = scene if self.frames is None else cut(scene, *self.frames)
-            with progress.stage("reading"):  # the reconstruction cuts and reads again, from what is kept, and notes it
-                part = readable(part, cache, pool.map, Progress(tell))
+            with progress.stage("reading"):  # the reconstruction cuts and reads again, from what is kept
+                part = readable(part, cache, pool.map, progress)
             train = part.take([n for n in part.names if n not in self.held_out])
             if self.reference is not None and self.reference not in train.names:
                 raise ValueError(f"--reference: expected one of {', '.join(train.names)}; found {self.reference!r}.")

@@ -47,8 +47,7 @@ class CurveDistance:
 
         xa, xb = positions_in_common_frame(a, b)
         distance = curve_distances(_thinned(xa, self.samples), _thinned(xb, self.samples), i, j, self.share)
-        unit = self.scale * scene_scale(xa, xb)
-        return capped(distance, unit, self.cap)
+        return capped(distance, self.scale * scene_scale(xa, xb), self.cap)
 
 
 @dataclass(frozen=True)
@@ -67,8 +66,7 @@ class MedianPosition:
     ) -> Float[np.ndarray, " P"]:
         xa, xb = positions_in_common_frame(a, b)
         distance = np.linalg.norm(_medians(xa)[i] - _medians(xb)[j], axis=1)
-        unit = self.scale * scene_scale(xa, xb)
-        return capped(distance, unit, self.cap)
+        return capped(distance, self.scale * scene_scale(xa, xb), self.cap)
 
 
 @dataclass(frozen=True)
@@ -97,15 +95,12 @@ class SynchronousDistance:
 
         xa, xb = positions_in_common_frame(a, b)
         ta, tb = a.times, self.rate * b.times + self.offset
-        step = float(np.median(np.diff(ta))) if len(ta) > 1 else 1.0
+        step = _step(ta, alone=1.0)
         at = np.clip(np.round(np.interp(ta, tb, np.arange(len(tb)))).astype(int), 0, len(tb) - 1)
-        at = np.where(
-            np.abs(tb[at] - ta) <= 0.51 * max(step, float(np.median(np.diff(tb))) if len(tb) > 1 else 0), at, -1
-        )
+        at = np.where(np.abs(tb[at] - ta) <= 0.51 * max(step, _step(tb, alone=0.0)), at, -1)
         least = max(2, round(self.min_overlap / step))
         distance = synchronous_distances(xa, xb, i, j, at, least)
-        unit = self.scale * scene_scale(xa, xb)
-        return capped(distance, unit, self.cap)
+        return capped(distance, self.scale * scene_scale(xa, xb), self.cap)
 
 
 def capped(distance: np.ndarray, unit: float, cap: float) -> np.ndarray:
@@ -140,6 +135,11 @@ def scene_scale(xa: Float[np.ndarray, "Na T 3"], xb: Float[np.ndarray, "Nb T 3"]
     medians = medians[:: max(1, len(medians) // SCALE_SAMPLES)]
     distance = pdist(medians) if len(medians) > 1 else np.zeros(0)
     return float(np.median(distance)) if distance.size and np.median(distance) > 0 else 1.0
+
+
+def _step(times: Float[np.ndarray, " T"], alone: float) -> float:
+    """Seconds from a frame to the next; ``alone`` for a single one."""
+    return float(np.median(np.diff(times))) if len(times) > 1 else alone
 
 
 def _medians(x: Float[np.ndarray, "N T 3"]) -> Float[np.ndarray, "N 3"]:

@@ -114,6 +114,7 @@ class Tracking:
     Args:
         masker: default: given masks where there are any, else the median background of a static camera, else the
             flow residual of a moving one.
+        features: colours, or :class:`otsync.priors.Daisy`; any object with that call.
         width: working resolution; larger frames are reduced to it.
     """
 

@@ -31,7 +31,8 @@ from recon.fit import fit
 from recon.gaussians4d import Gaussians4D
 from recon.held_out import Clock, view
 from recon.lpips import Lpips
-from recon.prepare import Plan, Prepared, Progress, prepare
+from recon.plan import Plan, Progress
+from recon.prepare import Prepared, prepare
 from recon.seed import Seeding
 
 Row = dict[str, Any]
@@ -109,7 +110,8 @@ def material_of(
     """Depth of every frame and tracks of every training video, from the synchronised recording; kept in ``cache``."""
     from otsync.depth_maps import depth_maps
     from otsync.io.mend import cut
-    from recon.prepare import lifted_tracks, only
+    from recon.initial import lifted_tracks
+    from recon.intake import only
 
     if protocol.frames is not None:
         scene = cut(scene, *protocol.frames)

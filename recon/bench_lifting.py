@@ -23,6 +23,7 @@ from scipy.stats import binned_statistic
 from otsync.bench.panoptic import NEAR, precision_near
 from otsync.bench.record import table, write_rows
 from otsync.io import Scene
+from otsync.progress import counted
 from otsync.types import Offsets, TrackSet, Video
 from recon.bench import Protocol, material_of
 from recon.dense_features import DaisyMaps, LabMaps
@@ -66,7 +67,8 @@ def run(
 ) -> list[Row]:  # fmt: skip
     """Measure; print, and write ``lifting.csv`` and ``lifting.json`` to ``out``."""
     from otsync.priors.cache import Cache
-    from recon.prepare import Progress, read_footage
+    from recon.initial import read_footage
+    from recon.plan import Progress
 
     if np.ptp(truth.seconds) > 0:
         raise ValueError(
@@ -188,7 +190,7 @@ def matched(sources: Sequence[dict[str, TrackSet]], cameras: Sequence[Any]) -> l
         head = {"matching": matching, "tracks": source, "n": round(float(n.mean()), 1)}
         rows.append(head | by_angle | {"all": round(float(precision.mean()), 3)})
 
-    for source in sources[0]:
+    for source in counted(sources[0], "partners within reach", "source"):
         add(
             "tracks that have a partner at all",
             source,
@@ -197,7 +199,7 @@ def matched(sources: Sequence[dict[str, TrackSet]], cameras: Sequence[Any]) -> l
     for matching, (matcher, most) in matchers.items():
         for source in sources[0]:
             scores = []
-            for i, j in pairs:
+            for i, j in counted(pairs, f"{matching}, {source}", "pair"):
                 a, b = sources[i][source], sources[j][source]
                 matches = matcher(a, b)
                 scores.append(precision_near(a, b, matches if most is None else matches.best(most)))

@@ -17,6 +17,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 import contextlib
 import ctypes
 import gc
+import itertools
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -29,6 +30,7 @@ from torch import Tensor
 
 from otsync.bench import record
 from otsync.files import atomic_write, read_json
+from otsync.progress import counted, say
 from recon.raster import Rendering, render, warmup
 
 SIZES = ((128, 96, 2_000), (160, 120, 5_000), (320, 180, 20_000), (640, 360, 100_000))  # width, height, Gaussians
@@ -258,16 +260,14 @@ def run(
     warmup()
     rows: list[dict[str, Any]] = []
     print("   size              C  back end    forward     total       min  x torch  peak MB  x bound")
-    for size in sizes:
-        for c in channels:
-            for row in measure(size, c, repeats, names):
-                rows.append(row)
-                print(
-                    f"{row['width']:4}x{row['height']:<4}{row['gaussians']:7} {c:4}  {row['backend']:7}"
-                    f"{row['forward_ms']:10.2f}{row['total_ms']:10.2f}{row['total_ms_min']:10.2f}"
-                    f"{row['times_torch']:9.1f}{row['peak_mb']:9.0f}{row['above_bound']:9.1f}",
-                    flush=True,
-                )
+    for size, c in counted(list(itertools.product(sizes, channels)), "rasterizer", "size"):
+        for row in measure(size, c, repeats, names):
+            rows.append(row)
+            say(
+                f"{row['width']:4}x{row['height']:<4}{row['gaussians']:7} {c:4}  {row['backend']:7}"
+                f"{row['forward_ms']:10.2f}{row['total_ms']:10.2f}{row['total_ms_min']:10.2f}"
+                f"{row['times_torch']:9.1f}{row['peak_mb']:9.0f}{row['above_bound']:9.1f}"
+            )
     fit = {"toy_fit": _toy_fit()} if with_fit else {}
     record.write_rows(out, "raster", rows, {**settings, "skipped": skipped, **fit})
     _plot(out, rows)

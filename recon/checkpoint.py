@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from torch import Tensor
 
 from otsync.files import read_npz, write_npz
 from recon.gaussians4d import UNSOUND, scene_from_arrays
+from recon.problem import scene_groups
 
 FORMAT, VERSION = "otsync.fit", 1
 
@@ -73,8 +73,12 @@ class Checkpoint:
         write_npz(self.path, arrays)
         self._last = time.monotonic()
 
-    def load(self) -> Snapshot | None:
-        """The last snapshot; None when there is none. ValueError for a damaged file or one of another fit."""
+    def load(self, groups: Mapping[str, Tensor]) -> Snapshot | None:
+        """The last snapshot; None when there is none. ValueError for a damaged file or one of another fit.
+
+        groups: what the fit begins with. The snapshot has the same ones, of the same types and shapes, but for the
+        number of nodes and Gaussians, which is that of its own scene.
+        """
         if self.path is None or not self.path.exists():
             return None
         arrays = read_npz(self.path)
@@ -93,7 +97,7 @@ class Checkpoint:
                 torch.from_numpy(np.array(arrays["pull"])), arrays["since"],
             )  # fmt: skip
             key = about["key"]
-            scene_from_arrays(snapshot.scene)  # what a fit continues from: here its errors name the file
+            scene = scene_from_arrays(snapshot.scene)  # what a fit continues from: here its errors name the file
         except (*UNSOUND, ValueError) as error:
             raise ValueError(
                 f"{self.path}: not a sound checkpoint; {type(error).__name__}: {error}. Delete it to begin anew."
@@ -103,18 +107,44 @@ class Checkpoint:
                 f"{self.path}: expected a checkpoint of this fit; it belongs to other videos, offsets or options. "
                 "Choose another path, or delete it to begin anew."
             )
+        own = scene_groups(scene)
+        beside = {name: tensor for name, tensor in groups.items() if name not in own}
+        wrong = "; ".join(_misfits(snapshot, own | beside, set(groups), len(scene)))
+        if wrong:
+            raise ValueError(f"{self.path}: not a sound checkpoint; {wrong}. Delete it to begin anew.")
         return snapshot
+
+
+def _misfits(snapshot: Snapshot, expected: Mapping[str, Tensor], names: set[str], gaussians: int) -> Iterator[str]:
+    """What of a snapshot is not as the fit needs it; ``expected``: its groups as its scene has them."""
+    if set(snapshot.groups) != names or set(expected) != names:
+        found = set(snapshot.groups) | (set(expected) - names)
+        yield f"groups: expected {', '.join(sorted(names))}; found {', '.join(sorted(found))}"
+        return
+    for name, tensor in expected.items():
+        yield from _misfit(f"groups/{name}", snapshot.groups[name], tensor.shape, _type(tensor))
+    for name, moment in snapshot.moments.items():
+        group, _, kind = name.rpartition(".")
+        if group not in expected or kind not in ("step", "exp_avg", "exp_avg_sq"):
+            yield f"moments/{name}: expected step, exp_avg or exp_avg_sq of a group"
+        elif kind == "step":
+            yield from _misfit(f"moments/{name}", moment, (), "float32")
+        else:
+            yield from _misfit(f"moments/{name}", moment, expected[group].shape, _type(expected[group]))
+    yield from _misfit("pull", snapshot.pull, (2, gaussians), "float32")
+    rows = {"history": (snapshot.history, 4 + len(expected["offsets"])), "since": (snapshot.since, 2)}
+    for name, (array, columns) in rows.items():
+        yield from _misfit(name, array, (*array.shape[:1], columns), "float64")
+
+
+def _misfit(name: str, found: Tensor | np.ndarray, shape: Sequence[int], dtype: str) -> Iterator[str]:
+    if tuple(found.shape) != tuple(shape) or _type(found) != dtype:
+        yield f"{name}: expected {dtype} of shape {tuple(shape)}; found {_type(found)} of shape {tuple(found.shape)}"
+
+
+def _type(x: Tensor | np.ndarray) -> str:
+    return str(x.dtype).removeprefix("torch.")
 
 
 def _tensors(arrays: Mapping[str, np.ndarray]) -> dict[str, Tensor]:
     return {name: torch.from_numpy(np.array(array)) for name, array in arrays.items()}
-
-
-def key_of(arrays: Iterable[np.ndarray], *options: Any) -> str:
-    """A hash of all that decides a fit's result: its arrays, and the text of its options."""
-    digest = hashlib.blake2b(repr(options).encode(), digest_size=16)
-    for array in arrays:
-        array = np.ascontiguousarray(array)
-        digest.update(f"{array.dtype}{array.shape}".encode())
-        digest.update(array.view(np.uint8).reshape(-1).data if array.size else b"")
-    return digest.hexdigest()

@@ -9,14 +9,16 @@ from __future__ import annotations
 import math
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from otsync.command_line import run_command
+from otsync.progress import counted
 from recon.commands_bench import Bench
 from recon.density import Densify
 from recon.export import Format
@@ -27,7 +29,7 @@ if TYPE_CHECKING:
     from otsync.types import Offsets
     from recon.held_out import ViewScore
     from recon.pipeline import Outcome
-    from recon.prepare import Plan, Progress
+    from recon.plan import Plan, Progress
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,7 @@ class FitOptions:
     def plan(self) -> Plan:
         """The pipeline's form of this."""
         from recon.effects import MotionBlur
-        from recon.prepare import Plan
+        from recon.plan import Plan
         from recon.seed import Seeding
 
         return Plan(
@@ -117,7 +119,7 @@ class Fit:
     """Track sets in space (.npz), one a video, that the motion begins with; default: tracked and lifted here."""
     truth: Path | None = None
     """truth.json of a simulated world: adds errors to table and report."""
-    fit: tyro.conf.OmitArgPrefixes[FitOptions] = field(default_factory=FitOptions)
+    fit: Annotated[FitOptions, tyro.conf.arg(name="")] = field(default_factory=FitOptions)
 
     def run(self) -> int:
         from otsync.types import Offsets, TrackSet
@@ -182,7 +184,7 @@ class Render:
             times = times * self.frames if len(self.times) == 1 else stretched(result.scene.span, self.frames)
         check_times(result.scene, times)
         images = rendered(result, times, self.camera, turns=self.turns, width=self.width)
-        count = write_images(progress(images, len(times), "rendering", "image"), self.out, fps)
+        count = write_images(counted(images, "rendering", "image", len(times)), self.out, fps)
         print(f"wrote {count} images to {self.out}")
         return 0
 
@@ -220,7 +222,7 @@ class Eval:
         from otsync.priors.cache import Cache
         from otsync.types import Offsets
         from recon.pipeline import evaluate, offset_figures, true_seconds
-        from recon.prepare import Progress
+        from recon.plan import Progress
         from recon.result import load_result, metrics_of
 
         if self.views < 1:
@@ -375,7 +377,7 @@ def reconstructed(
     from otsync.priors.cache import Cache
     from otsync.types import Offsets
     from recon.pipeline import reconstruct
-    from recon.prepare import Progress
+    from recon.plan import Progress
 
     known = None if truth is None else Offsets.load(truth)
     with ThreadPoolExecutor(options.workers or os.cpu_count() or 1) as pool:
@@ -427,40 +429,14 @@ def view_table(views: tuple[ViewScore, ...], lpips_reason: str = "") -> str:
     return "\n".join(lines + ([f"LPIPS is left out: {lpips_reason}"] if lpips_reason else []))
 
 
-def progress(items: Iterable[Any], total: int, what: str, unit: str) -> Iterator[Any]:
-    """A bar on a terminal."""
-    from tqdm import tqdm
-
-    return tqdm(items, total=total, desc=what, unit=unit, disable=None, leave=False)
-
-
 def main(args: list[str] | None = None) -> int:
     """Entry point of the ``recon`` command."""
-    from otsync import __version__
-    from recon.fit import Diverged
+    from recon.running import Diverged
 
-    args = sys.argv[1:] if args is None else args
-    if args == ["--version"]:
-        print(f"recon {__version__}")
-        return 0
-    command = tyro.extras.subcommand_cli_from_dict(
-        COMMANDS, prog="recon", description=__doc__, args=args,
-        config=(tyro.conf.AvoidSubcommands,) if not args else (),
+    return run_command(
+        "recon", COMMANDS, args, description=__doc__, refused=(Diverged, FloatingPointError),
+        interrupted="the same command continues from here.",
     )  # fmt: skip
-    try:
-        return command.run()
-    except (Diverged, FloatingPointError) as error:
-        print(f"recon: {error}", file=sys.stderr)
-        return 1
-    except ModuleNotFoundError as error:
-        print(f"recon: needs {error.name}. Install it: pip install 'otsync[recon,video]'.", file=sys.stderr)
-        return 2
-    except (ValueError, OSError) as error:
-        print(f"recon: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("recon: interrupted; the same command continues from here.", file=sys.stderr)
-        return 130
 
 
 if __name__ == "__main__":

@@ -52,7 +52,8 @@ class LabMaps:
 
 @dataclass(frozen=True)
 class DaisyMaps:
-    """DAISY (Tola et al., PAMI 2010): histograms of gradient directions on rings around every foreground pixel.
+    """DAISY (Tola et al., PAMI 2010): histograms of gradient directions on rings around every foreground pixel; of tracks
+    alone: :class:`otsync.priors.Daisy`.
 
     Args:
         radius: of the outer ring, pixels at 640 of width. rings, spokes, directions: (rings * spokes + 1) * directions

@@ -116,7 +116,7 @@ def fit(
     problem = Problem.of(scene, footage, offsets, tuple(losses), tuple(effects), batch, seed)
     options = (losses, effects, sorted(rates.items()), steps, budget, batch, densify, seed)
     keep = Checkpoint(checkpoint, problem.key(*options) if checkpoint is not None else "", save_every)
-    run = Run(problem, dict(rates), keep.load(), _steps(steps, budget))
+    run = Run(problem, dict(rates), keep.load(problem.groups()), _steps(steps, budget))
     started = time.perf_counter()
     with ExitStack() as stack:
         pool = stack.enter_context(ThreadPoolExecutor(batch + 1, thread_name_prefix="recon.fit"))

@@ -20,9 +20,12 @@ from recon.effects import Effect, Gain, MotionBlur, optics, with_declared
 from recon.evaluate import offset_error
 from recon.fit import Reconstruction, fit
 from recon.held_out import Clock, ViewScore, view
+from recon.initial import read_footage
+from recon.intake import given_clocks, readable
 from recon.lpips import Lpips
 from recon.optimize import RATES, without
-from recon.prepare import MapLike, Plan, Prepared, Progress, given_clocks, prepare, read_footage, readable
+from recon.plan import MapLike, Plan, Progress
+from recon.prepare import Prepared, prepare
 from recon.report import write_reconstruction_report
 from recon.result import FilmedBy, Result, clear_parts, metrics_of, save_run
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from otsync.types import Offsets
-from recon.checkpoint import key_of
+from recon.content import content_key
 from recon.effects import Effect, initial_parameters
 from recon.footage import Footage
 from recon.gaussians4d import Gaussians4D, scene_arrays
@@ -103,16 +103,9 @@ class Problem:
         return any(what in loss.needs for loss in self.losses)
 
     def key(self, *options: Any) -> str:
-        """What decides the result: see :func:`recon.checkpoint.key_of`."""
-        arrays = [*scene_arrays(self.scene).values(), self.start, self.offsets.rates[self.index]]
-        for clip in self.clips:
-            f = clip.footage
-            arrays += [f.images, f.times, f.K, f.w2c, f.boxes, f.bad]
-            arrays += [a for a in (f.masks, f.background) if a is not None]
-            for given in (f.depth, f.features):
-                arrays += [given[k] for k in sorted(given)] if given else []
-            arrays += [x.numpy() for k in sorted(f.tracks) for x in vars(f.tracks[k]).values()] if f.tracks else []
-        return key_of(arrays, *options)
+        """A hash of all that decides the result, the same in every process."""
+        footage, rates = [clip.footage for clip in self.clips], self.offsets.rates[self.index]
+        return content_key(scene_arrays(self.scene), self.start, rates, footage, *options)
 
     def pick(self, step: int) -> list[tuple[int, int]]:
         """(video, frame) of the images of a step: every frame once before any comes again."""

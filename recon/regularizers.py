@@ -8,9 +8,10 @@ Offsets get no gradient from here: a motion is as stiff as it is, whenever it wa
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -65,26 +66,31 @@ def soft_norm(x: Tensor, soft: float = SOFT) -> Tensor:
 
 def shape_change(motion: Scaffold, times: tuple[float, float], neighbours: int, draw: Draw) -> Tensor:
     """mean_i Σ_k ŵ_ik ‖l_ik(t_0) - l_ik(t_1)‖ with l_ik = R_kᵀ(x_i - x_k) in footprints, over the first neighbours."""
-    k, shares = motion.edges[:, :neighbours], _edge_shares(motion, neighbours)
-    if fused.applies(motion.knots, motion.knot_quats):
-        moments = motion.moments(times, draw.clocks)
-        edges, w = k.numpy(), shares.numpy()
 
-        def compute(knots, quats, g_knots, g_quats):
-            curves = (knots, quats, motion.rig.clock)
-            return regularizer_kernels.arap(curves, moments, edges, w, 1 / draw.footprint, SOFT, g_knots, g_quats)
+    def local(apart: Tensor, quats: Tensor, k: Tensor) -> Tensor:
+        return (rotation_matrices(quats)[k].transpose(-1, -2) @ apart[..., None])[..., 0]
 
-        return fused.penalty(motion.knots, motion.knot_quats, compute)
-    local = []
-    for t in times:
-        positions, quats = motion.nodes(t, draw.clocks)
-        apart = (positions[:, None] - positions[k]) / draw.footprint
-        local.append((rotation_matrices(quats)[k].transpose(-1, -2) @ apart[..., None])[..., 0])
-    return (soft_norm(local[0] - local[1]) * shares).sum(1).mean()
+    return _edge_change(motion, times, neighbours, draw, local, regularizer_kernels.arap)
 
 
 def length_change(motion: Scaffold, times: tuple[float, float], neighbours: int, draw: Draw) -> Tensor:
     """mean_i Σ_k ŵ_ik |‖x_i - x_k‖(t_0) - ‖x_i - x_k‖(t_1)| in footprints, over the first neighbours."""
+
+    def length(apart: Tensor, quats: Tensor, k: Tensor) -> Tensor:
+        return soft_norm(apart)[..., None]
+
+    def kernel(*given: Any) -> float:
+        return regularizer_kernels.length(*given[:-1])  # rotations get no gradient
+
+    return _edge_change(motion, times, neighbours, draw, length, kernel)
+
+
+def _edge_change(
+    motion: Scaffold, times: tuple[float, float], neighbours: int, draw: Draw,
+    described: Callable[[Tensor, Tensor, Tensor], Tensor], kernel: Callable[..., float],
+) -> Tensor:  # fmt: skip
+    """mean_i Σ_k ŵ_ik ‖d_ik(t_0) - d_ik(t_1)‖ with d = described(x_i - x_k [M,K,3], quats [M,4], k [M,K]); the kernel
+    computes the same, with its gradients, where that can be done in one pass."""
     k, shares = motion.edges[:, :neighbours], _edge_shares(motion, neighbours)
     if fused.applies(motion.knots, motion.knot_quats):
         moments = motion.moments(times, draw.clocks)
@@ -92,14 +98,14 @@ def length_change(motion: Scaffold, times: tuple[float, float], neighbours: int,
 
         def compute(knots, quats, g_knots, g_quats):
             curves = (knots, quats, motion.rig.clock)
-            return regularizer_kernels.length(curves, moments, edges, w, 1 / draw.footprint, SOFT, g_knots)
+            return kernel(curves, moments, edges, w, 1 / draw.footprint, SOFT, g_knots, g_quats)
 
         return fused.penalty(motion.knots, motion.knot_quats, compute)
-    lengths = []
-    for t in times:
-        positions, _ = motion.nodes(t, draw.clocks)
-        lengths.append(soft_norm((positions[:, None] - positions[k]) / draw.footprint))
-    return (soft_norm((lengths[0] - lengths[1])[..., None]) * shares).sum(1).mean()
+    before, after = (
+        described((positions[:, None] - positions[k]) / draw.footprint, quats, k)
+        for positions, quats in (motion.nodes(t, draw.clocks) for t in times)
+    )
+    return (soft_norm(before - after) * shares).sum(1).mean()
 
 
 def _edge_shares(motion: Scaffold, neighbours: int) -> Tensor:
@@ -141,6 +147,15 @@ def _step(motion: Motion) -> float:
     return motion.path.step(FRAME) if isinstance(motion, Scaffold | PerGaussian) else FRAME
 
 
+def _over_a_shift(loss: Arap | Length, change: Callable[..., Tensor], motion: Motion, draw: Draw) -> Tensor | None:
+    """The change between two moments, apart by one of the loss's shifts; None without a scaffold."""
+    if not isinstance(motion, Scaffold):
+        return None
+    shift = motion.path.step(float(draw.rng.choice(loss.shifts)))
+    t = draw.moment(0, shift)
+    return change(motion, (t, t + shift), loss.neighbours, _still(draw))
+
+
 @dataclass(frozen=True)
 class Arap:
     """As rigid as possible: a node keeps its place in the frames of its neighbours (MoSca's L_coord).
@@ -154,11 +169,7 @@ class Arap:
     neighbours: int = 6
 
     def __call__(self, motion: Motion, means: Tensor, quats: Tensor, draw: Draw) -> Tensor | None:
-        if not isinstance(motion, Scaffold):
-            return None
-        shift = motion.path.step(float(draw.rng.choice(self.shifts)))
-        t = draw.moment(0, shift)
-        return shape_change(motion, (t, t + shift), self.neighbours, _still(draw))
+        return _over_a_shift(self, shape_change, motion, draw)
 
 
 @dataclass(frozen=True)
@@ -171,11 +182,7 @@ class Length:
     neighbours: int = 6
 
     def __call__(self, motion: Motion, means: Tensor, quats: Tensor, draw: Draw) -> Tensor | None:
-        if not isinstance(motion, Scaffold):
-            return None
-        shift = motion.path.step(float(draw.rng.choice(self.shifts)))
-        t = draw.moment(0, shift)
-        return length_change(motion, (t, t + shift), self.neighbours, _still(draw))
+        return _over_a_shift(self, length_change, motion, draw)
 
 
 @dataclass(frozen=True)

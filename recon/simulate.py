@@ -18,6 +18,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from otsync.progress import counted
 from otsync.simulate import Scene
 from otsync.simulate.body import Parts, euler, sample_surface, thing
 from otsync.simulate.observation import stream
@@ -141,7 +142,7 @@ def synthetic(
     times = np.arange(frames) / FPS
     lenses = [_camera(c, cameras, held_out, size, seed) for c in range(cameras + held_out)]
     films = [Film.of(world, lens, c, effects, seed) for c, lens in enumerate(lenses)]
-    shots = [film.shoot(times + shift[c]) for c, film in enumerate(films)]
+    shots = [film.shoot(times + shift[c]) for c, film in counted(enumerate(films), "filming", "camera", len(films))]
     footage = []
     for c, (film, shot) in enumerate(zip(films, shots, strict=True)):
         name = f"cam{c}" if c < cameras else f"held{c - cameras}"

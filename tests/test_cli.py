@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from otsync import Offsets, TrackSet, __version__
-from otsync.cli import main
+from otsync.cli import Simulate, main
+from otsync.types import Alignment, Refused, Status
 
 ROOT = Path(__file__).parents[1]
 
@@ -31,6 +32,31 @@ def test_simulate_writes_track_sets_and_the_truth(world):
     truth = Offsets.load(world / "truth.json")
     assert truth.names == ("video0", "video1", "video2") and truth.seconds[0] == 0
     assert 0 < np.abs(truth.frames[1:]).max() <= 9 and len(TrackSet.load(world / "video1.npz")) > 50
+
+
+@pytest.mark.parametrize(
+    "error, code, says",
+    [
+        (Refused("align", Alignment(0.0, status=Status.WEAK)), 1, "otsync: align: weak"),
+        (ModuleNotFoundError("No module named 'torch'", name="torch"), 2, "otsync: needs torch. Install it: pip"),
+        (ValueError("videos: expected two"), 2, "otsync: videos: expected two"),
+        (FileNotFoundError("no such file"), 2, "otsync: no such file"),
+        (KeyboardInterrupt(), 130, "otsync: interrupted; nothing half-written is left."),
+    ],
+)
+def test_what_stops_a_command_decides_its_exit_code(error, code, says, tmp_path, monkeypatch, capsys):
+    def stop(self):
+        raise error
+
+    monkeypatch.setattr(Simulate, "run", stop)
+    assert main(["simulate", str(tmp_path)]) == code
+    assert capsys.readouterr().err.startswith(says)
+
+
+def test_any_other_error_is_a_defect_and_shows_where(tmp_path, monkeypatch):
+    monkeypatch.setattr(Simulate, "run", lambda self: [][1])
+    with pytest.raises(IndexError):
+        main(["simulate", str(tmp_path)])
 
 
 def test_sync_prints_a_table_and_writes_offsets_and_report(world, tmp_path, capsys):

@@ -13,6 +13,7 @@ from PIL import Image
 
 from otsync.files import write_npz
 from otsync.io import ImageFrames, VideoFrames, describe_folder, open_scene
+from otsync.io.frames import _Errors
 from otsync.io.images import read_depth, read_image, read_mask
 from otsync.io.scene import FORMAT, VERSION, write_document
 
@@ -274,6 +275,15 @@ def test_damaged_videos_are_clean_errors(tmp_path, data):
             video[k]
     except ValueError as error:
         assert "v.mp4" in str(error)
+
+
+def test_sizes_that_a_damaged_video_makes_up_are_no_lack_of_memory():
+    import av
+
+    with pytest.raises(ValueError, match=r"v\.mp4: expected a readable video; MemoryError"), _Errors(Path("v.mp4")):
+        raise av.error.MemoryError(12, "Cannot allocate memory")
+    with pytest.raises(MemoryError), _Errors(Path("v.mp4")):
+        raise MemoryError
 
 
 def test_init_names_what_is_missing(folder):

@@ -12,6 +12,7 @@ from otsync.lift import Lift, depth_at, running_median, smooth_in_time
 from otsync.priors import (
     Cache,
     ChainedFlow,
+    Daisy,
     FlowResidual,
     GivenMasks,
     LabHistogram,
@@ -134,6 +135,77 @@ def test_histograms_tell_colours_apart_and_missed_tracks_have_one():
     f = LabHistogram()(work, np.ones((20, H, W), bool), uv, 30.0)
     np.testing.assert_allclose(np.linalg.norm(f, axis=1), 1, atol=1e-6)
     assert f[0] @ f[1] > 0.99 and f[0] @ f[3] > 0.99 and f[0] @ f[2] < 0.1
+
+
+@pytest.fixture(scope="module")
+def moved() -> tuple[WorkingFrames, WorkingFrames, np.ndarray]:
+    """A texture that shifts by whole pixels, the same in other light and noise, and the paths of nine of its points."""
+    plain, lit = [], []
+    rng = np.random.default_rng(5)
+    wall = texture(3, (W + 60, H + 60))
+    uv = np.zeros((9, 20, 2), np.float32)
+    for k in range(20):
+        x, y = 2 * k, k
+        plain.append(wall[y : y + H, x : x + W].astype(np.uint8))
+        lit.append(np.clip(0.5 * plain[-1] + 60 + rng.normal(0, 2, (H, W, 3)), 0, 255).astype(np.uint8))
+        uv[:, k] = np.stack([80 + 40 * (np.arange(9) % 3) - x, 60 + 35 * (np.arange(9) // 3) - y], 1)
+    return WorkingFrames(plain, (W, H)), WorkingFrames(lit, (W, H)), uv
+
+
+def test_daisy_knows_a_point_again_in_other_light(moved):
+    plain, lit, uv = moved
+    masks = np.ones((20, H, W), bool)
+    early, late = np.where(np.arange(20)[:, None] < 10, uv, np.nan), np.where(np.arange(20)[:, None] < 10, np.nan, uv)
+    f = Daisy()(plain, masks, early, 30.0)
+    assert f.shape == (9, 64)
+    np.testing.assert_allclose(np.linalg.norm(f, axis=1), 1, atol=1e-6)
+    for other in (Daisy()(plain, masks, late, 30.0), Daisy()(lit, masks, uv, 30.0)):
+        similar = f @ other.T
+        assert (similar.argmax(1) == np.arange(9)).all() and np.diag(similar).min() > 0.98
+        assert similar[~np.eye(9, dtype=bool)].max() < 0.97
+    lab = LabHistogram()
+    assert np.diag(lab(plain, masks, uv, 30.0) @ lab(lit, masks, uv, 30.0).T).max() < 0.98  # colours do not bear it
+
+
+def test_daisy_counts_in_pixels_at_640(moved):
+    plain, _, uv = moved
+    double = WorkingFrames(
+        [cv2.resize(f, (2 * W, 2 * H), interpolation=cv2.INTER_CUBIC) for f in plain], (2 * W, 2 * H)
+    )
+    masks = np.ones((20, 1, 1), bool)
+    similar = Daisy()(plain, masks, uv, 30.0) @ Daisy()(double, masks, 2 * uv + 0.5, 30.0).T
+    assert (similar.argmax(1) == np.arange(9)).all() and np.diag(similar).min() > 0.9
+
+
+def test_daisy_of_short_lives_borders_and_nothing_at_all(moved):
+    plain, _, uv = moved
+    masks = np.ones((20, H, W), bool)
+    brief = np.full((3, 20, 2), np.nan, np.float32)
+    brief[0, 8:11] = uv[4, 8:11]  # between two samples
+    brief[1] = (-3.0, H + 2.0)  # tracks may leave the image by a little
+    f = Daisy()(plain, masks, brief, 30.0)
+    assert np.isfinite(f).all() and f[0] @ Daisy()(plain, masks, uv, 30.0)[4] > 0.98
+    np.testing.assert_allclose(f[2], 1 / 8)  # never seen
+    flat = Daisy()(WorkingFrames([np.full((H, W, 3), 90, np.uint8)] * 20, (W, H)), masks, uv, 30.0)
+    np.testing.assert_allclose(flat, 1 / 8)
+    assert Daisy(rings=2, spokes=8, directions=6)(plain, masks, uv, 30.0).shape == (9, 102)
+
+
+def test_daisy_in_the_slot(slide, tmp_path):
+    frames, corner = slide
+    video, masks = Video(frames, CAMERA, fps=30), list(inside(corner, 6))
+    lab, daisy = Tracking()(video, masks, Cache(tmp_path)), Tracking(features=Daisy())(video, masks, Cache(tmp_path))
+    np.testing.assert_array_equal(daisy["uv"], lab["uv"])
+    assert daisy["features"].shape == (len(daisy["uv"]), 64) and lab["features"].shape[1] == 64
+    np.testing.assert_allclose(np.linalg.norm(daisy["features"], axis=1), 1, atol=1e-5)
+    assert not np.allclose(daisy["features"], lab["features"])
+    assert len(list(tmp_path.glob("tracks-*.npz"))) == 2
+
+
+def test_daisy_says_what_it_needs(moved, monkeypatch):
+    monkeypatch.delattr(cv2, "xfeatures2d")
+    with pytest.raises(ValueError, match="Daisy: needs OpenCV's contributed modules"):
+        Daisy()(moved[0], [], moved[2], 30.0)
 
 
 def test_working_frames_reduce_and_map_back():

@@ -78,6 +78,64 @@ def test_offsets_of_another_version_are_refused_with_the_remedy(tmp_path, versio
         Offsets.load(tmp_path / "o.json")
 
 
+def changed(where, value):
+    data = json.loads(json.dumps(offsets().to_dict()))
+    part = data
+    for key in where[:-1]:
+        part = part[key]
+    part[where[-1]] = value
+    return data
+
+
+@pytest.mark.parametrize(
+    "where, value, says",
+    [
+        (("videos", 1, "fps"), -30, r"videos, b: fps: expected a finite number above 0, or null; found -30"),
+        (("videos", 1, "fps"), 0, r"videos, b: fps: expected .* above 0"),
+        (("videos", 1, "fps"), True, r"videos, b: fps: expected a number or null; found True"),
+        (("videos", 1, "rate"), 0.0, r"videos, b: rate: expected .* above 0"),
+        (("videos", 2, "sigma_seconds"), -0.1, r"videos, c: sigma_seconds: expected .* of 0 or more"),
+        (
+            ("videos", 2, "offset_seconds"),
+            float("inf"),
+            r"videos, c: offset_seconds: expected a finite number, or null",
+        ),
+        (("videos", 2, "offset_seconds"), 10**400, r"OverflowError"),
+        (("videos", 2, "offset_seconds"), "1", r"videos, c: offset_seconds: expected a number or null; found '1'"),
+        (("videos", 1, "name"), "a", r"videos: expected at least one, with unique names"),
+        (("videos", 2, "name"), 7, r"videos: expected at least one, with unique names"),
+        (("videos", 1, "reference"), "d", r"videos, b: reference: expected one of a, b, c; found 'd'"),
+        (("videos", 1, "reference"), "c", None),
+        (
+            ("videos", 2, "reference"),
+            "b",
+            r"videos, c: reference: expected a video that is its own reference; found 'b'",
+        ),
+        (("videos", 0, "reference"), "c", r"videos, b: reference: expected a video that is its own reference"),
+        (("reference",), "d", r"reference: expected one of a, b, c; found 'd'"),
+        (("reference",), "b", r"videos, b: reference: expected a video that is its own reference; found 'a'"),
+        (("videos", 1, "status"), "splendid", r"splendid"),
+        (("pairs", 0, "b"), "a", r"pairs, a-a: expected two videos, each pair once"),
+        (("pairs", 0, "b"), "d", r"pairs: b: expected one of a, b, c; found 'd'"),
+        (("pairs", 0, "fps"), -1, r"pairs, a-b: fps: expected .* above 0"),
+        (("pairs", 0, "rate"), -1, r"pairs, a-b: rate: expected .* above 0"),
+        (("pairs", 0, "sigma_seconds"), -1, r"pairs, a-b: sigma_seconds: expected .* of 0 or more"),
+        (("pairs", 0, "hypotheses"), [[1, 2, 3, 4]], r"pairs, a-b: hypotheses: expected a list of pairs"),
+        (("pairs", 0, "stats"), {"matches": "many"}, r"pairs, a-b: stats, matches: expected a number"),
+        (("stats",), {"seconds": [1]}, r"stats, seconds: expected a number"),
+        (("pairs",), [offsets().to_dict()["pairs"][0]] * 2, r"pairs, a-b: expected two videos, each pair once"),
+        (("videos", 1, "fps"), None, None),
+    ],
+)
+def test_offsets_that_make_no_sense_are_refused_with_the_field(tmp_path, where, value, says):
+    (tmp_path / "o.json").write_text(json.dumps(changed(where, value)))
+    if says is None:
+        Offsets.load(tmp_path / "o.json")
+        return
+    with pytest.raises(ValueError, match=rf"o\.json: not a sound offsets file; .*{says}.*Write it anew"):
+        Offsets.load(tmp_path / "o.json")
+
+
 @given(st.recursive(st.none() | st.booleans() | st.floats() | st.text(max_size=5), lambda c: st.lists(c, max_size=3) | st.dictionaries(st.text(max_size=8), c, max_size=3), max_leaves=8), st.sampled_from(["videos", "pairs", "reference", "stats"]))  # fmt: skip
 @settings(max_examples=60, deadline=None)
 def test_any_damaged_offsets_file_is_a_value_error_that_names_it(tmp_path_factory, value, key):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import numpy as np
 from ..align import DTW, Aligner, ConstantShift, align
 from ..match import FusedGromovWasserstein, Matcher, OptimalTransport, match
 from ..metrics import match_quality
+from ..progress import counted
 from ..simulate import matching_world, simulate
 from . import record
 from .record import run_python, table, write_rows
@@ -70,10 +72,10 @@ def worse(key: str, measured: float, baseline: float) -> bool:
 def matching_ablation(n: int, seeds: range) -> list[dict]:
     """Mean quality of each matcher over the same worlds, in the feature model of the design."""
     rows = []
-    worlds = [matching_world(n, seed=seed) for seed in seeds]
+    worlds = [matching_world(n, seed=seed) for seed in counted(seeds, "worlds to match", "world")]
     for name, matcher in MATCHERS.items():
         started, qualities = time.process_time(), []
-        for a, b, truth in worlds:
+        for a, b, truth in counted(worlds, name, "world"):
             qualities.append(match_quality(match(a, b, matcher), truth))
         spent = (time.process_time() - started) / len(worlds)
         means = {key: float(np.mean([q[key] for q in qualities])) for key in qualities[0]}
@@ -86,18 +88,16 @@ def offset_table(
 ) -> list[dict]:
     """One row per aligner, preset, class and band: mean, median, share over two frames."""
     rows = []
-    for preset in presets:
-        for motion in CLASSES:
-            for low, high in BANDS:
-                errors: dict[str, list[float]] = {name: [] for name in ALIGNERS}
-                for seed in range(first_seed, first_seed + seeds):
-                    rng = np.random.default_rng([seed, CLASSES.index(motion), low])
-                    frames = float(rng.uniform(low, high) * rng.choice([-1, 1]))
-                    (a, b), truth = simulate(motion, preset=preset, offsets=[0.0, frames / 30], seed=seed)
-                    matches = truth.matches(0, 1)
-                    for name, aligner in ALIGNERS.items():
-                        errors[name].append(abs(align(a, b, matches, aligner, throw=False).frames - frames))
-                rows += [_row(name, preset, motion, f"{low}-{high}", e) for name, e in errors.items()]
+    for preset, motion, (low, high) in counted(list(itertools.product(presets, CLASSES, BANDS)), "aligners", "cell"):
+        errors: dict[str, list[float]] = {name: [] for name in ALIGNERS}
+        for seed in range(first_seed, first_seed + seeds):
+            rng = np.random.default_rng([seed, CLASSES.index(motion), low])
+            frames = float(rng.uniform(low, high) * rng.choice([-1, 1]))
+            (a, b), truth = simulate(motion, preset=preset, offsets=[0.0, frames / 30], seed=seed)
+            matches = truth.matches(0, 1)
+            for name, aligner in ALIGNERS.items():
+                errors[name].append(abs(align(a, b, matches, aligner, throw=False).frames - frames))
+        rows += [_row(name, preset, motion, f"{low}-{high}", e) for name, e in errors.items()]
     return rows
 
 

@@ -30,6 +30,7 @@ from ..match import (
     uniform,
 )
 from ..metrics import match_quality
+from ..progress import counted, say
 from ..simulate import matching_world
 from ..types import Matches, TrackSet
 from . import record
@@ -99,13 +100,13 @@ def run(
     for name, (_, largest) in (MATCHERS | rivals()).items():
         if only and name not in only:
             continue
-        for n in (s for s in sizes if s <= largest):
+        for n in counted([s for s in sizes if s <= largest], name, "size"):
             last = rows[-1] if rows and rows[-1]["matcher"] == name else None
             if last and last.get("cpu_seconds", limit) * (n / last["n"]) ** GROWTH.get(name, 1.0) > limit:
                 break
             row = cell(name, n, range(first_seed, first_seed + seeds), limit)
             rows.append(row)
-            print(table([row], COLUMNS).splitlines()[-1], flush=True)
+            say(table([row], COLUMNS).splitlines()[-1])
             if row["status"] != "ok":
                 break
     for row in rows:

@@ -12,6 +12,7 @@ from ..anchored import AnchoredFGW
 from ..costs import track_distance
 from ..match import match
 from ..metrics import match_quality
+from ..progress import counted
 from ..simulate import matching_world
 from .record import table, write_rows
 
@@ -41,7 +42,7 @@ def run(out: Path, *, n: int = 4000, seeds: int = 6, pairs: int = 20, first_seed
 def scene(name: str, n: int, seeds: range, options: dict[str, Any]) -> dict[str, Any]:
     """Mean quality, worst P50, and how many answers were flagged."""
     qualities, flagged = [], 0
-    for seed in seeds:
+    for seed in counted(seeds, name, "world"):
         a, b, truth = matching_world(n, seed=seed, **options)
         found = match(a, b, AnchoredFGW(), throw=False)
         qualities.append(match_quality(found, truth))
@@ -52,14 +53,15 @@ def scene(name: str, n: int, seeds: range, options: dict[str, Any]) -> dict[str,
 
 def related(pairs: int, seed: int, n: int = 1000) -> dict[str, Any]:
     """How many pairs of views of one scene are matched without a flag."""
-    ok = sum(match(*matching_world(n, seed=seed + k)[:2], throw=False).status.ok for k in range(pairs))
+    worlds = counted(range(seed, seed + pairs), "related scenes", "pair")
+    ok = sum(match(*matching_world(n, seed=s)[:2], throw=False).status.ok for s in worlds)
     return {"what": "related scenes matched", "of": pairs, "count": ok}
 
 
 def unrelated(pairs: int, seed: int, n: int = 1000) -> dict[str, Any]:
     """How many pairs of views of different scenes are told apart."""
     told = 0
-    for k in range(pairs):
+    for k in counted(range(pairs), "unrelated scenes", "pair"):
         a, b = matching_world(n, seed=seed + k)[0], matching_world(n, seed=seed + 1000 + k)[1]
         told += match(a, b, throw=False).status.code == "no_match"
     return {"what": "unrelated scenes: no match", "of": pairs, "count": told}
@@ -70,7 +72,7 @@ def units(seeds: int, seed: int, n: int = 2000) -> dict[str, Any]:
     from dataclasses import replace
 
     same = 0
-    for k in range(seeds):
+    for k in counted(range(seeds), "units", "world"):
         a, b, _ = matching_world(n, seed=seed + k)
         assert a.xyz is not None and b.xyz is not None
         found = [

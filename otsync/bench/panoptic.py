@@ -34,6 +34,7 @@ from ..partners import Candidates
 from ..position_costs import CurveDistance, MedianPosition
 from ..priors.cache import Cache
 from ..priors.stereo import Rig
+from ..progress import counted
 from ..recordings import COLOUR, Stages, pairs_in_pixels, pairs_in_space
 from ..refine import Unrefined
 from ..sync import MapLike, synchronize
@@ -206,10 +207,10 @@ def measure(
             "error": _number(error), "sigma": _number(found.sigma * found.fps), "flags": " ".join(f.code for f in found.flags),
         }  # fmt: skip
 
-    details = list(map(pair, jobs))
+    details = list(counted(map(pair, jobs), f"{route}: pairs", "pair", len(jobs)))
     seconds = time.perf_counter() - started
     graph, whole = [], []
-    for n in range(protocol.graph_seeds):
+    for n in counted(range(protocol.graph_seeds), f"{route}: graphs", "graph"):
         graph += _graph(material, solve, lifted, protocol, rng, min(protocol.graph_cameras, V), f"graph {n}", route)
     for n in range(protocol.largest):
         whole += _graph(material, solve, lifted, protocol, rng, V, f"all {n}", route)
@@ -248,7 +249,8 @@ def matching_table(material: Material, protocol: Protocol, map: MapLike) -> list
         angle = view_angle(a.camera, b.camera, target)  # type: ignore[arg-type]
         return {name: (angle, *precision_near(a, b, matcher(a, b))) for name, matcher in matchers.items()}
 
-    for answer in map(pair, pairs[: protocol.matching]):
+    chosen = pairs[: protocol.matching]
+    for answer in counted(map(pair, chosen), "matchers", "pair", len(chosen)):
         for name, value in answer.items():
             found[name].append(value)
     rows = []

@@ -8,6 +8,7 @@ from dataclasses import replace
 from statistics import median
 from typing import Any
 
+from ..progress import counted
 from ..simulate import PRESETS, simulate
 
 
@@ -30,7 +31,7 @@ def effect_costs(motion: str = "juggle", tracks: int = 140, repeats: int = 15) -
     taken: dict[str, list[float]] = {name: [] for name in cases}
     for run in cases.values():
         run(0)
-    for seed in range(repeats):
+    for seed in counted(range(repeats), "effects", "round"):
         for name, run in cases.items():
             start = time.perf_counter()
             run(seed)

@@ -14,6 +14,7 @@ import numpy as np
 from ..align import DTW, Aligner, ConstantShift, LikelihoodScan, align
 from ..files import atomic_write
 from ..graph import Graph
+from ..progress import counted, say
 from ..refine import Refiner, SplineRefine, Unrefined, refine
 from ..sync import synchronize
 from ..types import Status
@@ -69,7 +70,7 @@ def run(
         rows = pair_rows(chosen)
         write_rows(out, "sync_pairs", rows, about)
         print(table(by_class(rows)) + "\n", flush=True)
-        checks = acceptance(chosen, rows, lambda line: print(line, flush=True))
+        checks = acceptance(chosen, rows, say)
         write_rows(out, "sync_acceptance", [c.row() for c in checks], about)
         return 0 if all(c.met for c in checks) else 1
     found = method_rows(chosen)
@@ -181,7 +182,7 @@ def graph_rows(seeds: Sequence[int], videos: int = 8) -> list[Row]:
         worlds = [many(motion, preset, videos, seed) for motion in motions() for seed in list(seeds)[:1]]
         for name, graph in GRAPHS.items():
             error, trusted, started = [], [], time.process_time()
-            for tracks, truth, matches in worlds:
+            for tracks, truth, matches in counted(worlds, f"{name}, {preset}", "world"):
                 own = {pair: matches[pair] for pair in graph.pairs(videos, 0)}
                 found = synchronize(tracks, matches=own, graph=graph)
                 error += list(np.abs(found.seconds - truth.offsets)[1:] * FPS)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..align import DTW, align
+from ..progress import counted
 from ..refine import SplineRefine, refine
 from ..simulate import simulate
 from ..sync import synchronize
@@ -105,13 +107,13 @@ def views(seeds: Sequence[int], videos: int = 8) -> Iterator[Check]:
     """Many views (items 2 and 5): medians over moving classes, sigma of the graph."""
     for preset, bar in (("mid", 0.03), ("hard", 0.06), ("brutal", 0.3)):
         e, s, ok = [], [], []
-        for motion in motions():
-            for seed in seeds:
-                tracks, truth, matches = many(motion, preset, videos, seed)
-                found = synchronize(tracks, matches=matches)
-                e += list(np.abs(found.seconds - truth.offsets)[1:] * FPS)
-                s += list(found.sigma[1:] * FPS)
-                ok += [status.ok for status in found.status[1:]]
+        worlds = list(itertools.product(motions(), seeds))
+        for motion, seed in counted(worlds, f"{videos} videos {preset}", "world"):
+            tracks, truth, matches = many(motion, preset, videos, seed)
+            found = synchronize(tracks, matches=matches)
+            e += list(np.abs(found.seconds - truth.offsets)[1:] * FPS)
+            s += list(found.sigma[1:] * FPS)
+            ok += [status.ok for status in found.status[1:]]
         error, sigma, trusted = np.array(e), np.array(s), np.array(ok)
         yield at_most(f"{videos} videos {preset}: median", float(np.nanmedian(error)), bar)
         yield Check(f"{videos} videos {preset}: share trusted", float(trusted.mean()), "", True)
@@ -132,7 +134,7 @@ def thirty(seed: int) -> Iterator[Check]:
 def juggling(seeds: Sequence[int], matches: int = 10) -> Iterator[Check]:
     """Periodic motion, few matches, brutal tracks (item 3): curves of many pairs against each pair alone."""
     star, graph, alone = [], [], []
-    for seed in seeds:
+    for seed in counted(seeds, "juggling", "world"):
         tracks, truth, given = many("juggle", "brutal", 8, seed, n=matches)
         found = synchronize(tracks, matches=given)
         graph += list(~(np.abs(found.seconds - truth.offsets)[1:] * FPS <= 2))
@@ -186,7 +188,7 @@ def flags(rows: Sequence[Row], seeds: Sequence[int]) -> Iterator[Check]:
     """Odd cases, errors caught and needless flags (item 4)."""
     wrong, caught = 0, 0
     by_kind: dict[str, list[bool]] = {}
-    for kind, found, error in odd_cases(seeds):
+    for kind, found, error in counted(odd_cases(seeds), "odd cases", "case"):
         flagged = not found.status.ok
         by_kind.setdefault(kind, []).append(flagged)
         if not error <= WRONG:
@@ -207,7 +209,7 @@ def flags(rows: Sequence[Row], seeds: Sequence[int]) -> Iterator[Check]:
 def clocks(seeds: Sequence[int]) -> Iterator[Check]:
     """Rates and timestamps (item 6)."""
     e, kept = {"fixed": [], "fit": []}, {150: [], 900: []}  # type: dict[str, list[float]], dict[int, list[bool]]
-    for motion in motions():
+    for motion in counted(motions(), "clocks", "class"):
         for seed in seeds:
             for frames, rate in ((900, 30 / 29.97), (150, 30 / 29.97), (900, 1.0)):
                 offset = float(np.random.default_rng([seed, frames]).uniform(-30, 30))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import zlib
 from collections.abc import Iterator, Sequence
@@ -11,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from ..graph import Graph, Pair
+from ..progress import counted
 from ..simulate import Truth, simulate
 from ..types import Matches, TrackSet
 
@@ -64,11 +66,9 @@ def pair_case(
 
 
 def pair_cases(presets: Sequence[str], seeds: Sequence[int], classes: Sequence[str] | None = None) -> Iterator[Case]:
-    for preset in presets:
-        for motion in classes or motions():
-            for band in range(len(BANDS)):
-                for seed in seeds:
-                    yield pair_case(motion, preset, band, seed)
+    cells = list(itertools.product(presets, classes or motions(), range(len(BANDS)), seeds))
+    for preset, motion, band, seed in counted(cells, "pairs", "pair"):
+        yield pair_case(motion, preset, band, seed)
 
 
 def many(

@@ -199,7 +199,9 @@ class _Errors:
         return None
 
     def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
-        if error is None or not isinstance(error, Exception) or isinstance(error, ImportError | MemoryError):
+        if error is None or not isinstance(error, Exception) or isinstance(error, ImportError):
+            return
+        if type(error) is MemoryError:  # PyAV's own one comes from sizes that a damaged file makes up
             return
         if isinstance(error, ValueError) and str(error).startswith(str(self.path)):
             return

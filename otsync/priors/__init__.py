@@ -5,7 +5,7 @@ make the key under which :class:`Cache` keeps the result.
 """
 
 from .cache import Cache
-from .features import LabHistogram
+from .features import Daisy, LabHistogram
 from .flow import DISFlow
 from .masks import FlowResidual, GivenMasks, MedianBackground
 from .points import ChainedFlow
@@ -15,6 +15,7 @@ __all__ = [
     "Cache",
     "ChainedFlow",
     "DISFlow",
+    "Daisy",
     "FlowResidual",
     "GivenMasks",
     "LabHistogram",

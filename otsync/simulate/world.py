@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from ..progress import counted
 from ..types import Camera, TrackSet
 from .body import sample_surface
 from .effects import Effect
@@ -126,7 +127,7 @@ def simulate(
     used = level.effects if effects is None else tuple(effects)
     rig = rig or Rig()
     made = []
-    for v in range(videos):
+    for v in counted(range(videos), "simulating", "video"):
         obs = observe(
             scene, rig.camera(scene, v, seed), counts[v], *clocks[v], rate=given_rates[v], offset=seconds[v],
             features=level.features, seed=seed, video=v,

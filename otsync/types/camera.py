@@ -104,7 +104,7 @@ class Video:
         frames: any sequence of (H,W,3) uint8 images; readers decode lazily.
         camera: who filmed; its ``w2c`` has one entry per frame when it moves.
         fps: frames per second, or None when ``timestamps`` (T,) in seconds tell the time.
-        depth: optional sequence of (H,W) depths along z in world units, 0 where unknown.
+        depth: optional sequence of (H,W) depths along z in world units, 0 where unknown; None for a frame without one.
     """
 
     frames: Sequence[Any]

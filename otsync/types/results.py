@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -232,45 +232,64 @@ class Offsets:
             )
         try:
             return cls._from_dict(data)
-        except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
-            raise ValueError(
-                f"{path}: not a sound offsets file; {type(error).__name__}: {error}. Write it anew."
-            ) from None
+        except (KeyError, TypeError, IndexError, AttributeError, OverflowError) as error:
+            detail = f"{type(error).__name__}: {error}"
+        except ValueError as error:
+            detail = str(error)
+        raise ValueError(f"{path}: not a sound offsets file; {detail}. Write it anew.")
 
     @classmethod
     def _from_dict(cls, data: dict[str, Any]) -> Offsets:
         videos = data["videos"]
         index = {video["name"]: v for v, video in enumerate(videos)}
-        if len(index) != len(videos) or not videos:
+        if len(index) != len(videos) or not videos or not all(isinstance(name, str) and name for name in index):
             raise ValueError("videos: expected at least one, with unique names")
 
-        def column(key: str, rows: Sequence[dict[str, Any]] = videos) -> np.ndarray:
-            return np.array([_float(row[key]) for row in rows])
+        def column(key: str, **bounds: float) -> np.ndarray:
+            return np.array([_float(video[key], f"videos, {video['name']}: {key}", **bounds) for video in videos])
 
-        alignments = {}
+        def place(name: Any, what: str) -> int:
+            if name not in index:
+                raise ValueError(f"{what}: expected one of {', '.join(index)}; found {name!r}")
+            return index[name]
+
+        alignments: dict[tuple[int, int], Alignment] = {}
         for p in data["pairs"]:
-            alignments[index[p["a"]], index[p["b"]]] = Alignment(
-                offset=_float(p["offset_seconds"]),
-                rate=_float(p["rate"]),
-                sigma=_float(p["sigma_seconds"]),
-                hypotheses=np.array([[_float(x) for x in row] for row in p["hypotheses"]]).reshape(-1, 2),
-                fps=_float(p["fps"]),
+            pair = place(p["a"], "pairs: a"), place(p["b"], "pairs: b")
+            what = f"pairs, {p['a']}-{p['b']}"
+            if pair[0] == pair[1] or pair in alignments:
+                raise ValueError(f"{what}: expected two videos, each pair once; found it again or with itself")
+            alignments[pair] = Alignment(
+                offset=_float(p["offset_seconds"], f"{what}: offset_seconds"),
+                rate=_float(p["rate"], f"{what}: rate", above=0),
+                sigma=_float(p["sigma_seconds"], f"{what}: sigma_seconds", least=0),
+                hypotheses=_rows_of_two(p["hypotheses"], f"{what}: hypotheses"),
+                fps=_float(p["fps"], f"{what}: fps", above=0),
                 status=Status.from_code(p["status"]),
                 flags=tuple(Status.from_code(f) for f in p["flags"]),
-                stats={str(k): _float(x) for k, x in p["stats"].items()},
+                stats={str(k): _float(x, f"{what}: stats, {k}") for k, x in p["stats"].items()},
+            )
+        reference = place(data["reference"], "reference")
+        component = np.array([place(video["reference"], f"videos, {video['name']}: reference") for video in videos])
+        astray = np.flatnonzero(component[component] != component)
+        if len(astray) or component[reference] != reference:
+            v = int(astray[0]) if len(astray) else reference
+            raise ValueError(
+                f"videos, {videos[v]['name']}: reference: expected a video that is its own reference; found "
+                f"{videos[v]['reference']!r}"
             )
         return cls(
             names=tuple(index),
-            fps=column("fps"),
+            fps=column("fps", above=0),
             seconds=column("offset_seconds"),
-            rates=column("rate"),
-            sigma=column("sigma_seconds"),
-            reference=index[data["reference"]],
-            component=np.array([index[video["reference"]] for video in videos]),
+            rates=column("rate", above=0),
+            sigma=column("sigma_seconds", least=0),
+            reference=reference,
+            component=component,
             status=tuple(Status.from_code(video["status"]) for video in videos),
             flags=tuple(in_order(Status.from_code(f) for f in video["flags"]) for video in videos),
             alignments=alignments,
-            stats={str(k): _float(x) for k, x in data["stats"].items()},
+            stats={str(k): _float(x, f"stats, {k}") for k, x in data["stats"].items()},
         )
 
 
@@ -280,9 +299,19 @@ def _number(x: Any) -> float | None:
     return x if math.isfinite(x) else None
 
 
-def _float(x: Any) -> float:
+def _float(x: Any, what: str, *, above: float = -math.inf, least: float = -math.inf) -> float:
+    """A finite number > above and >= least; nan for null. ValueError begins with ``what``."""
     if x is None:
         return math.nan
     if isinstance(x, bool) or not isinstance(x, int | float):
-        raise ValueError(f"expected a number or null; found {x!r}")
+        raise ValueError(f"{what}: expected a number or null; found {x!r}")
+    if not math.isfinite(x) or x <= above or x < least:
+        bound = f" above {above:g}" if above > -math.inf else f" of {least:g} or more" if least > -math.inf else ""
+        raise ValueError(f"{what}: expected a finite number{bound}, or null; found {x!r}")
     return float(x)
+
+
+def _rows_of_two(rows: Any, what: str) -> np.ndarray:
+    if not isinstance(rows, list) or any(not isinstance(row, list) or len(row) != 2 for row in rows):
+        raise ValueError(f"{what}: expected a list of pairs of an offset and a score; found {str(rows)[:80]}")
+    return np.array([[_float(x, what) for x in row] for row in rows]).reshape(-1, 2)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from recon.motion.quaternion_kernels import unit, unit_backward
+from recon.raster.cpu.quaternions import unit, unit_backward
 from recon.raster.cpu.threads import kernel
 
 F64 = np.float64

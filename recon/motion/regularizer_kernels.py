@@ -16,7 +16,7 @@ from recon.motion.pose_kernels import (
     orientation,
     position,
 )
-from recon.motion.quaternion_kernels import outer, rotation, rotation_backward, turned, turned_back
+from recon.raster.cpu.quaternions import outer, rotation, rotation_backward, turned, turned_back
 from recon.raster.cpu.threads import kernel
 
 _kernel = kernel(fastmath={"contract", "nsz"})

@@ -21,7 +21,8 @@ from __future__ import annotations
 import numpy as np
 
 from recon.motion.pose_kernels import along_time, lower_orientation, lower_position, orientation, position
-from recon.motion.quaternion_kernels import (
+from recon.raster.cpu import simd
+from recon.raster.cpu.quaternions import (
     conjugate,
     dot4,
     outer,
@@ -33,7 +34,6 @@ from recon.motion.quaternion_kernels import (
     unit,
     unit_backward,
 )
-from recon.raster.cpu import simd
 from recon.raster.cpu.simd import LANES
 from recon.raster.cpu.threads import kernel
 

@@ -188,6 +188,30 @@ def test_a_checkpoint_of_other_options_is_refused(capture, scene, tmp_path):
         fit(scene, capture.footage, believed(capture), steps=3, checkpoint=path)
 
 
+def test_losses_and_effects_of_plain_classes_are_known_again(capture, scene, tmp_path):
+    """Objects without a repr of their own count by what they hold, not by where they lie in memory."""
+
+    def key(loss, effect=None, frame=0):
+        footage = [replace(f, depth={frame: np.ones(f.size[::-1], np.float32)}) for f in capture.footage]
+        problem = Problem.of(scene, footage, believed(capture), (loss,), (), 1, 0)
+        return problem.key((loss,), () if effect is None else (effect,))
+
+    class Effect:
+        def __init__(self, strength):
+            self.strength = strength
+
+    heavier = Squared()
+    heavier.weight = 2.0
+    keys = [key(Squared()), key(heavier), key(Squared(), frame=1), key(Squared(), Effect(1)), key(Squared(), Effect(2))]
+    assert len(set(keys)) == len(keys)
+    assert keys[0] == key(Squared()) and keys[3] == key(Squared(), Effect(1))
+    path = tmp_path / "fit.npz"
+    first, again = (
+        fit(scene, capture.footage, believed(capture), steps=2, checkpoint=path, losses=(Squared(),)) for _ in range(2)
+    )
+    assert same(first, again)
+
+
 def test_frozen_groups_stand_still(capture, scene):
     result = fit(scene, capture.footage, believed(capture), steps=3, rates=without(RATES, "offsets", "means"))
     assert torch.equal(result.scene.dynamic.means, scene.dynamic.means)

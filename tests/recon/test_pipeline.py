@@ -16,12 +16,17 @@ from otsync.files import read_npz
 from otsync.io import open_scene
 from otsync.io.mend import cut, keep_frames, unreadable
 from otsync.priors.cache import Cache
+from otsync.priors.points import ChainedFlow
+from otsync.recordings import synchronize_scene
 from otsync.types import Offsets, Status, TrackSet
 from recon.capture import clocks
 from recon.footage import footage_of
 from recon.gaussians4d import Gaussians4D
+from recon.initial import lifted_tracks, world_footprint
+from recon.intake import only, readable, split
 from recon.pipeline import reconstruct
-from recon.prepare import Plan, Progress, lifted_tracks, only, prepare, readable, split, world_footprint
+from recon.plan import Plan, Progress
+from recon.prepare import prepare
 from recon.result import clear_parts, load_result
 
 from .worlds import CAMERAS, FRAMES, SIZE, capture, write_world
@@ -316,11 +321,15 @@ def test_one_track_carries_the_whole_scene(world, start, tmp_path):
     assert outcome.found.scene.motion.parameters()["knots"].shape[1] == 1
 
 
-def test_stages_are_shared_with_the_synchronisation_before(done, world, monkeypatch):
-    """Tracks that are kept are not tracked again, whoever made them."""
-    from otsync.priors.points import ChainedFlow
-
+def test_stages_are_shared_with_the_synchronisation_before(world, start, tmp_path, monkeypatch):
+    """What otsync sync has tracked and masked is neither tracked nor masked again."""
+    cache = Cache(tmp_path)
+    train, _, offsets, _ = split(open_scene(world), start, ("held0",), Progress())
+    synchronize_scene(train, cache=cache)
+    shared = {kind: sorted(tmp_path.glob(f"{kind}-*.npz")) for kind in ("tracks", "masks")}
+    assert all(len(files) == CAMERAS for files in shared.values())
     monkeypatch.setattr(ChainedFlow, "__call__", lambda *args: pytest.fail("tracked again"))
-    scene = open_scene(world)
-    train, _, offsets, _ = split(scene, Offsets.load(world / "start.json"), ("held0",), Progress())
-    lifted_tracks(train, offsets, Cache(done[1] / "stages"), map, Progress())
+    assert lifted_tracks(train, offsets, cache, map, Progress())
+    assert shared == {kind: sorted(tmp_path.glob(f"{kind}-*.npz")) for kind in shared}
+    with pytest.raises(pytest.fail.Exception, match="tracked again"):
+        lifted_tracks(train, offsets, Cache(tmp_path / "elsewhere"), map, Progress())

@@ -23,7 +23,7 @@ from otsync.files import read_npz
 from otsync.io import open_scene
 from otsync.types import Offsets, TrackSet
 from recon.cli import main
-from recon.prepare import only
+from recon.intake import only
 from recon.result import load_result
 
 from .test_pipeline import same_files
@@ -282,6 +282,14 @@ def test_every_help_has_an_example(capsys):
     assert "Example: otsync run" in " ".join(capsys.readouterr().out.split())
 
 
+def test_options_of_parts_are_told_apart_by_the_part(capsys):
+    """A scaffold and a seeding both have a reach."""
+    with pytest.raises(SystemExit):
+        main(["fit", "--help"])
+    told = capsys.readouterr().out
+    assert "--scaffold.reach" in told and "--seeding.reach" in told and "--held-out" in told
+
+
 def test_bench_writes_a_row_for_every_configuration(world, tmp_path, monkeypatch, capsys):
     args = ["bench", str(world), "--truth", str(world / "truth.json"), "--held-out", "held0", "--width", str(SIZE[0]),
             "--steps", "4", "--backdrop-steps", "5", "--rows", "ours", "true time", "--out", str(tmp_path)]  # fmt: skip
@@ -361,23 +369,42 @@ def test_ctrl_c_exits_with_130_and_says_how_to_go_on(world, tmp_path):
     assert run.returncode == 130 and b"continues from here" in told and b"Traceback" not in told
 
 
-def test_run_tells_the_reconstruction_which_frames(world, tmp_path, monkeypatch):
-    """Evaluation compares only the frames that the scene was made from, so run.json must name them."""
-    start = Offsets.load(world / "start.json")
-    part = only(start, ("cam0", "cam1", "cam2"))
+@pytest.fixture
+def synchronized(world, monkeypatch):
+    """otsync run takes the world's offsets for what it found; here are the lengths of the videos that it was given."""
+    part = only(Offsets.load(world / "start.json"), ("cam0", "cam1", "cam2"))
     lengths = []
 
-    def synchronized(scene, **kwargs):
+    def found(scene, **kwargs):
         lengths.append([len(v.frames) for v in scene.videos])
         return SimpleNamespace(offsets=part, route="tracks", why=(), seconds={})
 
-    monkeypatch.setattr("otsync.recordings.synchronize_scene", synchronized)
+    monkeypatch.setattr("otsync.recordings.synchronize_scene", found)
     monkeypatch.setattr("otsync.report.frames.write_recording_report", lambda *args: None)
+    return lengths
+
+
+def test_run_says_once_which_frames_it_leaves_out(world, synchronized, tmp_path, capsys):
+    damaged, out = tmp_path / "damaged", tmp_path / "r"
+    shutil.copytree(world, damaged)
+    for k in (3, 5, 6, 7):
+        (damaged / "images" / "cam1" / f"{k:04d}.png").write_bytes(b"\x89PNG broken")
+    args = ["run", str(damaged), "--out", str(out), "--steps", "2", "--width", str(SIZE[0]), "--frames", "2", "12"]
+    assert otsync([*args, "--held-out", "held0"]) == 0
+    told = capsys.readouterr().err
+    assert synchronized == [[10, 6, 10]]
+    for note in ("video cam1, frame 1 is left out", "video cam1: 1 further frames are left out"):
+        assert told.count(note) == 1
+        assert note in (out / "report.html").read_text()
+
+
+def test_run_tells_the_reconstruction_which_frames(world, synchronized, tmp_path):
+    """Evaluation compares only the frames that the scene was made from, so run.json must name them."""
     out = tmp_path / "r"
     args = ["run", str(world), "--out", str(out), "--steps", "2", "--width", str(SIZE[0]), "--frames", "2", "12",
             "--held-out", "held0"]  # fmt: skip
     assert otsync(args) == 0
-    assert lengths == [[10] * 3]
+    assert synchronized == [[10] * 3]
     assert json.loads((out / "run.json").read_text())["options"]["frames"] == [2, 12]
     times = load_result(out).video("cam1").times
     np.testing.assert_allclose(times, np.arange(2, 12) / 30)  # cut once, not twice

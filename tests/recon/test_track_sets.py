@@ -10,27 +10,19 @@ import torch
 
 import otsync.priors.cache
 import otsync.recordings
-import recon.prepare
+import recon.initial
 from otsync.io import open_scene
 from otsync.priors.cache import Cache
 from otsync.recordings import Stages
 from otsync.types import Offsets
 from recon.fit import fit
 from recon.gaussians4d import Gaussians4D, scene_arrays
+from recon.initial import content_key, lifted_tracks, read_footage, seeded
+from recon.intake import given_clocks, only, split
 from recon.motion import ScaffoldOptions
 from recon.optimize import RATES
-from recon.prepare import (
-    Plan,
-    Progress,
-    content_key,
-    given_clocks,
-    lifted_tracks,
-    only,
-    prepare,
-    read_footage,
-    seeded,
-    split,
-)
+from recon.plan import Plan, Progress
+from recon.prepare import prepare
 from recon.seed import cloud_at, shown_at
 from recon.track_sets import of_every_video, tracks_of
 
@@ -131,7 +123,7 @@ def test_every_frame_that_seeding_asks_for_has_its_depth(given, monkeypatch, shi
             cloud_at(footage, [of(maps) for maps in depth], offsets, float(t), frame_step)
         return None
 
-    monkeypatch.setattr(recon.prepare, "seed", watched)
+    monkeypatch.setattr(recon.initial, "seed", watched)
     early = replace(offsets, seconds=np.array([0, shift, 0]) * STEP)
     begun(given, capture().tracks, offsets=early)
     assert len(asked) >= 6 and all(z is not None for z in asked)

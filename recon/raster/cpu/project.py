@@ -17,6 +17,7 @@ import math
 
 import numpy as np
 
+from recon.raster.cpu.quaternions import rotation, rotation_backward, turned, turned_back, unit_backward
 from recon.raster.cpu.threads import kernel
 from recon.raster.projection import FRUSTUM_MARGIN, MAX_RADIUS
 from recon.raster.rendering import ALPHA_MIN, QUAT_NORM2_MIN, RADIUS_SIGMAS
@@ -55,18 +56,6 @@ def _plus(a, b):
 
 
 @_kernel
-def _row_times_matrix(a, Q):
-    """a Q, with Q the nine entries of a matrix row by row."""
-    return _dot(a, (Q[0], Q[3], Q[6])), _dot(a, (Q[1], Q[4], Q[7])), _dot(a, (Q[2], Q[5], Q[8]))
-
-
-@_kernel
-def _matrix_times(Q, a):
-    """Q a, with Q the nine entries of a matrix row by row."""
-    return _dot((Q[0], Q[1], Q[2]), a), _dot((Q[3], Q[4], Q[5]), a), _dot((Q[6], Q[7], Q[8]), a)
-
-
-@_kernel
 def _entry3(array, i):
     return F64(array[i, 0]), F64(array[i, 1]), F64(array[i, 2])
 
@@ -80,29 +69,6 @@ def _unit_quaternion(quats, i):
         return (0.0, 0.0, 0.0, 0.0), 0.0
     n = 1 / math.sqrt(norm2)
     return (w * n, x * n, y * n, z * n), n
-
-
-@_kernel
-def _rotation(q):
-    """The nine entries of the rotation of a unit quaternion, row by row."""
-    w, x, y, z = q
-    return (
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    )  # fmt: skip
-
-
-@_kernel
-def _quaternion_gradient(q, n, G):
-    """Gradient of an unnormalised quaternion from that of its rotation, G row by row; q unit, n one over the length."""
-    w, x, y, z = q
-    g_w = 2 * (x * (G[7] - G[5]) + y * (G[2] - G[6]) + z * (G[3] - G[1]))
-    g_x = 2 * (-2 * x * (G[4] + G[8]) + y * (G[3] + G[1]) + z * (G[6] + G[2]) + w * (G[7] - G[5]))
-    g_y = 2 * (x * (G[3] + G[1]) - 2 * y * (G[0] + G[8]) + z * (G[7] + G[5]) + w * (G[2] - G[6]))
-    g_z = 2 * (x * (G[6] + G[2]) + y * (G[7] + G[5]) - 2 * z * (G[0] + G[4]) + w * (G[3] - G[1]))
-    radial = g_w * w + g_x * x + g_y * y + g_z * z  # the normalisation forgets the length
-    return (g_w - radial * w) * n, (g_x - radial * x) * n, (g_y - radial * y) * n, (g_z - radial * z) * n
 
 
 @_kernel
@@ -179,8 +145,8 @@ def forward(first, last, gaussians, cameras, limits, antialiased, outputs):
             tan_x, tan_y = x / z, y / z
             tx, ty = min(max(tan_x, low_x), high_x), min(max(tan_y, low_y), high_y)
             a, b = _jacobian_rows(V, c, fx / z, fy / z, tx, ty)
-            Q, s = _rotation(q), _entry3(scales, i)
-            u, v = _times(_row_times_matrix(a, Q), s), _times(_row_times_matrix(b, Q), s)
+            Q, s = rotation(q), _entry3(scales, i)
+            u, v = _times(turned_back(Q, a), s), _times(turned_back(Q, b), s)
             sharp, det = _determinants(u, v, eps)
             var_x_all, var_y = _dot(u, u) + eps, _dot(v, v) + eps
             if not (det > 0 and det < np.inf and var_y > 0):
@@ -282,7 +248,7 @@ def backward(first, last, part, gaussians, cameras, eps, antialiased, radii, inc
     for i in range(first, last):
         p, s = _entry3(means, i), _entry3(scales, i)
         q, n = _unit_quaternion(quats, i)
-        Q = _rotation(q)
+        Q = rotation(q)
         g_p, g_s, g_o = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0
         G = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         for c in range(V.shape[0]):
@@ -296,7 +262,7 @@ def backward(first, last, part, gaussians, cameras, eps, antialiased, radii, inc
             tx, ty = min(max(tan_x, low_x), high_x), min(max(tan_y, low_y), high_y)
             jx, jy = fx / z, fy / z
             a, b = _jacobian_rows(V, c, jx, jy, tx, ty)
-            k, l = _row_times_matrix(a, Q), _row_times_matrix(b, Q)
+            k, l = turned_back(Q, a), turned_back(Q, b)
             u, v = _times(k, s), _times(l, s)
             g_u, g_v = _covariance_gradient(u, v, eps, _entry3(g_rows[c], i))
             ratio = 1.0
@@ -307,7 +273,7 @@ def backward(first, last, part, gaussians, cameras, eps, antialiased, radii, inc
             g_s = _plus(g_s, _plus(_times(g_u, k), _times(g_v, l)))
             g_k, g_l = _times(g_u, s), _times(g_v, s)
             G = _add_outer(_add_outer(G, a, g_k), b, g_l)
-            g_a, g_b = _matrix_times(Q, g_k), _matrix_times(Q, g_l)
+            g_a, g_b = turned(Q, g_k), turned(Q, g_l)
             back = _view_row(V, c, 2)
             # the 2-D mean follows x/z everywhere, the Jacobian only inside its limits
             g_tan_x, g_tan_y = fx * g_means2d[c, i, 0], fy * g_means2d[c, i, 1]
@@ -321,7 +287,7 @@ def backward(first, last, part, gaussians, cameras, eps, antialiased, radii, inc
             to_world = _plus(_scaled(g_camera[0], _view_row(V, c, 0)), _scaled(g_camera[1], _view_row(V, c, 1)))
             g_p = _plus(g_p, _plus(to_world, _scaled(g_z, back)))
             _add_view_gradient(g_views[part, c], p, g_camera, tx, ty, _scaled(jx, g_a), _scaled(jy, g_b))
-        g_q = _quaternion_gradient(q, n, G)
+        g_q = unit_backward(q, n, rotation_backward(q, G))
         g_opacities[i] = g_o
         for j in range(3):
             g_means[i, j], g_scales[i, j] = g_p[j], g_s[j]

@@ -1,0 +1,68 @@
+"""What is done with a recording, and what is said while it happens."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+from recon.density import Densify
+from recon.effects import Effect
+from recon.fit import LOSSES, Loss
+from recon.motion import ScaffoldOptions
+from recon.seed import Seeding
+
+Tell = Callable[[str], None]
+MapLike = Callable[..., Any]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is done with a recording.
+
+    Args:
+        width: working pixels. frames: first and last (exclusive) frame of every video; None: all.
+        scaffold: how the motion is built. seeding: how densely Gaussians begin.
+        losses, effects, densify: of the fit; effects get the gains of the backdrop by themselves.
+        freeze: parameter groups that the fit holds, "offsets" for instance.
+        batch: images a step, each on a thread of its own.
+        views: frames of every camera that are compared at the end. backdrop_steps: of the fit of the static part.
+        save_every: seconds between savings of the fit.
+    """
+
+    width: int = 320
+    frames: tuple[int, int] | None = None
+    scaffold: ScaffoldOptions = field(default_factory=ScaffoldOptions)
+    seeding: Seeding = field(default_factory=Seeding)
+    losses: tuple[Loss, ...] = LOSSES
+    effects: tuple[Effect, ...] = ()
+    densify: Densify | None = None
+    freeze: tuple[str, ...] = ()
+    batch: int = 2
+    seed: int = 0
+    views: int = 50
+    backdrop_steps: int = 1500
+    save_every: float = 60.0
+
+
+class Progress:
+    """Says what happens, remembers what was lacking, and times the stages."""
+
+    def __init__(self, tell: Tell = lambda text: None):
+        self.tell, self.notes, self.seconds = tell, [], {}  # type: Tell, list[str], dict[str, float]
+
+    def note(self, text: str) -> None:
+        """Something that the user should know when reading the result; said once, however often it is found."""
+        if text not in self.notes:
+            self.notes.append(text)
+            self.tell(f"note: {text}")
+
+    @contextmanager
+    def stage(self, name: str):
+        """Time what happens inside."""
+        started = time.perf_counter()
+        yield
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - started
+        self.tell(f"{name}: {self.seconds[name]:.1f} s")

@@ -1,0 +1,60 @@
+"""Bars: on a terminal, for what takes its time; nothing elsewhere, and nothing changed."""
+
+from __future__ import annotations
+
+import io
+import sys
+
+import pytest
+
+from otsync import progress
+from otsync.bench.sync_worlds import pair_cases
+from otsync.cli import main
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.fixture
+def attach(monkeypatch):
+    """Makes a stream standard error; from within a test, since pytest attaches its own when one begins."""
+
+    def attached(stream: io.StringIO, patience: float = 0) -> io.StringIO:
+        monkeypatch.setattr(progress, "PATIENCE", patience)
+        monkeypatch.setattr(sys, "stderr", stream)
+        return stream
+
+    return attached
+
+
+def test_a_long_run_is_counted_on_a_terminal(attach):
+    terminal = attach(Terminal())
+    assert list(progress.counted(range(3), "worlds", "world")) == [0, 1, 2]
+    assert list(progress.counted((k for k in "ab"), "letters", "letter", 2)) == ["a", "b"]
+    told = terminal.getvalue()
+    assert "worlds:   0%" in told and "0/3" in told and "letters" in told and "0/2" in told
+
+
+@pytest.mark.parametrize("stream, patience", [(Terminal(), progress.PATIENCE), (io.StringIO(), 0)])
+def test_a_short_run_and_a_pipe_are_left_alone(attach, stream, patience):
+    attach(stream, patience)
+    assert list(progress.counted(range(3), "worlds", "world")) == [0, 1, 2]
+    assert stream.getvalue() == ""
+
+
+def test_lines_go_to_standard_output_between_bars(attach, capsys):
+    attach(Terminal())
+    for k in progress.counted(range(2), "worlds", "world"):
+        progress.say(f"line {k}")
+    assert capsys.readouterr().out == "line 0\nline 1\n"
+
+
+def test_simulations_and_benchmarks_are_counted(attach, tmp_path):
+    terminal = attach(Terminal())
+    assert main(["simulate", str(tmp_path), "--videos", "2", "--frames", "20"]) == 0
+    assert "simulating:   0%" in terminal.getvalue() and "0/2" in terminal.getvalue()
+    cases = list(pair_cases(("clean",), (1,), ("boxes", "tennis")))
+    assert [(c.motion, c.band) for c in cases] == [(m, b) for m in ("boxes", "tennis") for b in range(3)]
+    assert "pairs:   0%" in terminal.getvalue() and "0/6" in terminal.getvalue()
