@@ -40,6 +40,8 @@ class Run:
     """Seconds for the fit, after everything is prepared; default: 300."""
     steps: int | None = None
     """Steps of the fit instead of seconds: the result is then the same on any machine of a kind."""
+    device: str = "cpu"
+    """cpu, or cuda for a GPU with gsplat: where the reconstruction is fitted."""
     seed: int = 0
     truth: Path | None = None
     """True offsets, where they are known: adds errors to tables and reports."""
@@ -63,9 +65,9 @@ class Run:
 
         options = FitOptions(
             held_out=self.held_out, width=self.width, frames=self.frames, budget=self.budget, steps=self.steps, seed=self.seed,
-            cache=self.recording.cache, workers=self.recording.workers,
+            cache=self.recording.cache, workers=self.recording.workers, device=self.device,
         )  # fmt: skip
-        options.length()  # before the work, not after it
+        options.length(), options.plan()  # before the work, not after it
         scene = opened(self.scene, self.allow_outside or self.recording.allow_outside)
         if self.recording.cameras:
             scene = scene.take(

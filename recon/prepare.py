@@ -27,6 +27,7 @@ from otsync.types import Offsets, TrackSet, Video
 from recon.backdrop import StaticFit, fit_backdrop, with_backdrop
 from recon.density import Densify
 from recon.depth import working_depth
+from recon.device import device_of
 from recon.effects import Effect
 from recon.fit import LOSSES, Loss
 from recon.footage import Footage, footage_of
@@ -53,6 +54,7 @@ class Plan:
         batch: images a step, each on a thread of its own.
         views: frames of every camera that are compared at the end. backdrop_steps: of the fit of the static part.
         save_every: seconds between savings of the fit.
+        device: where static part and motion are fitted: "cpu", or "cuda" for a GPU; the rest is done on the CPU.
     """
 
     width: int = 320
@@ -68,6 +70,10 @@ class Plan:
     views: int = 50
     backdrop_steps: int = 1500
     save_every: float = 60.0
+    device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        device_of(self.device)
 
 
 @dataclass(frozen=True, eq=False)
@@ -378,12 +384,14 @@ def backdrop_of_scene(
         depth = [None if v.depth is None else working_depth(v, width=plan.width) for v in scene.videos]
         found = fit_backdrop(
             footage, depth=None if all(d is None for d in depth) else depth, points=points, steps=plan.backdrop_steps,
-            seed=plan.seed,
+            seed=plan.seed, device=plan.device,
         )  # fmt: skip
         parts = {n: getattr(found.gaussians, n).numpy() for n in GAUSSIAN}
         return {**parts, "gains": found.gains, "near": np.array(found.near), "psnr": found.psnr}
 
     key = (*content_key(scene, tracks), plan.width, plan.backdrop_steps, plan.seed)
+    if plan.device != "cpu":  # rounds otherwise
+        key = (*key, plan.device)
     try:
         kept = cache.arrays("backdrop", key, build)
     except ValueError as error:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,6 +22,8 @@ from recon.problem import Problem, assemble, scene_groups
 from recon.regularizers import Draw
 from recon.stage import Clip, compose_over, feature_image, observer
 from recon.uncertainty import newton_sigma
+
+MapLike = Callable[..., Any]
 
 RECORDS = 200  # rows of history in a fit
 PER_NODE = ("knots", "knot_quats")
@@ -51,23 +54,26 @@ class Run:
         self.rows = np.zeros((0, 4 + len(problem.clips)))
         if snapshot is not None:
             self.scene, self.step, self.total = (
-                scene_from_arrays(snapshot.scene),
+                scene_from_arrays(snapshot.scene).to(problem.device),
                 snapshot.step,
                 snapshot.steps or total,
             )
-            self.groups |= {n: v.to(self.groups[n].device) for n, v in snapshot.groups.items()}
+            self.groups |= {n: v.to(problem.device) for n, v in snapshot.groups.items()}
             self.rows = snapshot.history
         self.densified = 0 if snapshot is None else snapshot.densified
         self.adam = self._adam({} if snapshot is None else snapshot.moments)
         self.decay = Decay()
         self._since = [] if snapshot is None else [(float(a), float(b)) for a, b in snapshot.since]
-        self._pull = torch.zeros(2, len(self.scene)) if snapshot is None else snapshot.pull
+        self._pull = self._no_pull() if snapshot is None else snapshot.pull.to(problem.device)
 
     def _adam(self, moments: Mapping[str, Tensor]) -> Adam:
         active = check_rates(self.rates, self.groups)
         adam = Adam(self.groups, active, self.scene.footprint, self.scene.frame_step)
         adam.restore(moments)
         return adam
+
+    def _no_pull(self) -> Tensor:
+        return torch.zeros(2, len(self.scene), device=self.problem.device)
 
     def values(self) -> dict[str, Tensor]:
         """Every group's current value; those that are fitted require gradients."""
@@ -77,9 +83,9 @@ class Run:
         """World seconds at which a frame was taken, differentiable in its video's clock."""
         return values["clock_rates"][video] * self.problem.times[video][frame] + values["offsets"][video]
 
-    def advance(self, pool: ThreadPoolExecutor, densify: Densify | None) -> None:
+    def advance(self, map: MapLike, densify: Densify | None) -> None:
         """A step, and what is due after it: all of it, or none."""
-        self.one_step(pool, probe=densify is not None)
+        self.one_step(map, probe=densify is not None)
         if densify is not None and self.total:
             due = sorted(densify.steps(self.total))
             # a budget may learn its length only after a moment has passed
@@ -87,14 +93,14 @@ class Run:
                 self.densify(densify)
                 self.densified += 1
 
-    def one_step(self, pool: ThreadPoolExecutor, probe: bool = False) -> None:
-        """Render a batch, gather gradients in a fixed order, and move."""
+    def one_step(self, map: MapLike, probe: bool = False) -> None:
+        """Render a batch, gather gradients in a fixed order, and move; ``map`` calls the jobs of the step."""
         p, values = self.problem, self.values()
         names = list(self.adam.groups)
-        jobs = [pool.submit(self.image_gradient, values, names, key, probe) for key in p.pick(self.step)]
+        jobs = [partial(self.image_gradient, values, names, key, probe) for key in p.pick(self.step)]
         if p.motion_losses:
-            jobs.append(pool.submit(self.motion_gradient, values, names))
-        done = [job.result() for job in jobs]
+            jobs.append(partial(self.motion_gradient, values, names))
+        done = list(map(lambda job: job(), jobs))
         total: dict[str, Tensor] = {}
         for n, result in enumerate(done):
             share = 1.0 / p.batch if n < p.batch else 1.0
@@ -142,15 +148,15 @@ class Run:
         seen = self.seen(scene, values, rendered, clip, shot)
         parts = [loss.weight * value for loss in p.losses if (value := loss(seen)) is not None]
         held = prior(p.effects, values)
-        loss = sum(parts if held is None else [*parts, held], torch.zeros(()))
+        loss = sum(parts if held is None else [*parts, held], torch.zeros((), device=p.device))
         psnr = -10 * math.log10(float((seen.rendered.detach() - seen.image).square().mean()) + 1e-12)
         wanted = [values[n] for n in names] + [means for means, _ in probes]
         gradients = torch.autograd.grad(loss, wanted, allow_unused=True) if loss.requires_grad else [None] * len(wanted)
-        pull = torch.zeros(2, len(scene)) if probe else None
+        pull = self._no_pull() if probe else None
         for (_, radii), g in zip(probes, gradients[len(names) :], strict=True):
             if pull is not None and g is not None:
-                seen_here = (radii > 0).any(-1).cpu()
-                pull += torch.stack([g[0, : len(scene)].norm(dim=-1).cpu() * seen_here, seen_here.float()])
+                seen_here = (radii > 0).any(-1)
+                pull += torch.stack([g[0, : len(scene)].norm(dim=-1) * seen_here, seen_here.float()])
         return Result(float(loss.detach()), psnr, list(gradients[: len(names)]), pull)
 
     def seen(
@@ -161,7 +167,7 @@ class Run:
         rows, columns = slice(box[1], box[3]), slice(box[0], box[2])
 
         def cut(maps: Mapping[int, np.ndarray] | None) -> Tensor | None:
-            return None if maps is None or k not in maps else torch.as_tensor(maps[k][rows, columns])
+            return None if maps is None or k not in maps else torch.as_tensor(maps[k][rows, columns], device=p.device)
 
         depth, features = cut(given.depth), cut(given.features) if p.needs("features") else None
         tracks = None if given.tracks is None else given.tracks.get(k)
@@ -185,7 +191,7 @@ class Run:
             loss.weight * value for loss in p.motion_losses if self.step % loss.every == 0
             if (value := loss(scene.motion, scene.dynamic.means, scene.dynamic.quats, draw)) is not None
         ]  # fmt: skip
-        total = sum(parts, torch.zeros(()))
+        total = sum(parts, torch.zeros((), device=p.device))
         wanted = [values[n] for n in names]
         gradients = (
             torch.autograd.grad(total, wanted, allow_unused=True) if total.requires_grad else [None] * len(names)
@@ -194,7 +200,9 @@ class Run:
 
     def _guard(self, total: Mapping[str, Tensor], done: Sequence[Result], keys: list[tuple[int, int]]) -> None:
         """Diverged, with step, group and frames, before a NaN reaches the parameters."""
-        bad = [n for n, g in total.items() if not bool(g.sum().isfinite()) and not bool(g.isfinite().all())]
+        sums = [g.sum().isfinite() for g in total.values()]
+        sound = not sums or bool(torch.stack(sums).all())  # one question: a GPU's answers are waited for
+        bad = [] if sound else [n for n, g in total.items() if not bool(g.isfinite().all())]
         lost = [n for n, r in enumerate(done) if not math.isfinite(r.loss)]
         if bad or lost:
             frames = ", ".join(f"{self.problem.clips[v].footage.name} frame {k}" for v, k in keys)
@@ -220,7 +228,7 @@ class Run:
                 moment = _carried(moment, 1, source)
             carried[name] = moment
         self.adam = self._adam(carried)
-        self._pull = torch.zeros(2, len(self.scene))
+        self._pull = self._no_pull()
 
     def record_due(self) -> bool:
         every = max(1, (self.total or 10**9) // RECORDS)

@@ -109,11 +109,11 @@ def _choose(backend: str, means: Tensor) -> str:
     if backend != "auto":
         if backend == "cpu" and not _has_numba():
             raise ValueError("backend='cpu' needs numba: pip install numba, or use backend='torch' (15-40x slower)")
-        if backend in ("cpu", "torch") and means.is_cuda:
+        if backend in ("cpu", "torch") and means.device.type != "cpu":
             raise ValueError(f"backend={backend!r} works on CPU tensors, got {means.device}: move them with .cpu()")
         return backend
-    if means.is_cuda:
-        name, reason = "gsplat", "the tensors are on a CUDA device"
+    if means.device.type != "cpu":
+        name, reason = "gsplat", "the tensors are on a GPU"
     elif _has_numba():
         name, reason = "cpu", "numba kernels; pass CUDA tensors to use gsplat"
     else:
@@ -135,7 +135,7 @@ def _drop_nonfinite(gaussians: tuple[Tensor, ...], sh_degree: int | None) -> tup
     the slower exact test), and takes a small fraction of the time of a rendering.
     """
     with torch.no_grad():
-        if all(_finite_sum(t) for t in gaussians):
+        if _finite_sums(*gaussians):
             return gaussians
         means, colors = gaussians[0], gaussians[4]
         per_camera = colors.ndim == 4 or (colors.ndim == 3 and (sh_degree is None))
@@ -149,13 +149,13 @@ def _drop_nonfinite(gaussians: tuple[Tensor, ...], sh_degree: int | None) -> tup
     return *(keep(t) for t in gaussians[:4]), keep(colors, int(per_camera))
 
 
-def _finite_sum(t: Tensor) -> bool:
-    if t.is_cuda:
-        return bool(t.sum().isfinite())
+def _finite_sums(*tensors: Tensor) -> bool:
+    if tensors[0].device.type != "cpu":
+        # one question for all: a GPU's answers are waited for
+        return bool(torch.stack([t.sum().isfinite() for t in tensors]).all())
     with np.errstate(all="ignore"):
-        return bool(
-            np.isfinite(t.detach().numpy().sum())
-        )  # torch would wake its own pool, which then competes with ours
+        # torch would wake its own pool, which then competes with ours
+        return all(np.isfinite(t.detach().numpy().sum()) for t in tensors)
 
 
 def _check_shapes(
@@ -230,11 +230,11 @@ def _check_shapes(
     if backgrounds is not None:
         expect("backgrounds", backgrounds, (c, d))
         cameras["backgrounds"] = backgrounds
-    for name, tensor in cameras.items():
-        if not _finite_sum(tensor):
-            raise ValueError(
-                f"{name}: expected finite entries, got NaN or infinity: a camera or colour of the caller has diverged"
-            )
+    if not _finite_sums(*cameras.values()):
+        name = next(name for name, tensor in cameras.items() if not _finite_sums(tensor))
+        raise ValueError(
+            f"{name}: expected finite entries, got NaN or infinity: a camera or colour of the caller has diverged"
+        )
     if not ((Ks[:, 0, 0] > 0) & (Ks[:, 1, 1] > 0)).all():
         raise ValueError(
             "Ks: expected positive focal lengths, got zero or negative ones: flip the image, not the camera"
