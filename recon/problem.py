@@ -12,7 +12,7 @@ from torch import Tensor
 
 from otsync.types import Offsets
 from recon.checkpoint import key_of
-from recon.effects import Effect, initial_parameters
+from recon.effects import Effect, Gain, initial_parameters
 from recon.footage import Footage
 from recon.gaussians4d import Gaussians4D, scene_arrays
 from recon.losses import ImageLoss
@@ -102,6 +102,13 @@ class Problem:
     def device(self) -> torch.device:
         """Where the fit runs: where the scene is."""
         return self.scene.dynamic.means.device
+
+    @property
+    def at_once(self) -> bool:
+        """Whether the images of a step are one rendering: on a GPU, where no effect asks for other moments than the
+        frames' own and what is static is not drawn."""
+        layered = self.scene.static is None or all(clip.background is not None for clip in self.clips)
+        return self.device.type != "cpu" and layered and all(isinstance(e, Gain) for e in self.effects)
 
     def needs(self, what: str) -> bool:
         """Whether a loss asks for "depth" or "features" to be rendered."""

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from recon.raster import sh
-from recon.raster.rendering import Rendering, Settings
+from recon.raster.rendering import Rendering, Settings, Splats
 
 logger = logging.getLogger("recon.raster")
 BackendName = Literal["auto", "torch", "cpu", "gsplat"]
@@ -37,6 +37,7 @@ def render(
     """Render N Gaussians into C cameras of one image size; conventions and names are those of gsplat's `rasterization`.
 
     means: [N,3] world units. quats: [N,4] wxyz, any length. scales: [N,3] standard deviations. opacities: [N] in 0..1.
+        Where each camera looks at another moment, means are [C,N,3] and quats [C,N,4].
     colors: [N,D] or per camera [C,N,D], D channels of any kind; with `sh_degree` spherical-harmonics coefficients
         [N,K,3] or [C,N,K,3], K >= (sh_degree + 1)^2, and D = 3.
     viewmats: [C,4,4] world-to-camera, OpenCV axes (x right, y down, z forward). Ks: [C,3,3] pixels, not differentiable.
@@ -65,7 +66,12 @@ def render(
             (means, quats, scales, opacities, colors), viewmats, Ks, (width, height), backgrounds, options
         )
     engine = _engine(name)
-    splats = engine.project(means, quats, scales, opacities, viewmats, Ks, width, height, options)
+    if means.ndim == 2:
+        splats = engine.project(means, quats, scales, opacities, viewmats, Ks, width, height, options)
+    else:
+        each = zip(means, quats, viewmats.split(1), Ks.split(1), strict=True)
+        views = [engine.project(m, q, scales, opacities, w2c, K, width, height, options) for m, q, w2c, K in each]
+        splats = Splats(*(torch.cat(parts) for parts in zip(*views, strict=True)))
     features = colors
     if options.sh_degree is not None:
         features = sh.view_colors(options.sh_degree, means, colors, viewmats)
@@ -138,15 +144,16 @@ def _drop_nonfinite(gaussians: tuple[Tensor, ...], sh_degree: int | None) -> tup
         if _finite_sums(*gaussians):
             return gaussians
         means, colors = gaussians[0], gaussians[4]
-        per_camera = colors.ndim == 4 or (colors.ndim == 3 and (sh_degree is None))
-        good = torch.ones(len(means), dtype=torch.bool, device=means.device)
-        for t in (*gaussians[:4], colors.movedim(0, 1) if per_camera else colors):
-            good &= t.isfinite().reshape(len(means), -1).all(-1)
+        moving, per_camera = means.ndim - 2, colors.ndim == 4 or (colors.ndim == 3 and (sh_degree is None))
+        axes = (moving, moving, 0, 0, int(per_camera))  # along which the Gaussians lie
+        good = torch.ones(means.shape[-2], dtype=torch.bool, device=means.device)
+        for t, axis in zip(gaussians, axes, strict=True):
+            good &= t.movedim(axis, 0).isfinite().reshape(len(good), -1).all(-1)
 
-    def keep(t: Tensor, axis: int = 0) -> Tensor:
+    def keep(t: Tensor, axis: int) -> Tensor:
         return torch.where(good.reshape(-1, *[1] * (t.ndim - 1 - axis)), t, 0.0)
 
-    return *(keep(t) for t in gaussians[:4]), keep(colors, int(per_camera))
+    return tuple(keep(t, axis) for t, axis in zip(gaussians, axes, strict=True))
 
 
 def _finite_sums(*tensors: Tensor) -> bool:
@@ -179,7 +186,8 @@ def _check_shapes(
             )
     if means.dtype not in (torch.float16, torch.float32, torch.float64):
         raise ValueError(f"means: expected float16, float32 or float64, got {means.dtype}: convert with .float()")
-    n, c = len(means), len(viewmats)
+    c, moving = len(viewmats), means.ndim == 3
+    n = means.shape[-2] if means.ndim > 1 else 0
 
     def expect(name: str, tensor: Tensor, *shapes: tuple[int | str, ...]) -> None:
         if not isinstance(tensor, Tensor):
@@ -202,8 +210,8 @@ def _check_shapes(
                 f"got {tensor.dtype} on {tensor.device}: convert with .to(means)"
             )
 
-    expect("means", means, ("N", 3))
-    expect("quats", quats, (n, 4))
+    expect("means", means, ("N", 3), (c, "N", 3))
+    expect("quats", quats, (c, n, 4) if moving else (n, 4))
     expect("scales", scales, (n, 3))
     expect("opacities", opacities, (n,))
     expect("viewmats", viewmats, ("C", 4, 4))

@@ -18,7 +18,8 @@ from recon.fit import LOSSES, RATES, fit
 from recon.losses import Depth, Feature, Sightings, Track
 from recon.motion import PerGaussian, ScaffoldOptions, Static, build_scaffold
 from recon.prepare import Plan
-from recon.raster import Rendering, gsplat_backend
+from recon.problem import Problem
+from recon.raster import Rendering, Splats, gsplat_backend
 from recon.raster.cpu import backend as cpu_backend
 from recon.regularizers import RotationAcceleration, RotationVelocity
 from recon.running import Run
@@ -44,8 +45,13 @@ def second(monkeypatch):
 
     def rasterized(gaussians, viewmats, Ks, size, backgrounds, options):
         assert all(isinstance(t, Far) for t in (*gaussians, viewmats, Ks)) and backgrounds is None
-        *splats, colors, w2c, K = (t.cpu() for t in (*gaussians, viewmats, Ks))
-        drawn = cpu_backend.project(*splats, w2c, K, *size, options)
+        means, quats, scales, opacities, colors, w2c, K = (t.cpu() for t in (*gaussians, viewmats, Ks))
+        means, quats = (t.expand(len(w2c), *t.shape[-2:]) for t in (means, quats))
+        views = [
+            cpu_backend.project(m, q, scales, opacities, w[None], k[None], *size, options)
+            for m, q, w, k in zip(means, quats, w2c, K, strict=True)
+        ]
+        drawn = Splats(*(torch.cat(parts) for parts in zip(*views, strict=True)))
         means2d = drawn.means2d.to(ELSEWHERE)  # whose gradient densification asks for
         here = drawn._replace(means2d=means2d.cpu())
         image, depths, alphas = cpu_backend.rasterize(here, colors, *size, options.depth)
@@ -107,10 +113,14 @@ def per_video(capture, scene):
     return replace(scene, motion=bound), capture.footage, {"densify": Densify((0.5,), share=0.2, nodes=5)}
 
 
-def joint(capture, scene):
-    """Static and moving Gaussians together, cameras that move, colours that depend on the view."""
+def view_dependent(capture, scene):
     sh = torch.cat([scene.dynamic.sh, torch.full((len(scene), 3, 3), 0.1)], 1)
-    whole = replace(scene, dynamic=replace(scene.dynamic, sh=sh), static=capture.world.static)
+    return replace(scene, dynamic=replace(scene.dynamic, sh=sh)), capture.footage, {}
+
+
+def joint(capture, scene):
+    """Static and moving Gaussians together, cameras that move."""
+    whole = replace(scene, static=capture.world.static)
     footage = [replace(f, background=None, w2c=np.repeat(f.w2c[None], len(f), 0)) for f in capture.footage]
     return whole, footage, {"rates": {**RATES, "static.sh": 0.02}}
 
@@ -131,7 +141,19 @@ def given(capture, scene):
 
 @pytest.mark.parametrize(
     "case",
-    [plain, densified, blurred, turning, dual_quaternions, per_gaussian, static, per_video, joint, given],
+    [
+        plain,
+        densified,
+        blurred,
+        turning,
+        dual_quaternions,
+        per_gaussian,
+        static,
+        per_video,
+        view_dependent,
+        joint,
+        given,
+    ],
     ids=lambda case: case.__name__,
 )
 def test_a_fit_elsewhere_is_the_fit_here(capture, scene, second, case):
@@ -147,6 +169,32 @@ def test_a_fit_elsewhere_is_the_fit_here(capture, scene, second, case):
     assert there.offsets.sigma == pytest.approx(here.offsets.sigma, rel=0.05, nan_ok=True)
     assert len(here.scene) == len(there.scene)
     there.scene.tracks([0.1])
+
+
+@pytest.mark.parametrize("case", [plain, per_gaussian, per_video, view_dependent], ids=lambda case: case.__name__)
+def test_images_rendered_at_once_are_each_of_them(capture, scene, case):
+    """What a GPU is given: losses, gradients of their sum, and what densification reads, from boxes of any size."""
+    start, footage, options = case(capture, scene)
+    effects = options.get("effects", ())
+    run = Run(Problem.of(start, footage, believed(capture), LOSSES, effects, 4, 0), dict(RATES), None, 10)
+    values, names, keys = run.values(), list(run.adam.groups), [(0, 1), (1, 4), (2, 6), (1, 0)]
+    assert len({run.problem.clips[v].box(k) for v, k in keys}) == 4
+    whole = run.image_gradient(values, names, keys, True)
+    each = [run.image_gradient(values, names, [key], True) for key in keys]
+    assert whole.losses == pytest.approx([r.losses[0] for r in each], rel=1e-6)
+    assert whole.psnrs == pytest.approx([r.psnrs[0] for r in each], rel=1e-6)
+    for n, name in enumerate(names):
+        total = sum(r.gradients[n] for r in each if r.gradients[n] is not None)
+        assert float((whole.gradients[n] - total).abs().max()) <= 2e-6 * float(total.abs().max()), name
+    assert torch.allclose(whole.pull, sum(r.pull for r in each), rtol=1e-5)
+
+
+def test_only_where_it_is_exact_are_images_rendered_at_once(capture, scene, second):
+    for case, at_once in ((plain, True), (given, True), (blurred, False), (joint, False)):
+        start, footage, options = case(capture, scene)
+        problem = Problem.of(start.to(second), footage, believed(capture), LOSSES, options.get("effects", ()), 2, 0)
+        assert problem.at_once is at_once
+        assert not Problem.of(start, footage, believed(capture), LOSSES, (), 2, 0).at_once
 
 
 def test_a_fit_begun_elsewhere_continues_there_and_here(capture, scene, second, tmp_path, monkeypatch):
