@@ -30,16 +30,22 @@ def blend(
     """
     rest, nodes, w = binding.rest[:, None], binding.nodes, binding.weights.to(means.dtype)
     p_rest, q_rest = binding.positions.to(means.dtype)[rest, nodes], binding.quats.to(means.dtype)[rest, nodes]
-    turn = product(quats_of_nodes[..., nodes, :], conjugate(q_rest))  # [...,N,8,4]
+    turn = product(_of(quats_of_nodes, nodes), conjugate(q_rest))  # [...,N,8,4]
     agrees = (turn * turn[..., :1, :]).sum(-1, keepdim=True).detach() >= 0
     signed = torch.where(agrees, turn, -turn)
     whole = (w[..., None] * signed).sum(-2)
     mean_turn = unit(whole)
     if how == LINEAR:
-        moved = (rotation_matrices(turn) @ (means[:, None] - p_rest)[..., None])[..., 0] + positions[..., nodes, :]
+        moved = (rotation_matrices(turn) @ (means[:, None] - p_rest)[..., None])[..., 0] + _of(positions, nodes)
         return (w[..., None] * moved).sum(-2), product(mean_turn, quats)
-    shift = positions[..., nodes, :] - (rotation_matrices(turn) @ p_rest[..., None])[..., 0]
+    shift = _of(positions, nodes) - (rotation_matrices(turn) @ p_rest[..., None])[..., 0]
     dual = (w[..., None] * product(torch.nn.functional.pad(shift, (1, 0)), signed)).sum(-2)  # twice the dual part
     translation = product(dual, conjugate(whole))[..., 1:] / (whole * whole).sum(-1, keepdim=True)
     x = (rotation_matrices(mean_turn) @ means[..., None])[..., 0] + translation
     return x, product(mean_turn, quats)
+
+
+def _of(poses: Tensor, nodes: Tensor) -> Tensor:
+    """Those [...,N,8,D] of `poses` [...,M,D] that Gaussians hang on."""
+    # plain indexing would sort its many duplicates in the backward pass on a GPU
+    return poses.index_select(-2, nodes.reshape(-1)).unflatten(-2, nodes.shape)
