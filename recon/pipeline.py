@@ -78,8 +78,9 @@ def reconstruct(
     effects = (Gain(start=ready.gains), *plan.effects)
     with progress.stage("fit"):
         found = fit(
-            ready.initial.to(plan.device), ready.footage, ready.offsets, losses=plan.losses, effects=effects, rates=rates,
-            steps=steps, budget=budget, batch=plan.batch, densify=plan.densify, seed=plan.seed, checkpoint=out / "fit.npz",
+            ready.initial.to(plan.device), ready.footage, ready.offsets, losses=plan.losses, effects=effects,
+            rates=rates, steps=steps, budget=budget, batch=plan.batch, densify=plan.densify, seed=plan.seed,
+            checkpoint=out / "fit.npz",
             save_every=plan.save_every,
         )  # fmt: skip
     _write_fit(out, found)

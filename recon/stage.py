@@ -146,7 +146,8 @@ def observer_at_once(
     means, quats = means.expand(len(shots), -1, -1), quats.expand(len(shots), -1, -1)
     sizes = [(s.box[2] - s.box[0], s.box[3] - s.box[1]) for s in shots]
     out = render(
-        means, quats, g.scales, g.opacities, colours(g, w2c, means), w2c, K, max(w for w, _ in sizes), max(h for _, h in sizes),
+        means, quats, g.scales, g.opacities, colours(g, w2c, means), w2c, K,
+        max(w for w, _ in sizes), max(h for _, h in sizes),
         near_plane=0.01 * scene.near, depth="expected" if depth else None,
     )  # fmt: skip
     if probes is not None:
