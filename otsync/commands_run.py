@@ -42,6 +42,8 @@ class Run:
     """Steps of the fit instead of seconds: the result is then the same on any machine of a kind."""
     exposure: float = 0.0
     """Seconds that the shutters were open, where moving things are blurred; 0: sharp. Readouts are in the scene."""
+    device: str = "cpu"
+    """cpu, or cuda for a GPU with gsplat: where the reconstruction is fitted."""
     seed: int = 0
     truth: Path | None = None
     """True offsets, where they are known: adds errors to tables and reports."""
@@ -64,9 +66,9 @@ class Run:
 
         options = FitOptions(
             held_out=self.held_out, width=self.width, frames=self.frames, budget=self.budget, steps=self.steps, seed=self.seed,
-            exposure=self.exposure, cache=self.recording.cache, workers=self.recording.workers,
+            exposure=self.exposure, cache=self.recording.cache, workers=self.recording.workers, device=self.device,
         )  # fmt: skip
-        options.length()  # before the work, not after it
+        options.length(), options.plan()  # before the work, not after it
         scene = opened(self.scene, self.allow_outside or self.recording.allow_outside)
         if self.recording.cameras:
             scene = scene.take(

@@ -20,6 +20,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from recon.depth import Depths
+from recon.device import device_of
 from recon.discs import seed_discs, surface_of
 from recon.footage import Footage
 from recon.gaussians import Gaussians
@@ -100,7 +101,7 @@ def fit_backdrop(
     The result depends on the seed, not on the number of threads (with ``budget`` on the machine's speed as well).
     Raises ValueError when no video has a background: give masks; FloatingPointError when the fit diverges.
     """
-    total = _total(steps, budget)
+    total, device = _total(steps, budget), device_of(device)
     unknown = sorted(set(rates) - set(RATES))
     if unknown:
         raise ValueError(f"rates: expected some of {', '.join(RATES)}; found {', '.join(unknown)}.")

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from otsync.bench.record import table, write_rows
 from otsync.files import atomic_write
@@ -25,6 +26,7 @@ from otsync.io import Scene
 from otsync.types import Offsets, TrackSet
 from recon.bench_rows import find, measured_before, paper_tables
 from recon.configurations import CONFIGURATIONS, Configuration
+from recon.device import device_of
 from recon.effects import Gain, with_declared
 from recon.evaluate import acceleration, coherence, following_error, offset_error
 from recon.fit import fit
@@ -58,6 +60,7 @@ class Protocol:
         seeds: of the draws. steps: of the fit, of ``batch`` images each; budget: wall seconds instead.
         width: working pixels. voxel: footprints between Gaussians at the start, see :class:`recon.seed.Seeding`.
         held_out_tracks: share of the tracks that no scaffold sees.
+        device: where the fits run, "cpu" or "cuda"; on a GPU rows tell the most memory that the fit held there.
     """
 
     frames: tuple[int, int] | None = None
@@ -72,6 +75,7 @@ class Protocol:
     voxel: float = 2.7
     held_out_tracks: float = 0.1
     backdrop_steps: int = 1500
+    device: str = "cpu"
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,13 +154,17 @@ def measure(
     plan = Plan(
         width=protocol.width, scaffold=replace(configuration.scaffold, margin=margin), losses=configuration.losses,
         seeding=Seeding(voxel=protocol.voxel), batch=protocol.batch, backdrop_steps=protocol.backdrop_steps,
+        device=protocol.device,
     )  # fmt: skip
     ready = prepare(
         material.scene, built_from, material.tracks, plan=plan, held_out=material.held_out, cache=cache, map=map
     )
+    device = device_of(protocol.device)
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
     began = time.perf_counter(), time.process_time()
     found = fit(
-        configuration.motion(ready.initial), ready.footage, ready.offsets, losses=plan.losses,
+        configuration.motion(ready.initial).to(device), ready.footage, ready.offsets, losses=plan.losses,
         effects=(*with_declared((), [f.readout for f in ready.footage]), Gain(start=ready.gains)),
         rates=configuration.rates, steps=protocol.steps if protocol.budget is None else None,
         budget=protocol.budget, batch=protocol.batch,
@@ -173,6 +181,8 @@ def measure(
         **held_out_figures(found.scene, ready, lpips), **motion_figures(found.scene, ready, material.kept),
         "images": found.stats["images"], "seconds": seconds, "cpu_seconds": cpu, "gaussians": len(found.scene),
     }  # fmt: skip
+    if device.type == "cuda":
+        row["gpu_gb"] = torch.cuda.max_memory_allocated(device) / 1e9
     return {k: _rounded(v) for k, v in row.items()}
 
 
@@ -247,6 +257,7 @@ def run(
     unknown = [r for r in rows if r not in CONFIGURATIONS]
     if unknown:
         raise ValueError(f"rows: expected some of {', '.join(CONFIGURATIONS)}; found {', '.join(unknown)}.")
+    device_of(protocol.device)  # before the work, not after it
     kept, progress, lpips = Cache(cache or out / "stages"), Progress(tell), lpips or Lpips()
     description = about(protocol, scene, truth)
     found = measured_before(out, description)
@@ -273,9 +284,12 @@ def run(
 def about(protocol: Protocol, scene: Scene, truth: Offsets) -> Mapping[str, Any]:
     """What the figures were made with; rows are continued where all of it agrees."""
     clips = [[v.name, len(v.frames), v.camera.width, v.camera.height] for v in scene.videos]
+    settings = dict(vars(protocol))
+    if protocol.device == "cpu":  # as in files from before there was a choice: their rows are continued
+        del settings["device"]
     true = {n: round(float(s), 6) for n, s in zip(truth.names, truth.seconds, strict=True)}
     return {
-        "protocol": vars(protocol), "figures": FIGURES, "recording": {"videos": clips, "truth": true},
+        "protocol": settings, "figures": FIGURES, "recording": {"videos": clips, "truth": true},
         "published": PUBLISHED, "unit": "frames, dB, footprints",
     }  # fmt: skip
 

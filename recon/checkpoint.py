@@ -66,7 +66,7 @@ class Checkpoint:
         about = {"format": FORMAT, "version": VERSION, "key": self.key, "step": snapshot.step,
                  "steps": snapshot.steps, "densified": snapshot.densified}  # fmt: skip
         arrays = {"fit": np.frombuffer(json.dumps(about).encode(), np.uint8), "history": snapshot.history,
-                  "since": snapshot.since, "pull": snapshot.pull.numpy()}  # fmt: skip
+                  "since": snapshot.since, "pull": snapshot.pull.cpu().numpy()}  # fmt: skip
         arrays |= {f"scene/{k}": v for k, v in snapshot.scene.items()}
         for part in ("groups", "moments"):
             arrays |= {f"{part}/{k}": v.detach().cpu().numpy() for k, v in getattr(snapshot, part).items()}

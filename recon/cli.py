@@ -49,7 +49,9 @@ class FitOptions:
     freeze: tuple[str, ...] = ()
     """Parameter groups that stay as they are: offsets, gain, knots, ..."""
     batch: int = 2
-    """Images a step, each on a thread of its own."""
+    """Images a step, on a CPU each on a thread of its own."""
+    device: str = "cpu"
+    """cpu, or cuda for a GPU with gsplat: where the fits run."""
     backdrop_steps: int = 1500
     """Steps of the fit of the static part, before anything moves."""
     seed: int = 0
@@ -81,7 +83,7 @@ class FitOptions:
             effects=(MotionBlur(self.exposure),) if self.exposure else (),
             width=self.width, frames=self.frames, scaffold=self.scaffold, seeding=Seeding(self.voxel, sh_degree=self.sh_degree), densify=self.densify, freeze=self.freeze,
             batch=self.batch, seed=self.seed, backdrop_steps=self.backdrop_steps,
-            save_every=self.save_every,
+            save_every=self.save_every, device=self.device,
         )  # fmt: skip
 
     def length(self) -> dict[str, Any]:

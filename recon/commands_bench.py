@@ -22,6 +22,9 @@ class Bench:
 
     On a simulated recording: recon bench world --truth world/truth.json --held-out held0 --width 160
 
+    On a GPU, with the time and the most memory that it took: recon bench recording/ --held-out 0 --frames 0 150
+    --width 640 --rows ours --steps 10000 --batch 8 --device cuda --out bench
+
     Lifted features against averaged ones, for the matcher: recon bench recording/ --suite lifting --frames 50 98
     """
 

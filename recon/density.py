@@ -62,12 +62,12 @@ class Densify:
         size = g.scales.amax(1)
         split = wanted & (size > size[alive].median())
         old = torch.cat([torch.nonzero(alive)[:, 0], torch.nonzero(wanted)[:, 0]])
-        new = torch.arange(len(old)) >= int(alive.sum())
+        new = torch.arange(len(old), device=old.device) >= int(alive.sum())
         # a split replaces its parent: the kept row is one half, the new row the other
         side = torch.where(new, 1.0, -1.0) * split[old]
         halves = _moved(Gaussians(*(getattr(g, f.name)[old] for f in fields(g))), side, split[old])
         features = None if scene.features is None else scene.features[old]
-        motion = scene.motion.take(old.numpy())
+        motion = scene.motion.take(old)
         return replace(scene, dynamic=halves, motion=motion, features=features), old, new | split[old]
 
     def scaffold(self, scene: Gaussians4D, pull: Tensor) -> tuple[Gaussians4D, Tensor | None]:
@@ -90,5 +90,5 @@ def _moved(g: Gaussians, side: Tensor, split: Tensor) -> Gaussians:
     w, v = q[:, :1], q[:, 1:]
     turned = axis + 2 * torch.linalg.cross(v, torch.linalg.cross(v, axis, dim=1) + w * axis, dim=1)
     shift = 0.5 * side[:, None] * g.scales.amax(1, keepdim=True) * turned
-    smaller = g.log_scales - split[:, None] * torch.log(torch.tensor(SPLIT_SHRINK))
+    smaller = g.log_scales - split[:, None] * torch.log(torch.tensor(SPLIT_SHRINK, device=split.device))
     return replace(g, means=g.means + shift, log_scales=smaller)

@@ -1,10 +1,10 @@
 """fit(): one scene, many videos, their clocks: everything that has a learning rate is refined from the images.
 
-One step renders a few frames, each on a thread of its own, blends them over their backgrounds, and follows the losses'
-gradients. The offsets are parameters like any other: a frame's time becomes world time by its video's offset, and the
-motion can be differentiated in time. Only differences of offsets are seen. All of them move during the fit, because
-holding the reference still leaves a slow common mode between all others and the motion; at the end the reference is
-put back to where it was.
+One step renders a few frames (on a CPU each on a thread of its own, on a GPU all at once where it can), blends them over
+their backgrounds, and follows the losses' gradients. The offsets are parameters like any other: a frame's time becomes
+world time by its video's offset, and the motion can be differentiated in time. Only differences of offsets are seen. All
+of them move during the fit, because holding the reference still leaves a slow common mode between all others and the
+motion; at the end the reference is put back to where it was.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from recon.optimize import RATES
 from recon.problem import Loss, Problem, assemble
 from recon.quiet import one_thread_each, uninterrupted
 from recon.regularizers import Acceleration, Arap, Length, Velocity
-from recon.running import Diverged, Run
+from recon.running import Diverged, MapLike, Run
 
 __all__ = ["LOSSES", "RATES", "Diverged", "History", "Reconstruction", "fit"]
 
@@ -99,15 +99,18 @@ def fit(
 ) -> Reconstruction:
     """Refine a 4D scene, and the clocks of the videos, from their images.
 
+    The fit runs where the scene is: ``fit(scene.to("cuda"), ...)`` runs on a GPU, through gsplat. What it gives back is
+    on the CPU either way.
+
     Args:
         footage: the videos; each is found by name in ``offsets``, whose reference keeps its place.
         losses, effects: what is in the tuple is computed, nothing else.
         rates: learning rate of each parameter group at the start; a group without one is frozen, "offsets" too.
         steps, budget: how long: a number of steps, or wall seconds, which are turned into a number of steps once the
             first ones have shown their speed (120 at the least). Default: 2000 steps.
-        batch: images per step, each on its own thread. The result does not depend on the number of threads.
+        batch: images per step, on a CPU each on its own thread. The result does not depend on the number of threads.
         checkpoint: file that the fit is kept in, every ``save_every`` seconds and on Ctrl-C; a fit that was killed
-            continues from it and ends with the same numbers.
+            continues from it and ends with the same numbers (on a GPU, whose sums run in any order, nearly so).
 
     Raises:
         ValueError: for footage, offsets or rates that do not fit together.
@@ -119,14 +122,16 @@ def fit(
     run = Run(problem, dict(rates), keep.load(problem.groups()), _steps(steps, budget))
     started = time.perf_counter()
     with ExitStack() as stack:
-        pool = stack.enter_context(ThreadPoolExecutor(batch + 1, thread_name_prefix="recon.fit"))
+        each: MapLike = map
+        if problem.device.type == "cpu":  # a GPU is fed by one thread: more would only wait for each other
+            each = stack.enter_context(ThreadPoolExecutor(batch + 1, thread_name_prefix="recon.fit")).map
         stack.enter_context(one_thread_each(batch))
         bar = stack.enter_context(tqdm(total=run.total, initial=run.step, desc="fit", unit="step", disable=None))
         calibrate = Calibration(budget)
         try:
             while run.total is None or run.step < run.total:
                 with uninterrupted():
-                    run.advance(pool, densify)
+                    run.advance(each, densify)
                     row = run.record(time.perf_counter() - started) if run.record_due() else None
                 bar.update()
                 if run.total is None:
@@ -188,7 +193,7 @@ def _finish(run: Run, seconds: float) -> Reconstruction:
     found = values["offsets"].cpu().numpy()
     sigma = run.sigma(values) if "offsets" in run.adam.groups else p.offsets.sigma[p.index]
     drift = float(found[p.reference] - p.start[p.reference])
-    scene = replace(scene, motion=scene.motion.shifted(-drift, values["offsets"] - drift))
+    scene = replace(scene, motion=scene.motion.shifted(-drift, values["offsets"] - drift)).to("cpu")
     offsets = replace(
         p.offsets,
         seconds=_put(p.offsets.seconds, p.index, found - drift), sigma=_put(p.offsets.sigma, p.index, sigma),
@@ -201,7 +206,7 @@ def _finish(run: Run, seconds: float) -> Reconstruction:
         "psnr": float(history.psnr[-1]) if len(history.psnr) else math.nan,
         "drift_frames": drift / scene.frame_step,
     }  # fmt: skip
-    learned = {n: values[n] for n in initial_parameters(p.effects, len(p.clips))}
+    learned = {n: values[n].cpu() for n in initial_parameters(p.effects, len(p.clips))}
     return Reconstruction(scene, offsets, learned, history, stats)
 
 

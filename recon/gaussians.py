@@ -117,6 +117,10 @@ class Gaussians:
         """The same Gaussians without their graph, on the CPU in float32: what files hold."""
         return Gaussians(*(getattr(self, f.name).detach().float().cpu() for f in fields(self)))
 
+    def to(self, device: torch.device | str) -> Gaussians:
+        """The same Gaussians on another device."""
+        return Gaussians(*(getattr(self, f.name).to(device) for f in fields(self)))
+
     def finite(self) -> Gaussians:
         """These Gaussians; ValueError when a parameter is NaN or infinite, which no file should hold."""
         for f in fields(self):

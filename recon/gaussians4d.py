@@ -15,6 +15,7 @@ from torch import Tensor
 
 from otsync.files import read_npz, write_npz
 from otsync.types import Camera
+from recon.device import device_of
 from recon.gaussians import Gaussians
 from recon.motion import Motion, motion_from_arrays
 from recon.motion.arrays import numbers
@@ -77,6 +78,15 @@ class Gaussians4D:
         """All Gaussians at world time ``t`` (seconds): dynamic first, then static."""
         moving = self.moving(t, clocks)
         return moving if self.static is None else join(moving, self.static)
+
+    def to(self, device: torch.device | str) -> Gaussians4D:
+        """The same scene on "cpu", or on a GPU ("cuda"): a fit of it then runs there. ValueError where there is none."""
+        device = device_of(device)
+        return replace(
+            self, dynamic=self.dynamic.to(device), motion=self.motion.to(device),
+            static=None if self.static is None else self.static.to(device),
+            features=None if self.features is None else self.features.to(device),
+        )  # fmt: skip
 
     def tracks(self, times: Sequence[float] | np.ndarray, clocks: Tensor | None = None) -> np.ndarray:
         """Trajectories (N,T,3) of the dynamic Gaussians at world ``times`` (seconds), float32, world units."""

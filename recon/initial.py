@@ -152,12 +152,14 @@ def backdrop_of_scene(
         depth = [None if v.depth is None else working_depth(v, width=plan.width) for v in scene.videos]
         found = fit_backdrop(
             footage, depth=None if all(d is None for d in depth) else depth, points=points, steps=plan.backdrop_steps,
-            seed=plan.seed,
+            seed=plan.seed, device=plan.device,
         )  # fmt: skip
         parts = {n: getattr(found.gaussians, n).numpy() for n in GAUSSIAN}
         return {**parts, "gains": found.gains, "near": np.array(found.near), "psnr": found.psnr}
 
     key = (*content_key(scene, tracks), plan.width, plan.backdrop_steps, plan.seed)
+    if plan.device != "cpu":  # rounds otherwise
+        key = (*key, plan.device)
     try:
         kept = cache.arrays("backdrop", key, build)
     except ValueError as error:

@@ -103,6 +103,6 @@ class Adam:
     def restore(self, moments: Mapping[str, Tensor]) -> None:
         """Put back what :meth:`moments` gave."""
         for name, p in self.groups.items():
-            state = {key[len(name) + 1 :]: v.clone() for key, v in moments.items() if key.rpartition(".")[0] == name}
-            if state:
-                self._adam.state[p] = state
+            own = {key[len(name) + 1 :]: v for key, v in moments.items() if key.rpartition(".")[0] == name}
+            if own:
+                self._adam.state[p] = {key: v.to(p.device, copy=True) for key, v in own.items()}

@@ -81,8 +81,9 @@ def reconstruct(
     effects = (*with_declared(plan.effects, [f.readout for f in ready.footage]), Gain(start=ready.gains))
     with progress.stage("fit"):
         found = fit(
-            ready.initial, ready.footage, ready.offsets, losses=plan.losses, effects=effects, rates=rates, steps=steps,
-            budget=budget, batch=plan.batch, densify=plan.densify, seed=plan.seed, checkpoint=out / "fit.npz",
+            ready.initial.to(plan.device), ready.footage, ready.offsets, losses=plan.losses, effects=effects,
+            rates=rates, steps=steps, budget=budget, batch=plan.batch, densify=plan.densify, seed=plan.seed,
+            checkpoint=out / "fit.npz",
             save_every=plan.save_every,
         )  # fmt: skip
     _write_fit(out, found)

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from recon.density import Densify
+from recon.device import device_of
 from recon.effects import Effect
 from recon.fit import LOSSES, Loss
 from recon.motion import ScaffoldOptions
@@ -30,6 +31,7 @@ class Plan:
         batch: images a step, each on a thread of its own.
         views: frames of every camera that are compared at the end. backdrop_steps: of the fit of the static part.
         save_every: seconds between savings of the fit.
+        device: where static part and motion are fitted: "cpu", or "cuda" for a GPU; the rest is done on the CPU.
     """
 
     width: int = 320
@@ -45,6 +47,10 @@ class Plan:
     views: int = 50
     backdrop_steps: int = 1500
     save_every: float = 60.0
+    device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        device_of(self.device)
 
 
 class Progress:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from otsync.types import Offsets
 from recon.content import content_key
-from recon.effects import Effect, initial_parameters
+from recon.effects import Effect, Gain, initial_parameters
 from recon.footage import Footage
 from recon.gaussians4d import Gaussians4D, scene_arrays
 from recon.losses import ImageLoss
@@ -83,7 +83,7 @@ class Problem:
         device = scene.dynamic.means.device
         return cls(
             scene, tuple(Clip.of(f, device) for f in footage),
-            tuple(torch.as_tensor(f.times, dtype=torch.float64) for f in footage), offsets, index,
+            tuple(torch.as_tensor(f.times, dtype=torch.float64, device=device) for f in footage), offsets, index,
             tuple(cast(ImageLoss, x) for x in losses if hasattr(x, "needs")), tuple(cast(MotionLoss, x) for x in losses if hasattr(x, "every")), effects, np.array(keys), batch, seed,
         )  # fmt: skip
 
@@ -97,6 +97,18 @@ class Problem:
         """The video whose offset stays: the offsets' reference, or the first where that was left out."""
         at = np.nonzero(self.index == self.offsets.component[self.index[0]])[0]
         return int(at[0]) if len(at) else 0
+
+    @property
+    def device(self) -> torch.device:
+        """Where the fit runs: where the scene is."""
+        return self.scene.dynamic.means.device
+
+    @property
+    def at_once(self) -> bool:
+        """Whether the images of a step are one rendering: on a GPU, where no effect asks for other moments than the
+        frames' own and what is static is not drawn."""
+        layered = self.scene.static is None or all(clip.background is not None for clip in self.clips)
+        return self.device.type != "cpu" and layered and all(isinstance(e, Gain) for e in self.effects)
 
     def needs(self, what: str) -> bool:
         """Whether a loss asks for "depth" or "features" to be rendered."""
@@ -118,11 +130,10 @@ class Problem:
 
     def groups(self) -> dict[str, Tensor]:
         """Every parameter group at its start, frozen or not."""
-        out = scene_groups(self.scene)
-        out |= initial_parameters(self.effects, len(self.clips))
+        out = initial_parameters(self.effects, len(self.clips))
         out["offsets"] = torch.as_tensor(self.start.copy())
         out["clock_rates"] = torch.as_tensor(self.offsets.rates[self.index].copy())
-        return out
+        return scene_groups(self.scene) | {name: t.to(self.device) for name, t in out.items()}
 
 
 def scene_groups(scene: Gaussians4D) -> dict[str, Tensor]:

@@ -117,17 +117,15 @@ def _edge_shares(motion: Scaffold, neighbours: int) -> Tensor:
 def difference(motion: Motion, times: list[float], coefficients: list[float], draw: Draw) -> Tensor | None:
     """mean ‖Σ_s coefficients_s x(t_s)‖ in footprints over what moves by its own parameters: nodes, or Gaussians
     without a scaffold."""
-    if isinstance(motion, PerGaussian):
-        path, knots = motion.path, motion.own_knots
-        moments = path.basis(np.array(times)[:, None])[:2]
-        clock = np.zeros(knots.shape[1], np.int32)
-    elif isinstance(motion, Scaffold):
-        path, knots = motion.path, motion.knots
-        moments, clock = motion.moments(times, draw.clocks), motion.rig.clock
-    else:
+    if not isinstance(motion, PerGaussian | Scaffold):
         return None
+    knots = motion.knots if isinstance(motion, Scaffold) else motion.own_knots
     if fused.applies(knots):
         weights = np.array(coefficients)
+        if isinstance(motion, Scaffold):
+            moments, clock = motion.moments(times, draw.clocks), motion.rig.clock
+        else:
+            moments, clock = motion.path.basis(np.array(times)[:, None])[:2], np.zeros(knots.shape[1], np.int32)
 
         def compute(knots, quats, g_knots, g_quats):
             curves = (knots, quats, clock)
@@ -137,7 +135,7 @@ def difference(motion: Motion, times: list[float], coefficients: list[float], dr
     if isinstance(motion, Scaffold):
         at = [motion.nodes(t, draw.clocks)[0] for t in times]
     else:
-        at = [path.at(knots, t) for t in times]
+        at = [motion.path.at(knots, t) for t in times]
     together = torch.stack([c * x for c, x in zip(coefficients, at, strict=True)]).sum(0)
     return soft_norm(together / draw.footprint).mean()
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,8 +20,10 @@ from recon.losses import Seen
 from recon.optimize import Adam, Decay, check_rates
 from recon.problem import Problem, assemble, scene_groups
 from recon.regularizers import Draw
-from recon.stage import Clip, compose_over, feature_image, observer
+from recon.stage import Clip, compose_over, feature_image, observer, observer_at_once
 from recon.uncertainty import newton_sigma
+
+MapLike = Callable[..., Any]
 
 RECORDS = 200  # rows of history in a fit
 PER_NODE = ("knots", "knot_quats")
@@ -33,10 +36,11 @@ class Diverged(RuntimeError):
 
 @dataclass(frozen=True)
 class Result:
-    """What one job of a step gives back; gradients in the order of the groups, None where there is none."""
+    """What one job of a step gives back: loss and PSNR by image, gradients in the order of the groups, None where there
+    is none."""
 
-    loss: float
-    psnr: float
+    losses: list[float]
+    psnrs: list[float]
     gradients: list[Tensor | None]
     pull: Tensor | None
 
@@ -51,23 +55,26 @@ class Run:
         self.rows = np.zeros((0, 4 + len(problem.clips)))
         if snapshot is not None:
             self.scene, self.step, self.total = (
-                scene_from_arrays(snapshot.scene),
+                scene_from_arrays(snapshot.scene).to(problem.device),
                 snapshot.step,
                 snapshot.steps or total,
             )
-            self.groups |= {n: v.to(self.groups[n].device) for n, v in snapshot.groups.items()}
+            self.groups |= {n: v.to(problem.device) for n, v in snapshot.groups.items()}
             self.rows = snapshot.history
         self.densified = 0 if snapshot is None else snapshot.densified
         self.adam = self._adam({} if snapshot is None else snapshot.moments)
         self.decay = Decay()
         self._since = [] if snapshot is None else [(float(a), float(b)) for a, b in snapshot.since]
-        self._pull = torch.zeros(2, len(self.scene)) if snapshot is None else snapshot.pull
+        self._pull = self._no_pull() if snapshot is None else snapshot.pull.to(problem.device)
 
     def _adam(self, moments: Mapping[str, Tensor]) -> Adam:
         active = check_rates(self.rates, self.groups)
         adam = Adam(self.groups, active, self.scene.footprint, self.scene.frame_step)
         adam.restore(moments)
         return adam
+
+    def _no_pull(self) -> Tensor:
+        return torch.zeros(2, len(self.scene), device=self.problem.device)
 
     def values(self) -> dict[str, Tensor]:
         """Every group's current value; those that are fitted require gradients."""
@@ -77,9 +84,9 @@ class Run:
         """World seconds at which a frame was taken, differentiable in its video's clock."""
         return values["clock_rates"][video] * self.problem.times[video][frame] + values["offsets"][video]
 
-    def advance(self, pool: ThreadPoolExecutor, densify: Densify | None) -> None:
+    def advance(self, map: MapLike, densify: Densify | None) -> None:
         """A step, and what is due after it: all of it, or none."""
-        self.one_step(pool, probe=densify is not None)
+        self.one_step(map, probe=densify is not None)
         if densify is not None and self.total:
             due = sorted(densify.steps(self.total))
             # a budget may learn its length only after a moment has passed
@@ -87,28 +94,30 @@ class Run:
                 self.densify(densify)
                 self.densified += 1
 
-    def one_step(self, pool: ThreadPoolExecutor, probe: bool = False) -> None:
-        """Render a batch, gather gradients in a fixed order, and move."""
+    def one_step(self, map: MapLike, probe: bool = False) -> None:
+        """Render a batch, gather gradients in a fixed order, and move; ``map`` calls the jobs of the step."""
         p, values = self.problem, self.values()
         names = list(self.adam.groups)
-        jobs = [pool.submit(self.image_gradient, values, names, key, probe) for key in p.pick(self.step)]
+        keys = p.pick(self.step)
+        groups = [keys] if p.at_once else [[key] for key in keys]
+        jobs = [partial(self.image_gradient, values, names, group, probe) for group in groups]
         if p.motion_losses:
-            jobs.append(pool.submit(self.motion_gradient, values, names))
-        done = [job.result() for job in jobs]
+            jobs.append(partial(self.motion_gradient, values, names))
+        done = list(map(lambda job: job(), jobs))
         total: dict[str, Tensor] = {}
         for n, result in enumerate(done):
-            share = 1.0 / p.batch if n < p.batch else 1.0
+            share = 1.0 / p.batch if n < len(groups) else 1.0
             for name, gradient in zip(names, result.gradients, strict=True):
                 if gradient is not None:
                     total[name] = gradient * share if name not in total else total[name].add_(gradient, alpha=share)
-        self._guard(total, done, p.pick(self.step))
+        self._guard(total, done, keys)
         fraction = self.step / self.total if self.total else 0.0
         if "clock_rates" in total:  # the reference's clock is the world's
             total["clock_rates"][p.reference] = 0
         self.adam.step(total, self.decay(fraction))
         self.step += 1
-        for r in done[: p.batch]:
-            self._since.append((r.loss, r.psnr))
+        for r in done[: len(groups)]:
+            self._since += zip(r.losses, r.psnrs, strict=True)
             if r.pull is not None:
                 self._pull += r.pull
 
@@ -129,29 +138,37 @@ class Run:
             p.keys, p.reference, len(p.clips), self.scene.frame_step,
         )  # fmt: skip
 
-    def image_gradient(self, values: dict[str, Tensor], names: list[str], key: tuple[int, int], probe: bool) -> Result:
-        """Loss of one frame and its gradients."""
-        p, (v, k) = self.problem, key
+    def image_gradient(
+        self, values: dict[str, Tensor], names: list[str], keys: list[tuple[int, int]], probe: bool
+    ) -> Result:
+        """Losses of some frames, and the gradients of their sum; several are rendered at once."""
+        p = self.problem
         probes: list[tuple[Tensor, Tensor]] = []
         scene = assemble(self.scene, values)
-        clip = p.clips[v]
-        box = clip.box(k)
-        observe = observer(scene, p.clips, values["offsets"], depth=p.needs("depth"), probes=probes if probe else None)
-        shot = Shot(v, self.world_time(values, v, k), box, clip.size[1], k)
-        rendered = compose(observe, p.effects, values)(shot)
-        seen = self.seen(scene, values, rendered, clip, shot)
-        parts = [loss.weight * value for loss in p.losses if (value := loss(seen)) is not None]
-        held = prior(p.effects, values)
-        loss = sum(parts if held is None else [*parts, held], torch.zeros(()))
-        psnr = -10 * math.log10(float((seen.rendered.detach() - seen.image).square().mean()) + 1e-12)
+        shots = [Shot(v, self.world_time(values, v, k), p.clips[v].box(k), p.clips[v].size[1], k) for v, k in keys]
+        clocks, depth, asked = values["offsets"], p.needs("depth"), probes if probe else None
+        observe = (
+            observer(scene, p.clips, clocks, depth=depth, probes=asked) if len(shots) == 1
+            else observer_at_once(scene, p.clips, shots, clocks, depth=depth, probes=asked)
+        )  # fmt: skip
+        observe, losses, errors = compose(observe, p.effects, values), [], []
+        for shot in shots:
+            seen = self.seen(scene, values, observe(shot), p.clips[shot.video], shot)
+            parts = [loss.weight * value for loss in p.losses if (value := loss(seen)) is not None]
+            held = prior(p.effects, values)
+            losses.append(sum(parts if held is None else [*parts, held], torch.zeros((), device=p.device)))
+            errors.append((seen.rendered.detach() - seen.image).square().mean())
+        loss = sum(losses[1:], losses[0])
         wanted = [values[n] for n in names] + [means for means, _ in probes]
         gradients = torch.autograd.grad(loss, wanted, allow_unused=True) if loss.requires_grad else [None] * len(wanted)
-        pull = torch.zeros(2, len(scene)) if probe else None
+        pull = self._no_pull() if probe else None
         for (_, radii), g in zip(probes, gradients[len(names) :], strict=True):
             if pull is not None and g is not None:
-                seen_here = (radii > 0).any(-1).cpu()
-                pull += torch.stack([g[0, : len(scene)].norm(dim=-1).cpu() * seen_here, seen_here.float()])
-        return Result(float(loss.detach()), psnr, list(gradients[: len(names)]), pull)
+                seen_here = (radii[:, : len(scene)] > 0).any(-1)
+                length = g.reshape(radii.shape)[:, : len(scene)].norm(dim=-1)
+                pull += torch.stack([(length * seen_here).sum(0), seen_here.float().sum(0)])
+        psnrs = [-10 * math.log10(float(e) + 1e-12) for e in errors]
+        return Result([float(x.detach()) for x in losses], psnrs, list(gradients[: len(names)]), pull)
 
     def seen(
         self, scene: Gaussians4D, values: Mapping[str, Tensor], rendered: Rendered, clip: Clip, shot: Shot
@@ -161,7 +178,7 @@ class Run:
         rows, columns = slice(box[1], box[3]), slice(box[0], box[2])
 
         def cut(maps: Mapping[int, np.ndarray] | None) -> Tensor | None:
-            return None if maps is None or k not in maps else torch.as_tensor(maps[k][rows, columns])
+            return None if maps is None or k not in maps else torch.as_tensor(maps[k][rows, columns], device=p.device)
 
         depth, features = cut(given.depth), cut(given.features) if p.needs("features") else None
         tracks = None if given.tracks is None else given.tracks.get(k)
@@ -185,18 +202,19 @@ class Run:
             loss.weight * value for loss in p.motion_losses if self.step % loss.every == 0
             if (value := loss(scene.motion, scene.dynamic.means, scene.dynamic.quats, draw)) is not None
         ]  # fmt: skip
-        total = sum(parts, torch.zeros(()))
+        total = sum(parts, torch.zeros((), device=p.device))
         wanted = [values[n] for n in names]
         gradients = (
             torch.autograd.grad(total, wanted, allow_unused=True) if total.requires_grad else [None] * len(names)
         )
-        return Result(float(total.detach()), math.nan, list(gradients), None)
+        return Result([float(total.detach())], [], list(gradients), None)
 
     def _guard(self, total: Mapping[str, Tensor], done: Sequence[Result], keys: list[tuple[int, int]]) -> None:
         """Diverged, with step, group and frames, before a NaN reaches the parameters."""
-        bad = [n for n, g in total.items() if not bool(g.sum().isfinite()) and not bool(g.isfinite().all())]
-        lost = [n for n, r in enumerate(done) if not math.isfinite(r.loss)]
-        if bad or lost:
+        sums = [g.sum().isfinite() for g in total.values()]
+        sound = not sums or bool(torch.stack(sums).all())  # one question: a GPU's answers are waited for
+        bad = [] if sound else [n for n, g in total.items() if not bool(g.isfinite().all())]
+        if bad or not all(math.isfinite(loss) for r in done for loss in r.losses):
             frames = ", ".join(f"{self.problem.clips[v].footage.name} frame {k}" for v, k in keys)
             what = f"the gradient of {', '.join(bad)}" if bad else "the loss"
             raise Diverged(
@@ -220,7 +238,7 @@ class Run:
                 moment = _carried(moment, 1, source)
             carried[name] = moment
         self.adam = self._adam(carried)
-        self._pull = torch.zeros(2, len(self.scene))
+        self._pull = self._no_pull()
 
     def record_due(self) -> bool:
         every = max(1, (self.total or 10**9) // RECORDS)

@@ -120,7 +120,7 @@ def observer(
             depth="expected" if depth else None,
         )  # fmt: skip
         if probes is not None:
-            probes.append((out.means2d, out.radii[0, :n]))
+            probes.append((out.means2d, out.radii))
         rgb = out.colors[0]
         z = None if out.depths is None else out.depths[0]
         if together:
@@ -128,6 +128,33 @@ def observer(
         return Rendered(rgb, out.alphas[0], z)
 
     return observe
+
+
+def observer_at_once(
+    scene: Gaussians4D, clips: Sequence[Clip], shots: Sequence[Shot], clocks: Tensor | None = None, *,
+    depth: bool = False, probes: list[tuple[Tensor, Tensor]] | None = None,
+) -> Observe:  # fmt: skip
+    """As :func:`observer`, for these shots alone: one rendering of all keeps a GPU busy.
+
+    Moving Gaussians only: for clips with a background, or scenes without a static part. The images are as large as the
+    largest box and are cut; a splat that begins beyond its own box, where the projection stops following it, may be
+    shaped a little differently.
+    """
+    g, views = scene.dynamic, [clips[s.video].view(s.frame, s.box) for s in shots]
+    w2c, K = torch.cat([w for w, _ in views]), torch.cat([k for _, k in views])
+    means, quats = scene.motion.warp(g.means, g.quats, torch.stack([s.t for s in shots]), clocks)
+    means, quats = means.expand(len(shots), -1, -1), quats.expand(len(shots), -1, -1)
+    sizes = [(s.box[2] - s.box[0], s.box[3] - s.box[1]) for s in shots]
+    out = render(
+        means, quats, g.scales, g.opacities, colours(g, w2c, means), w2c, K,
+        max(w for w, _ in sizes), max(h for _, h in sizes),
+        near_plane=0.01 * scene.near, depth="expected" if depth else None,
+    )  # fmt: skip
+    if probes is not None:
+        probes.append((out.means2d, out.radii))
+    parts = (out.colors, out.alphas, *([] if out.depths is None else [out.depths]))
+    cut = {s: Rendered(*(x[i, :h, :w] for x in parts)) for i, (s, (w, h)) in enumerate(zip(shots, sizes, strict=True))}
+    return cut.__getitem__
 
 
 def feature_image(scene: Gaussians4D, clip: Clip, frame: int, t: Tensor, box: Box, clocks: Tensor | None) -> Tensor:
@@ -140,11 +167,11 @@ def feature_image(scene: Gaussians4D, clip: Clip, frame: int, t: Tensor, box: Bo
     return render(*parts, w2c, K, *size, near_plane=0.01 * scene.near, depth=None).colors[0]
 
 
-def colours(gaussians: Gaussians, w2c: Tensor) -> Tensor:
-    """Colours [N,3], or [1,N,3] where they depend on the view."""
+def colours(gaussians: Gaussians, w2c: Tensor, means: Tensor | None = None) -> Tensor:
+    """Colours [N,3], or [C,N,3] where they depend on the view; means [C,N,3]: where each of the C cameras sees them."""
     if gaussians.sh_degree == 0:
         return (sh.C0 * gaussians.sh[:, 0] + 0.5).clamp_min(0)
-    return sh.view_colors(gaussians.sh_degree, gaussians.means, gaussians.sh, w2c)
+    return sh.view_colors(gaussians.sh_degree, gaussians.means if means is None else means, gaussians.sh, w2c)
 
 
 def compose_over(rendered: Rendered, background: Tensor | None) -> Tensor:

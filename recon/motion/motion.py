@@ -27,7 +27,10 @@ class Motion(Protocol):
     def warp(
         self, means: Tensor, quats: Tensor, t: Tensor | float, clocks: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Means [N,3] and quats [N,4] at world second `t`; `clocks` [V] offsets, for a scaffold per video."""
+        """Means [N,3] and quats [N,4] at world second `t`; `clocks` [V] offsets, for a scaffold per video.
+
+        At T seconds: [T,N,3] and [T,N,4]; what does not change with time may lack the first axis.
+        """
         ...
 
     def take(self, index: Tensor | np.ndarray) -> Self:

@@ -74,7 +74,8 @@ class PerGaussian:
     def warp(
         self, means: Tensor, quats: Tensor, t: Tensor | float, clocks: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Means [N,3] displaced to world second `t`, and the quats as they are. `clocks` are ignored."""
+        """Means [N,3] displaced to world second `t` ([T,N,3]: to T of them), and the quats as they are. `clocks` are
+        ignored."""
         return means + self.path.at(self.own_knots, t), quats
 
     def shifted(self, by: float, clocks: Tensor | None = None) -> PerGaussian:

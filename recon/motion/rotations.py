@@ -17,7 +17,7 @@ def unit(quats: Tensor) -> Tensor:
 
 def conjugate(quats: Tensor) -> Tensor:
     """The inverse rotations of *unit* quaternions [...,4]."""
-    return quats * quats.new_tensor([1.0, -1, -1, -1])
+    return torch.cat([quats[..., :1], -quats[..., 1:]], -1)
 
 
 def product(p: Tensor, q: Tensor) -> Tensor:

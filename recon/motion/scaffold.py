@@ -90,10 +90,11 @@ class Scaffold:
         return replace(self, knots=parameters["knots"], knot_quats=parameters["knot_quats"])
 
     def own_times(self, t: Tensor | float, clocks: Tensor | None = None) -> Tensor:
-        """World second `t` on the clock of every video whose nodes these are: float64 [V], or [1] for world time."""
+        """World second `t`, or T of them, on the clock of every video whose nodes these are: float64 [V] or [T,V]; V is
+        1 for world time."""
         t = torch.as_tensor(t, dtype=torch.float64, device=self.knots.device)
         if self.clock is None:
-            return t[None]
+            return t[..., None]
         assert self.offsets is not None and self.rates is not None
         if clocks is None:
             clocks = self.offsets
@@ -102,19 +103,20 @@ class Scaffold:
                 f"clocks: expected one offset in seconds per video, {tuple(self.offsets.shape)}; "
                 f"found {tuple(clocks.shape)}."
             )
-        return (t - clocks.to(torch.float64)) / self.rates
+        return (t[..., None] - clocks.to(torch.float64)) / self.rates
 
     def nodes(self, t: Tensor | float, clocks: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Positions [M,3] and unit quaternions [M,4] of the nodes at world second `t`; differentiable in everything."""
+        """Positions [M,3] and unit quaternions [M,4] of the nodes at world second `t`, [T,M,3] and [T,M,4] at T of them;
+        differentiable in everything."""
         times = self.own_times(t, clocks)
-        if fused.applies(self.knots, self.knot_quats):
+        if times.ndim == 1 and fused.applies(self.knots, self.knot_quats):
             return fused.poses(times, self.knots, self.knot_quats, self.path, self.rig.clock)
         first, w = self.path.weights(times)
         clock = torch.zeros(len(self), dtype=torch.int64, device=w.device) if self.clock is None else self.clock
-        window = torch.as_tensor(first)[clock] + torch.arange(WINDOW, device=w.device)[:, None]  # [4,M]
+        window = torch.as_tensor(first)[..., None, clock] + torch.arange(WINDOW, device=w.device)[:, None]  # [...,4,M]
         every = torch.arange(len(self), device=w.device)
         positions, quats = (
-            torch.einsum("ma,amx->mx", w.to(knots.dtype)[clock], knots[window, every])
+            torch.einsum("...ma,...amx->...mx", w.to(knots.dtype)[..., clock, :], knots[window, every])
             for knots in (self.knots, self.knot_quats)
         )
         return positions, unit(quats)
@@ -122,14 +124,19 @@ class Scaffold:
     def warp(
         self, means: Tensor, quats: Tensor, t: Tensor | float, clocks: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Means [N,3] and quats [N,4] of the bound Gaussians at world second `t`; see :func:`recon.motion.warp.blend`.
+        """Means [N,3] and quats [N,4] of the bound Gaussians at world second `t`, [T,N,3] and [T,N,4] at T of them; see
+        :func:`recon.motion.warp.blend`.
 
         clocks float64 [V]: offsets of the videos, for a scaffold per video; ignored by one in world time.
         """
         if len(means) != len(self.binding):
             raise ValueError(f"means: expected the {len(self.binding)} Gaussians bound here; found {len(means)}.")
         if fused.applies(means, quats, self.knots, self.knot_quats):
-            return fused.warp(means, quats, self.own_times(t, clocks), self.knots, self.knot_quats, self.rig)
+            times = self.own_times(t, clocks)
+            if times.ndim == 1:
+                return fused.warp(means, quats, times, self.knots, self.knot_quats, self.rig)
+            each = [fused.warp(means, quats, own, self.knots, self.knot_quats, self.rig) for own in times]
+            return torch.stack([moved for moved, _ in each]), torch.stack([turned for _, turned in each])
         positions, node_quats = self.nodes(t, clocks)
         return warping.blend(self.binding, positions, node_quats, means, quats, self.blend)
 

@@ -45,7 +45,7 @@ def rasterize(
 ) -> Rendering:
     """Translate to and from `rasterization`, a function with the signature of gsplat's."""
     means, quats, scales, opacities, colors = gaussians
-    dtype, n, c = means.dtype, len(means), len(viewmats)
+    dtype, n, c = means.dtype, means.shape[-2], len(viewmats)
     width, height = size
     if n == 0:  # gsplat launches no kernel and leaves its outputs unset
         return _empty(
@@ -53,8 +53,15 @@ def rasterize(
         )
     # gsplat normalises by 1/|q|; a quaternion that is no rotation must not reach it
     rotates = (quats * quats).sum(-1) >= QUAT_NORM2_MIN
-    quats = torch.where(rotates[:, None], quats, torch.ones_like(quats))
+    quats = torch.where(rotates[..., None], quats, torch.ones_like(quats))
     opacities = torch.where(rotates, opacities, 0.0)
+    moving = means.ndim == 3
+    if moving:  # every camera becomes an entry of gsplat's batch, of one camera
+        scales = scales.expand(c, n, 3)
+        if colors.ndim == (2 if options.sh_degree is None else 3):
+            colors = colors.expand(c, *colors.shape)
+        viewmats, Ks = viewmats[:, None], Ks[:, None]
+        backgrounds = None if backgrounds is None else backgrounds[:, None]
     tensors = [t.float() for t in (means, quats, scales, opacities, colors, viewmats, Ks)]
     image, alphas, meta = rasterization(
         *tensors,
@@ -70,6 +77,8 @@ def rasterize(
         render_mode=RENDER_MODES[options.depth],
         rasterize_mode=options.rasterize_mode,
     )
+    if moving:
+        image, alphas = image[:, 0], alphas[:, 0]
     depths = None
     if options.depth is not None:
         image, depths = image[..., :-1], image[..., -1:].to(dtype)

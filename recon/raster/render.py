@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from recon.raster import sh
-from recon.raster.rendering import Rendering, Settings
+from recon.raster.rendering import Rendering, Settings, Splats
 
 logger = logging.getLogger("recon.raster")
 BackendName = Literal["auto", "torch", "cpu", "gsplat"]
@@ -37,6 +37,7 @@ def render(
     """Render N Gaussians into C cameras of one image size; conventions and names are those of gsplat's `rasterization`.
 
     means: [N,3] world units. quats: [N,4] wxyz, any length. scales: [N,3] standard deviations. opacities: [N] in 0..1.
+        Where each camera looks at another moment, means are [C,N,3] and quats [C,N,4].
     colors: [N,D] or per camera [C,N,D], D channels of any kind; with `sh_degree` spherical-harmonics coefficients
         [N,K,3] or [C,N,K,3], K >= (sh_degree + 1)^2, and D = 3.
     viewmats: [C,4,4] world-to-camera, OpenCV axes (x right, y down, z forward). Ks: [C,3,3] pixels, not differentiable.
@@ -65,7 +66,12 @@ def render(
             (means, quats, scales, opacities, colors), viewmats, Ks, (width, height), backgrounds, options
         )
     engine = _engine(name)
-    splats = engine.project(means, quats, scales, opacities, viewmats, Ks, width, height, options)
+    if means.ndim == 2:
+        splats = engine.project(means, quats, scales, opacities, viewmats, Ks, width, height, options)
+    else:
+        each = zip(means, quats, viewmats.split(1), Ks.split(1), strict=True)
+        views = [engine.project(m, q, scales, opacities, w2c, K, width, height, options) for m, q, w2c, K in each]
+        splats = Splats(*(torch.cat(parts) for parts in zip(*views, strict=True)))
     features = colors
     if options.sh_degree is not None:
         features = sh.view_colors(options.sh_degree, means, colors, viewmats)
@@ -109,11 +115,11 @@ def _choose(backend: str, means: Tensor) -> str:
     if backend != "auto":
         if backend == "cpu" and not _has_numba():
             raise ValueError("backend='cpu' needs numba: pip install numba, or use backend='torch' (15-40x slower)")
-        if backend in ("cpu", "torch") and means.is_cuda:
+        if backend in ("cpu", "torch") and means.device.type != "cpu":
             raise ValueError(f"backend={backend!r} works on CPU tensors, got {means.device}: move them with .cpu()")
         return backend
-    if means.is_cuda:
-        name, reason = "gsplat", "the tensors are on a CUDA device"
+    if means.device.type != "cpu":
+        name, reason = "gsplat", "the tensors are on a GPU"
     elif _has_numba():
         name, reason = "cpu", "numba kernels; pass CUDA tensors to use gsplat"
     else:
@@ -135,27 +141,28 @@ def _drop_nonfinite(gaussians: tuple[Tensor, ...], sh_degree: int | None) -> tup
     the slower exact test), and takes a small fraction of the time of a rendering.
     """
     with torch.no_grad():
-        if all(_finite_sum(t) for t in gaussians):
+        if _finite_sums(*gaussians):
             return gaussians
         means, colors = gaussians[0], gaussians[4]
-        per_camera = colors.ndim == 4 or (colors.ndim == 3 and (sh_degree is None))
-        good = torch.ones(len(means), dtype=torch.bool, device=means.device)
-        for t in (*gaussians[:4], colors.movedim(0, 1) if per_camera else colors):
-            good &= t.isfinite().reshape(len(means), -1).all(-1)
+        moving, per_camera = means.ndim - 2, colors.ndim == 4 or (colors.ndim == 3 and (sh_degree is None))
+        axes = (moving, moving, 0, 0, int(per_camera))  # along which the Gaussians lie
+        good = torch.ones(means.shape[-2], dtype=torch.bool, device=means.device)
+        for t, axis in zip(gaussians, axes, strict=True):
+            good &= t.movedim(axis, 0).isfinite().reshape(len(good), -1).all(-1)
 
-    def keep(t: Tensor, axis: int = 0) -> Tensor:
+    def keep(t: Tensor, axis: int) -> Tensor:
         return torch.where(good.reshape(-1, *[1] * (t.ndim - 1 - axis)), t, 0.0)
 
-    return *(keep(t) for t in gaussians[:4]), keep(colors, int(per_camera))
+    return tuple(keep(t, axis) for t, axis in zip(gaussians, axes, strict=True))
 
 
-def _finite_sum(t: Tensor) -> bool:
-    if t.is_cuda:
-        return bool(t.sum().isfinite())
+def _finite_sums(*tensors: Tensor) -> bool:
+    if tensors[0].device.type != "cpu":
+        # one question for all: a GPU's answers are waited for
+        return bool(torch.stack([t.sum().isfinite() for t in tensors]).all())
     with np.errstate(all="ignore"):
-        return bool(
-            np.isfinite(t.detach().numpy().sum())
-        )  # torch would wake its own pool, which then competes with ours
+        # torch would wake its own pool, which then competes with ours
+        return all(np.isfinite(t.detach().numpy().sum()) for t in tensors)
 
 
 def _check_shapes(
@@ -179,7 +186,8 @@ def _check_shapes(
             )
     if means.dtype not in (torch.float16, torch.float32, torch.float64):
         raise ValueError(f"means: expected float16, float32 or float64, got {means.dtype}: convert with .float()")
-    n, c = len(means), len(viewmats)
+    c, moving = len(viewmats), means.ndim == 3
+    n = means.shape[-2] if means.ndim > 1 else 0
 
     def expect(name: str, tensor: Tensor, *shapes: tuple[int | str, ...]) -> None:
         if not isinstance(tensor, Tensor):
@@ -202,8 +210,8 @@ def _check_shapes(
                 f"got {tensor.dtype} on {tensor.device}: convert with .to(means)"
             )
 
-    expect("means", means, ("N", 3))
-    expect("quats", quats, (n, 4))
+    expect("means", means, ("N", 3), (c, "N", 3))
+    expect("quats", quats, (c, n, 4) if moving else (n, 4))
     expect("scales", scales, (n, 3))
     expect("opacities", opacities, (n,))
     expect("viewmats", viewmats, ("C", 4, 4))
@@ -230,11 +238,11 @@ def _check_shapes(
     if backgrounds is not None:
         expect("backgrounds", backgrounds, (c, d))
         cameras["backgrounds"] = backgrounds
-    for name, tensor in cameras.items():
-        if not _finite_sum(tensor):
-            raise ValueError(
-                f"{name}: expected finite entries, got NaN or infinity: a camera or colour of the caller has diverged"
-            )
+    if not _finite_sums(*cameras.values()):
+        name = next(name for name, tensor in cameras.items() if not _finite_sums(tensor))
+        raise ValueError(
+            f"{name}: expected finite entries, got NaN or infinity: a camera or colour of the caller has diverged"
+        )
     if not ((Ks[:, 0, 0] > 0) & (Ks[:, 1, 1] > 0)).all():
         raise ValueError(
             "Ks: expected positive focal lengths, got zero or negative ones: flip the image, not the camera"

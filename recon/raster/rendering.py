@@ -89,6 +89,6 @@ class Rendering:
     colors: Tensor  # [C,H,W,D]
     alphas: Tensor  # [C,H,W,1] 1 - transmittance
     depths: Tensor | None  # [C,H,W,1] z in the camera frame, expected or accumulated; None when not asked for
-    means2d: Tensor  # [C,N,2] pixels
+    means2d: Tensor  # [C,N,2] pixels ([C,1,N,2] by gsplat, where every camera looks at another moment)
     radii: Tensor  # [C,N,2] int32 pixels
     backend: str  # "torch", "cpu" or "gsplat"

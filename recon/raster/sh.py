@@ -64,10 +64,10 @@ def evaluate(degree: int, directions: Tensor, coefficients: Tensor) -> Tensor:
 def view_colors(degree: int, means: Tensor, coefficients: Tensor, viewmats: Tensor) -> Tensor:
     """Colours [C,N,3] that cameras `viewmats` [C,4,4] see: max(SH(mean - camera centre) + 0.5, 0).
 
-    means [N,3] world units; coefficients [N,K,3] or one set per camera [C,N,K,3].
+    means [N,3] or [C,N,3] world units; coefficients [N,K,3] or one set per camera [C,N,K,3].
     """
     rotation, translation = viewmats[:, :3, :3], viewmats[:, :3, 3]
     # the centre by a solve, not by a transpose: gsplat inverts, and so gradients agree for any matrix
     centres = -torch.linalg.solve(rotation, translation)
-    directions = means[None] - centres[:, None]
+    directions = means - centres[:, None]
     return (evaluate(degree, directions, coefficients) + 0.5).clamp_min(0)

@@ -98,10 +98,10 @@ def gradient_against_differences(problem, group, index, step):
     def loss(shift: float) -> float:
         moved = {n: v.clone() for n, v in values.items()}
         moved[group][index] += shift
-        return run.image_gradient({**moved, group: moved[group].requires_grad_()}, [group], (1, 4), False).loss
+        return run.image_gradient({**moved, group: moved[group].requires_grad_()}, [group], [(1, 4)], False).losses[0]
 
     values[group] = values[group].clone().requires_grad_()
-    gradient = run.image_gradient(values, [group], (1, 4), False).gradients[0]
+    gradient = run.image_gradient(values, [group], [(1, 4)], False).gradients[0]
     return float(gradient[index]), (loss(step) - loss(-step)) / (2 * step)
 
 

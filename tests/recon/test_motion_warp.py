@@ -60,6 +60,31 @@ def test_the_kernels_are_the_definition(blend, videos, turn):
 
 
 @pytest.mark.parametrize("blend", BLENDS)
+@pytest.mark.parametrize("videos", [0, 3])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["kernels", "torch"])
+def test_several_moments_at_once_are_each_of_them(blend, videos, dtype):
+    """Values and gradients of poses and of what they carry."""
+    scaffold = random_scaffold(gaussians=40, blend=blend, videos=videos, turn=1.0, dtype=dtype)
+    knots = leaves(scaffold.parameters())
+    scaffold, gaussians = scaffold.with_parameters(knots), random_gaussians(40, dtype)
+    t = torch.tensor([0.43, -3.0, 0.1], dtype=torch.float64, requires_grad=True)
+    clocks = torch.tensor([0.02, -0.05, 0.01], dtype=torch.float64, requires_grad=True) if videos else None
+    asked = [t, *knots.values()] + ([clocks] if videos else [])
+    g, found = [np.random.default_rng(d).normal(size=(3, n, d)) for n, d in ((40, 3), (40, 4))], []
+    for at_once in (True, False):
+        if at_once:
+            out = [*scaffold.warp(*gaussians, t, clocks), *scaffold.nodes(t, clocks)]
+        else:
+            each = [(*scaffold.warp(*gaussians, s, clocks), *scaffold.nodes(s, clocks)) for s in t]
+            out = [torch.stack(parts) for parts in zip(*each, strict=True)]
+        loss = sum((x.double() * torch.from_numpy(y)).sum() for x, y in zip(out[:2], g, strict=True))
+        found.append([*(x.detach() for x in out), *torch.autograd.grad(loss, asked)])
+    tolerance = 1e-12 if dtype == torch.float64 else 1e-5
+    for a, b in zip(*found, strict=True):
+        assert float((a - b).abs().max()) <= tolerance * float(b.abs().max())
+
+
+@pytest.mark.parametrize("blend", BLENDS)
 def test_gradcheck_of_the_definition(blend):
     scaffold = random_scaffold(nodes=6, gaussians=2, knots=5, blend=blend, videos=2, dtype=torch.float64)
     means, quats = (x.requires_grad_() for x in random_gaussians(2, torch.float64))

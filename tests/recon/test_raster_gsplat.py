@@ -8,11 +8,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from recon.raster import sh
+from recon.raster import render, sh
 from recon.raster.cpu import backend as cpu_backend
 from recon.raster.projection import project, rotation_matrices
 from recon.raster.rendering import Settings
-from tests.recon.scenes import random_scene, relative, run
+from tests.recon.scenes import LEAVES, random_scene, relative, run
 
 gsplat = pytest.importorskip("gsplat", reason="gsplat is not installed: pip install 'otsync[cuda]'")
 reference = pytest.importorskip("gsplat.cuda._torch_impl")
@@ -143,6 +143,41 @@ def test_every_keyword_that_is_passed_exists():
         assert out.radii.shape == (2, 3000, 2)
 
 
+def by_the_book(means, quats, scales, opacities, colors, viewmats, Ks, width, height, **options):
+    """gsplat's rules about leading dimensions, with the torch back end in the place of its kernels."""
+    lead, n = means.shape[:-2], means.shape[-2]
+    assert quats.shape == (*lead, n, 4) and scales.shape == (*lead, n, 3) and opacities.shape == (*lead, n)
+    assert viewmats.shape[:-3] == Ks.shape[:-3] == lead and colors.shape[: len(lead) + 1] == (*lead, n)
+    assert options["backgrounds"].shape[:-2] == lead
+    each = [
+        render(*parts[:7], width, height, backgrounds=parts[7], backend="torch", sh_degree=options["sh_degree"])
+        for parts in zip(means, quats, scales, opacities, colors, viewmats, Ks, options["backgrounds"], strict=True)
+    ]
+    image, alphas, depths, means2d, radii = (
+        torch.stack([getattr(out, name) for out in each]) for name in ("colors", "alphas", "depths", "means2d", "radii")
+    )
+    return torch.cat([image, depths], -1), alphas, {"means2d": means2d, "radii": radii}
+
+
+@pytest.mark.parametrize("harmonics", [False, True], ids=["colours", "harmonics"])
+def test_cameras_that_look_at_other_moments_become_gsplat_s_batch(harmonics):
+    from recon.raster import gsplat_backend
+
+    scene, g = random_scene(n=50, cameras=3, seed=63), torch.Generator().manual_seed(2)
+    degree, colors = (1, 0.5 * torch.randn(50, 4, 3, generator=g)) if harmonics else (None, scene.colors)
+    means, quats = scene.means + 0.2 * torch.randn(3, 50, 3, generator=g), torch.randn(3, 50, 4, generator=g)
+    quats[1, 3] = 0  # no rotation: not drawn by that camera
+    gaussians = (means, quats, scene.scales, scene.opacities, colors)
+    behind = torch.rand(3, 3, generator=g)
+    options = Settings(sh_degree=degree)
+    views = (scene.viewmats, scene.Ks)
+    out = gsplat_backend.rasterize(by_the_book, gaussians, *views, (scene.width, scene.height), behind, options)
+    true = render(*gaussians, *views, scene.width, scene.height, backgrounds=behind, backend="torch", sh_degree=degree)
+    for name in ("colors", "alphas", "depths", "radii"):
+        torch.testing.assert_close(getattr(out, name), getattr(true, name))
+    torch.testing.assert_close(out.means2d[:, 0], true.means2d)
+
+
 def test_gsplat_without_cuda_says_what_to_do():
     if torch.cuda.is_available():
         pytest.skip("there is a CUDA device")
@@ -161,3 +196,22 @@ def test_images_and_gradients_on_a_gpu(mode):
         assert float((got - true).abs().flatten().quantile(0.999)) < 1e-4
     for name, true in true_gradients.items():
         assert relative(gradients[name], true) < 1e-2, name
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_cameras_that_look_at_other_moments_on_a_gpu():
+    """One call with means and quats per camera, and the gradient of the 2-D means that densification reads."""
+    scene, g = random_scene(n=2000, width=128, height=96, cameras=3, seed=64), torch.Generator().manual_seed(2)
+    means, quats = scene.means + 0.1 * torch.randn(3, 2000, 3, generator=g), torch.randn(3, 2000, 4, generator=g)
+    scene = replace(scene, means=means, quats=quats)
+    truth, true_gradients = run(scene, "torch", torch.float64)
+    outputs, gradients = run(scene, "gsplat")
+    for got, true in zip(outputs, truth, strict=True):
+        assert float((got - true).abs().flatten().quantile(0.999)) < 1e-4
+    for name, true in true_gradients.items():
+        assert relative(gradients[name], true) < 1e-2, name
+    there = {n: t.cuda() for n, t in scene.leaves().items()}
+    there["means"].requires_grad_()
+    out = render(*(there[n] for n in LEAVES[:6]), scene.Ks.cuda(), scene.width, scene.height)
+    (pull,) = torch.autograd.grad(out.colors.square().sum(), out.means2d)
+    assert pull.reshape(out.radii.shape)[(out.radii > 0).all(-1)].abs().max() > 0

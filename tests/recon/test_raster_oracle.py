@@ -173,3 +173,48 @@ def test_accuracy_at_the_sizes_of_the_benchmark(size, mode):
     assert flips <= 20 and float(difference.max()) <= 5e-3
     if flips == 0:
         assert max(worst.values()) <= 5e-6
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("harmonics", [False, True], ids=["colours", "harmonics"])
+def test_cameras_that_look_at_other_moments(backend, harmonics):
+    """One call with means and quats per camera is one call per camera: images, gradients, and what is no number."""
+    scene, g = random_scene(n=120, cameras=3, seed=23), torch.Generator().manual_seed(2)
+    if harmonics:
+        colors = 0.5 * torch.randn(120, 4, 3, generator=g)
+        scene = replace(scene, colors=colors, settings={"sh_degree": 1})
+    moved = scene.means + 0.2 * torch.randn(3, 120, 3, generator=g)
+    moved[1, 7, 2] = torch.nan  # in one camera: drawn in none
+    turned = torch.randn(3, 120, 4, generator=g)
+    weights = torch.rand(3, scene.height, scene.width, 5, generator=g)
+    seen = moved.clone()
+    seen[:, 7] = torch.nan
+    found = []
+    for at_once in (True, False):
+        start = {"means": moved if at_once else seen, "quats": turned}
+        leaves = {n: t.clone().requires_grad_() for n, t in {**scene.leaves(), **start}.items()}
+        if at_once:
+            out = scene.render(backend, **leaves)
+            images = torch.cat([out.colors, out.alphas, out.depths], -1)
+            assert out.means2d.shape == (3, 120, 2) and not (out.radii[:, 7] > 0).any()
+        else:
+            each = [
+                replace(scene, Ks=scene.Ks[c : c + 1]).render(
+                    backend, **{n: t[c] if n in start else t for n, t in leaves.items() if n != "viewmats"},
+                    viewmats=leaves["viewmats"][c : c + 1],
+                )
+                for c in range(3)
+            ]  # fmt: skip
+            images = torch.cat([torch.cat([o.colors, o.alphas, o.depths], -1) for o in each])
+        gradients = torch.autograd.grad((images * weights).sum(), list(leaves.values()))
+        found.append([images.detach(), *(x.nan_to_num() for x in gradients)])
+    for a, b in zip(*found, strict=True):
+        assert float((a - b).abs().max()) <= 2e-6 * float(b.abs().max())
+
+
+def test_one_moment_more_than_cameras_is_refused():
+    scene = random_scene(n=9, cameras=2, seed=24)
+    with pytest.raises(ValueError, match=r"means: expected \[N,3\] or \[2,N,3\]"):
+        replace(scene, means=scene.means.expand(3, 9, 3)).render("torch")
+    with pytest.raises(ValueError, match=r"quats: expected \[2,9,4\]"):
+        replace(scene, means=scene.means.expand(2, 9, 3)).render("torch")

@@ -16,6 +16,7 @@ from types import SimpleNamespace
 import av
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from otsync.cli import main as otsync
@@ -131,6 +132,9 @@ def test_eval_repeats_the_figures_of_the_run(world, result, tmp_path, capsys):
         (["fit", "WORLD", "--offsets", "WORLD/start.json", "--budget", "0"], "--budget: expected seconds above 0"),
         (["fit", "WORLD", "--offsets", "WORLD/start.json", "--steps", "-1"], "--steps: expected 0 or more"),
         (["fit", "WORLD", "--offsets", "nowhere.json"], "no such file"),
+        (["fit", "WORLD", "--offsets", "WORLD/start.json", "--device", "gpu"], "device: expected 'cpu', 'cuda'"),
+        (["fit", "WORLD", "--offsets", "WORLD/start.json", "--device", "cuda:99"], "device: expected one that is there"),
+        (["bench", "WORLD", "--truth", "WORLD/truth.json", "--device", "cuda:99"], "device: expected one that is there"),
         (["fit", "nowhere", "--offsets", "WORLD/start.json"], "nowhere"),
         (["fit", "WORLD", "--offsets", "WORLD/start.json", "--steps", "3", "--budget", "4"], "expected one of them"),
         (["fit", "WORLD", "--offsets", "WORLD/start.json", "--frames", "50", "60"], "expected first < stop"),
@@ -287,7 +291,7 @@ def test_options_of_parts_are_told_apart_by_the_part(capsys):
     with pytest.raises(SystemExit):
         main(["fit", "--help"])
     told = capsys.readouterr().out
-    assert "--scaffold.reach" in told and "--seeding.reach" in told and "--held-out" in told
+    assert "--scaffold.reach" in told and "--voxel" in told and "--held-out" in told
 
 
 def test_bench_writes_a_row_for_every_configuration(world, tmp_path, monkeypatch, capsys):
@@ -319,6 +323,16 @@ def test_bench_writes_a_row_for_every_configuration(world, tmp_path, monkeypatch
     assert json.loads((tmp_path / "recon.json").read_text())["rows"] == again
     assert main([*args[:-4], "theirs", "--out", str(tmp_path)]) == 2
     assert "rows: expected some of ours" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_a_row_measured_on_a_gpu_tells_its_memory(world, tmp_path):
+    pytest.importorskip("gsplat", reason="gsplat is not installed: pip install 'otsync[cuda]'")
+    args = ["bench", str(world), "--truth", str(world / "truth.json"), "--held-out", "held0", "--width", str(SIZE[0]),
+            "--steps", "40", "--backdrop-steps", "5", "--rows", "ours", "--device", "cuda", "--batch", "8"]  # fmt: skip
+    assert main([*args, "--out", str(tmp_path)]) == 0
+    (row,) = json.loads((tmp_path / "recon.json").read_text())["rows"]
+    assert 0 < row["gpu_gb"] < 20 and row["mean"] < row["start"] + 0.1 and row["psnr"] > 15
 
 
 def command(world: Path, out: Path) -> list[str]:
@@ -422,6 +436,7 @@ def test_run_says_what_it_cannot_do(world, tmp_path, capsys):
         (["--held-out", "nobody"], "expected some of cam0"),
         (["--held-out", "held0", "--reference", "held0"], "--reference: expected one of cam0, cam1, cam2"),
         (["--budget", "9"], "expected one of them"),
+        (["--device", "cuda:99"], "device: expected one that is there"),
         (["--frames", "5", "5"], "expected first < stop"),
         (["--recording.route", "stereo", "--held-out", "held0"], "3 videos are fewer than the 5"),
     ):
