@@ -24,6 +24,7 @@ from otsync.bench.record import table, write_rows
 from otsync.files import atomic_write
 from otsync.io import Scene
 from otsync.types import Offsets, TrackSet
+from recon.backdrop import StaticFit
 from recon.bench_rows import find, measured_before, paper_tables
 from recon.configurations import CONFIGURATIONS, Configuration
 from recon.device import device_of
@@ -54,8 +55,8 @@ class Protocol:
 
     Args:
         frames: first and last (exclusive) frame of the window.
-        cameras: that train; None: all that are not held out. Depth, and with it the tracks' positions, is always
-            measured with all of them: few cameras are few images, not another front-end.
+        cameras: that train; None: all that are not held out. Depth, and with it the tracks' positions, and the static
+            part always come from all of them: few cameras are few images of what moves, nothing else.
         amplitudes: frames; errors are drawn uniformly within them, one seed after another.
         seeds: of the draws. steps: of the fit, of ``batch`` images each; budget: wall seconds instead.
         width: working pixels. voxel: footprints between Gaussians at the start, see :class:`recon.seed.Seeding`.
@@ -85,6 +86,7 @@ class Material:
     Args:
         scene: training and held-out videos; the training ones with depth. tracks: that scaffolds are built from.
         kept: tracks that none is. truth: offsets of every video.
+        backdrop: the static part, where cameras that do not train have a share in it.
     """
 
     scene: Scene
@@ -92,6 +94,7 @@ class Material:
     kept: tuple[TrackSet, ...]
     truth: Offsets
     held_out: tuple[str, ...]
+    backdrop: StaticFit | None = None
 
     @property
     def train(self) -> tuple[str, ...]:
@@ -114,23 +117,31 @@ def material_of(
     """Depth of every frame and tracks of every training video, from the synchronised recording; kept in ``cache``."""
     from otsync.depth_maps import depth_maps
     from otsync.io.mend import cut
-    from recon.initial import lifted_tracks
+    from recon.initial import backdrop_of_scene, lifted_tracks, read_footage
     from recon.intake import only
 
     if protocol.frames is not None:
         scene = cut(scene, *protocol.frames)
     rig = scene.take([n for n in scene.names if n not in protocol.held_out])
-    chosen = protocol.cameras or rig.names
     known = only(truth, rig.names)
     with progress.stage("tracks"):
-        tracks = [t for t in lifted_tracks(rig, known, cache, map, progress) if t.name in chosen]
-    train = rig.take(chosen)
-    if any(v.depth is None for v in train.videos):
+        tracks = lifted_tracks(rig, known, cache, map, progress)
+    if any(v.depth is None for v in rig.videos):
         with progress.stage("depth"):
-            every = [range(len(v.frames)) if v.name in chosen else [] for v in rig.videos]
+            every = [range(len(v.frames)) for v in rig.videos]
             maps = depth_maps(rig, known, every, width=protocol.width, cache=cache, map=map)
-            depth = dict(zip(rig.names, maps, strict=True))
-            train = replace(train, videos=tuple(replace(v, depth=list(depth[v.name])) for v in train.videos))
+            rig = replace(rig, videos=tuple(replace(v, depth=list(z)) for v, z in zip(rig.videos, maps, strict=True)))
+    train, backdrop = rig, None
+    if protocol.cameras is not None:
+        train = rig.take(protocol.cameras)
+        with progress.stage("backdrop"):
+            plan = Plan(width=protocol.width, backdrop_steps=protocol.backdrop_steps, device=protocol.device)
+            footage = read_footage(rig, protocol.width, cache, map, progress)
+            backdrop = backdrop_of_scene(rig, tracks, footage, plan, cache, progress)
+            if backdrop is not None:
+                own = [rig.names.index(n) for n in train.names]
+                backdrop = replace(backdrop, gains=backdrop.gains[own], psnr=backdrop.psnr[own])
+        tracks = tuple(t for t in tracks if t.name in train.names)
     held = scene.take(protocol.held_out) if protocol.held_out else None
     if held is not None:
         train = replace(train, videos=(*train.videos, *held.videos), masks=(*train.masks, *held.masks), labels=())
@@ -139,7 +150,7 @@ def material_of(
     return Material(
         train, tuple(t.take(np.flatnonzero(~o)) for t, o in zip(tracks, out, strict=True)),
         tuple(t.take(np.flatnonzero(o)) for t, o in zip(tracks, out, strict=True)),
-        only(truth, train.names), protocol.held_out,
+        only(truth, train.names), protocol.held_out, backdrop,
     )  # fmt: skip
 
 
@@ -157,8 +168,9 @@ def measure(
         device=protocol.device,
     )  # fmt: skip
     ready = prepare(
-        material.scene, built_from, material.tracks, plan=plan, held_out=material.held_out, cache=cache, map=map
-    )
+        material.scene, built_from, material.tracks, plan=plan, held_out=material.held_out, backdrop=material.backdrop,
+        cache=cache, map=map,
+    )  # fmt: skip
     device = device_of(protocol.device)
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)

@@ -16,7 +16,7 @@ from otsync.io import Scene
 from otsync.io.mend import cut
 from otsync.shutter import at_frame_times
 from otsync.types import Offsets, TrackSet
-from recon.backdrop import with_backdrop
+from recon.backdrop import StaticFit, with_backdrop
 from recon.footage import Footage
 from recon.gaussians4d import Gaussians4D
 from recon.held_out import Clock
@@ -61,6 +61,7 @@ def prepare(
     *,
     plan: Plan | None = None,
     held_out: Sequence[str] = (),
+    backdrop: StaticFit | None = None,
     cache: Any = None,
     map: MapLike = map,
     progress: Progress | None = None,
@@ -72,6 +73,7 @@ def prepare(
         tracks: in space, one set a video; those of other than training videos are left out, with a note. Default:
             tracked and lifted here.
         held_out: names of videos that nothing here sees but their own footage.
+        backdrop: the static part, its gains those of the training videos; default: fitted here.
         cache: an :class:`otsync.priors.cache.Cache`. map: any map-like callable; two threads use two cores.
     """
     from otsync.priors.cache import Cache
@@ -93,7 +95,7 @@ def prepare(
     if not any((f.boxes[:, 2] > f.boxes[:, 0]).any() for f in footage):
         raise ValueError("scene: expected something that moves; the masks are empty in every frame of every video.")
     with progress.stage("backdrop"):
-        static = backdrop_of_scene(train, tracks, footage, plan, cache, progress)
+        static = backdrop or backdrop_of_scene(train, tracks, footage, plan, cache, progress)
     with progress.stage("initial scene"):
         initial = initial_scene(train, offsets, tuple(tracks), footage, static, plan, cache, map, progress)
     gains = np.ones((len(footage), 3)) if static is None else static.gains

@@ -425,6 +425,18 @@ result.offsets.save({out!r})
 
 
 @pytest.mark.slow
+def test_the_process_that_compiles_the_kernels_gives_the_same_bits_as_those_that_load_them(tmp_path):
+    code = KILLED.format(tests=str(ROOT), path=str(tmp_path / "fit.npz"), out=str(tmp_path / "{name}.json"))
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": str(tmp_path / "compiled")}
+    for name in ("compiled", "loaded"):
+        (tmp_path / "fit.npz").unlink(missing_ok=True)
+        subprocess.run(
+            [sys.executable, "-c", code.replace("{name}", name)], cwd=ROOT, env=environment, check=True, timeout=600
+        )
+    assert (tmp_path / "compiled.json").read_bytes() == (tmp_path / "loaded.json").read_bytes()
+
+
+@pytest.mark.slow
 def test_sigkill_at_random_moments_changes_nothing(tmp_path):
     def start(name):
         code = KILLED.format(tests=str(ROOT), path=str(tmp_path / f"{name}.npz"), out=str(tmp_path / f"{name}.json"))
