@@ -25,7 +25,9 @@ def main() -> None:
     parser.add_argument("--rows", nargs="+", default=["ours", "fixed", "w/o spline", "w/o scaffold"],
                         choices=list(CONFIGURATIONS))  # fmt: skip
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--steps", type=int, default=700)
+    parser.add_argument(
+        "--steps", type=int, nargs="+", default=[700], help="several: what accuracy costs, in recon.svg"
+    )
     parser.add_argument("--out", type=Path, default=Path("ablations"))
     args = parser.parse_args()
 
@@ -37,7 +39,7 @@ def main() -> None:
         protocol = Protocol(
             held_out=held_out,
             seeds=(args.seed,),
-            steps=args.steps,
+            steps=tuple(args.steps),
             width=capture.footage[0].size[0],
             backdrop_steps=800,
         )

@@ -25,7 +25,8 @@ from otsync.files import atomic_write
 from otsync.io import Scene
 from otsync.types import Offsets, TrackSet
 from recon.backdrop import StaticFit
-from recon.bench_rows import find, measured_before, paper_tables
+from recon.bench_plot import plot
+from recon.bench_rows import KEY, find, measured_before, paper_tables
 from recon.configurations import CONFIGURATIONS, Configuration
 from recon.device import device_of
 from recon.effects import Gain, with_declared
@@ -39,8 +40,9 @@ from recon.prepare import Prepared, prepare
 from recon.seed import Seeding
 
 Row = dict[str, Any]
-FIGURES = 2
-"""Version of what the figures mean: rows of another one are not continued. 2: tracks at their videos' own times."""
+FIGURES = 3
+"""Version of what the figures mean: rows of another one are not continued. 2: tracks at their videos' own times. 3: rows of
+several lengths."""
 
 REACH = 5.0  # footprints within which a held-out track must have a Gaussian, to be followed
 PUBLISHED = (
@@ -58,8 +60,10 @@ class Protocol:
         cameras: that train; None: all that are not held out. Depth, and with it the tracks' positions, and the static
             part always come from all of them: few cameras are few images of what moves, nothing else.
         amplitudes: frames; errors are drawn uniformly within them, one seed after another.
-        seeds: of the draws. steps: of the fit, of ``batch`` images each; budget: wall seconds instead.
-        width: working pixels. voxel: footprints between Gaussians at the start, see :class:`recon.seed.Seeding`.
+        seeds: of the draws.
+        steps: of the fit, of ``batch`` images each; several give every row several times: what accuracy costs.
+        budget: wall seconds instead.
+        width: working pixels. voxel, sh_degree: see :class:`recon.seed.Seeding`.
         held_out_tracks: share of the tracks that no scaffold sees.
         device: where the fits run, "cpu" or "cuda"; on a GPU rows tell the most memory that the fit held there.
     """
@@ -69,14 +73,20 @@ class Protocol:
     held_out: tuple[str, ...] = ()
     amplitudes: tuple[float, ...] = (1.0,)
     seeds: tuple[int, ...] = (0,)
-    steps: int | None = 2500
+    steps: tuple[int, ...] = (2500,)
     budget: float | None = None
     batch: int = 2
     width: int = 320
     voxel: float = 2.7
+    sh_degree: int = 0
     held_out_tracks: float = 0.1
     backdrop_steps: int = 1500
     device: str = "cpu"
+
+    @property
+    def lengths(self) -> tuple[int, ...]:
+        """Steps of the fits; 0: as many as the budget allows."""
+        return (0,) if self.budget is not None else self.steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,16 +165,16 @@ def material_of(
 
 
 def measure(
-    name: str, configuration: Configuration, material: Material, protocol: Protocol, amplitude: float, seed: int,
+    name: str, configuration: Configuration, material: Material, protocol: Protocol, amplitude: float, seed: int, steps: int,
     cache: Any, map: Callable[..., Any], lpips: Lpips | None = None,
 ) -> Row:  # fmt: skip
-    """One row: build from the believed offsets, fit, and hold against the truth."""
+    """One row: build from the believed offsets, fit (``steps`` as of Protocol.lengths), and hold against the truth."""
     believed = material.believed(amplitude, seed)
     built_from = believed if configuration.start == "given" else material.truth
     margin = max(configuration.scaffold.margin, (amplitude + 1) / float(believed.fps[believed.reference]))
     plan = Plan(
         width=protocol.width, scaffold=replace(configuration.scaffold, margin=margin), losses=configuration.losses,
-        seeding=Seeding(voxel=protocol.voxel), batch=protocol.batch, backdrop_steps=protocol.backdrop_steps,
+        seeding=Seeding(voxel=protocol.voxel, sh_degree=protocol.sh_degree), batch=protocol.batch, backdrop_steps=protocol.backdrop_steps,
         device=protocol.device,
     )  # fmt: skip
     ready = prepare(
@@ -178,8 +188,7 @@ def measure(
     found = fit(
         configuration.motion(ready.initial).to(device), ready.footage, ready.offsets, losses=plan.losses,
         effects=(*with_declared((), [f.readout for f in ready.footage]), Gain(start=ready.gains)),
-        rates=configuration.rates, steps=protocol.steps if protocol.budget is None else None,
-        budget=protocol.budget, batch=protocol.batch,
+        rates=configuration.rates, steps=None if protocol.budget is not None else steps, budget=protocol.budget, batch=protocol.batch,
     )  # fmt: skip
     seconds, cpu = time.perf_counter() - began[0], time.process_time() - began[1]
     step, at = found.scene.frame_step, [material.truth.names.index(n) for n in found.offsets.names]
@@ -188,7 +197,7 @@ def measure(
     error = offset_error(found.offsets.seconds, true, step, reference=reference)
     free = offset_error(found.offsets.seconds, true, step, gauge="median")
     row: Row = {
-        "configuration": name, "amplitude": amplitude, "seed": seed, "start": start.mean, "mean": error.mean,
+        "configuration": name, "amplitude": amplitude, "seed": seed, "steps": steps, "start": start.mean, "mean": error.mean,
         "max": error.max, "gauge_free": free.mean, "sigma": float(np.nanmedian(found.offsets.sigma) / step),
         **held_out_figures(found.scene, ready, lpips), **motion_figures(found.scene, ready, material.kept),
         "images": found.stats["images"], "seconds": seconds, "cpu_seconds": cpu, "gaussians": len(found.scene),
@@ -257,8 +266,8 @@ def run(
 ) -> list[Row]:  # fmt: skip
     """Measure the named configurations; write ``recon.csv`` and ``recon.json`` to ``out`` row by row.
 
-    Rows that an earlier run into ``out`` has measured by the same protocol are kept. At the end ``recon.md`` holds all
-    in the paper's layout. Returns all rows of the file.
+    Rows that an earlier run into ``out`` has measured by the same protocol are kept. At the end ``recon.md`` holds the
+    longest fits in the paper's layout, and ``recon.svg`` shows what accuracy costs in time. Returns all rows of the file.
 
     Args:
         name: of the recording in the tables; one of the paper's scenes stands beside its figures.
@@ -274,8 +283,9 @@ def run(
     description = about(protocol, scene, truth)
     found = measured_before(out, description)
     wanted = [
-        (row, amplitude, seed) for amplitude in protocol.amplitudes for seed in protocol.seeds for row in rows
-        if find(found, row, amplitude, seed, lpips.network is not None) is None
+        (row, amplitude, seed, steps)
+        for amplitude in protocol.amplitudes for seed in protocol.seeds for row in rows for steps in protocol.lengths
+        if find(found, (row, amplitude, seed, steps), lpips.network is not None) is None
     ]  # fmt: skip
     if found:
         tell(f"{len(found)} rows are kept from an earlier run; {len(wanted)} are to be measured")
@@ -284,11 +294,12 @@ def run(
             material = material_of(scene, truth, protocol, kept, pool.map, progress)
             for which in wanted:
                 row = measure(which[0], CONFIGURATIONS[which[0]], material, protocol, *which[1:], kept, pool.map, lpips)
-                found = [r for r in found if (r["configuration"], r["amplitude"], r["seed"]) != which] + [row]
+                found = [r for r in found if tuple(r[k] for k in KEY) != which] + [row]
                 tell(table([row]))
                 write_rows(out, "recon", found, description)
     with atomic_write(out / "recon.md", "w") as stream:
         stream.write(paper_tables(found, name, lpips.reason, "markdown") + "\n")
+    plot(found, out / "recon.svg")
     tell(f"{table(found)}\n{PUBLISHED}")
     return found
 

@@ -13,7 +13,7 @@ from recon.paper_table import Style, ablation_table, offset_table, view_table
 
 Row = dict[str, Any]
 
-KEY = ("configuration", "amplitude", "seed")
+KEY = ("configuration", "amplitude", "seed", "steps")
 """What tells the rows of one protocol apart."""
 
 SETTINGS = {"true time": "true time", "ours": "unsynchronised"}
@@ -48,9 +48,9 @@ def measured_before(out: Path, about: Mapping[str, Any]) -> list[Row]:
 
 
 def _fixed(key: str, value: Any) -> Any:
-    """What must agree: of a protocol all but the errors that are put in, since every row names its own."""
+    """What must agree: of a protocol all but the errors put in and the lengths, since every row names its own."""
     if key == "protocol" and isinstance(value, dict):
-        return {k: v for k, v in value.items() if k not in ("amplitudes", "seeds")}
+        return {k: v for k, v in value.items() if k not in ("amplitudes", "seeds", "steps")}
     return value
 
 
@@ -61,16 +61,16 @@ def _apart(was: Any, wanted: Any) -> str:
     return f"{was!r}, now {wanted!r}"
 
 
-def find(rows: Sequence[Row], name: str, amplitude: float, seed: int, lpips: bool) -> Row | None:
-    """The row measured for these; not one without LPIPS where there is a network for it now."""
+def find(rows: Sequence[Row], which: tuple[str, float, int, int], lpips: bool) -> Row | None:
+    """The row of this KEY; not one without LPIPS where there is a network for it now."""
     for row in rows:
-        if tuple(row[k] for k in KEY) == (name, amplitude, seed) and not (lpips and row.get("lpips") is None):
+        if tuple(row[k] for k in KEY) == which and not (lpips and row.get("lpips") is None):
             return row
     return None
 
 
 def paper_tables(rows: Sequence[Row], scene: str, lpips_reason: str = "", style: Style = "text") -> str:
-    """Novel views, offsets and ablations in the paper's layout: the mean over seeds, tables for every amplitude.
+    """Novel views, offsets and ablations in the paper's layout: longest fits, mean over seeds, tables per amplitude.
 
     Args:
         scene: name of the recording; one of the paper's stands beside its figures.
@@ -78,7 +78,7 @@ def paper_tables(rows: Sequence[Row], scene: str, lpips_reason: str = "", style:
     """
     parts = []
     for amplitude in dict.fromkeys(r["amplitude"] for r in rows):
-        chosen = [r for r in rows if r["amplitude"] == amplitude]
+        chosen = longest([r for r in rows if r["amplitude"] == amplitude])
         means = {name: _mean([r for r in chosen if r["configuration"] == name]) for name in _names(chosen)}
         parts.append(f"errors of up to {amplitude:g} frames, {len({r['seed'] for r in chosen})} seeds, {scene}")
         views = [{**means[n], "scene": scene, "setting": s} for n, s in SETTINGS.items() if n in means]
@@ -92,6 +92,12 @@ def paper_tables(rows: Sequence[Row], scene: str, lpips_reason: str = "", style:
             parts.append(ablation_table([_variant(ABLATIONS.get(n, n), m) for n, m in means.items()], style))
             parts.append("The paper's ablations are of tennis.")
     return "\n\n".join(parts)
+
+
+def longest(rows: Sequence[Row]) -> list[Row]:
+    """Of every configuration the rows of its longest fits."""
+    most = {name: max(r["steps"] for r in rows if r["configuration"] == name) for name in _names(rows)}
+    return [r for r in rows if r["steps"] == most[r["configuration"]]]
 
 
 def _names(rows: Sequence[Row]) -> list[str]:

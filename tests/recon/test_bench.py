@@ -12,6 +12,7 @@ import torch
 
 from otsync.types import TrackSet
 from recon import bench
+from recon.bench_plot import curve, held, plot
 from recon.bench_rows import find, measured_before, paper_tables
 from recon.capture import clocks
 from recon.gaussians4d import Gaussians4D
@@ -84,7 +85,7 @@ def test_held_out_views_are_drawn_as_the_fit_drew_them(truth, monkeypatch, layer
 
 
 def row(name: str, amplitude: float = 1.0, seed: int = 0, **figures: float | None) -> dict:
-    base = {"start": 0.5, "mean": 0.1, "max": 0.2, "psnr": 25.0, "ssim": 0.9, "lpips": None, "mask_psnr": 20.0,
+    base = {"steps": 2500, "cpu_seconds": 100.0, "start": 0.5, "mean": 0.1, "max": 0.2, "psnr": 25.0, "ssim": 0.9, "lpips": None, "mask_psnr": 20.0,
             "mask_ssim": 0.8, "neighbour_change": 0.3, "follow_20": 2.0}  # fmt: skip
     return {"configuration": name, "amplitude": amplitude, "seed": seed, **base, **figures}
 
@@ -117,10 +118,11 @@ def test_rows_of_the_cpu_go_on_and_those_of_a_gpu_stand_apart():
 
 def test_a_row_without_lpips_is_measured_again_once_there_are_weights():
     rows = [row("ours"), row("fixed", lpips=0.1)]
-    assert find(rows, "ours", 1.0, 0, lpips=False) is rows[0]
-    assert find(rows, "ours", 1.0, 0, lpips=True) is None
-    assert find(rows, "fixed", 1.0, 0, lpips=True) is rows[1]
-    assert find(rows, "ours", 1.0, 1, lpips=False) is None
+    assert find(rows, ("ours", 1.0, 0, 2500), lpips=False) is rows[0]
+    assert find(rows, ("ours", 1.0, 0, 2500), lpips=True) is None
+    assert find(rows, ("fixed", 1.0, 0, 2500), lpips=True) is rows[1]
+    assert find(rows, ("ours", 1.0, 1, 2500), lpips=False) is None
+    assert find(rows, ("ours", 1.0, 0, 300), lpips=False) is None
 
 
 def test_tables_in_the_papers_layout_average_seeds_and_say_why_lpips_lacks():
@@ -135,3 +137,27 @@ def test_tables_in_the_papers_layout_average_seeds_and_say_why_lpips_lacks():
     assert offsets[-4:] == ["0.500", "–", "0.100", "0.700"]
     assert "w/o spline" in small and "2 seeds" in small and "27.50" not in large and "w/o spline" not in large
     assert paper_tables([row("ours", lpips=0.123)], "kitchen").count("0.123") == 1
+
+
+def test_the_plot_has_a_line_a_configuration_and_a_point_a_length(tmp_path):
+    rows = [row("ours", steps=n, cpu_seconds=n / 25, mean=30 / n, seed=s) for n in (300, 1000, 3000) for s in (0, 1)]
+    rows += [row("fixed", mean=0.5), row("true time", mask_psnr=None, mean=0.0, start=0.0), row("ours", amplitude=9.0)]
+    np.testing.assert_allclose(curve(rows[:6], "mean"), [[12, 0.1], [40, 0.03], [120, 0.01]])
+    assert curve([rows[7]], "mask_psnr").shape == (0, 2)
+    assert held(rows[6]) and held(rows[7]) and not held(rows[0])
+    plot(rows, tmp_path / "recon.svg")
+    drawn = (tmp_path / "recon.svg").read_text()
+    assert all(name in drawn for name in ("ours", "fixed", "true time", "errors of up to 1 frames"))
+    again = tmp_path / "again.svg"
+    plot(rows, again)
+    assert again.read_text() == drawn
+
+
+def test_tables_hold_the_longest_fits():
+    rows = [
+        row("ours", steps=300, psnr=11.11),
+        row("ours", steps=900, psnr=22.22),
+        row("w/o spline", psnr=33.33, steps=300),
+    ]
+    told = paper_tables(rows, "tennis")
+    assert "22.22" in told and "33.33" in told and "11.11" not in told

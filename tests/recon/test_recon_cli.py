@@ -301,6 +301,7 @@ def test_bench_writes_a_row_for_every_configuration(world, tmp_path, monkeypatch
     rows = json.loads((tmp_path / "recon.json").read_text())["rows"]
     assert [r["configuration"] for r in rows] == ["ours", "true time"]
     assert rows[1]["start"] == 0 < rows[0]["start"] < 1
+    assert [r["steps"] for r in rows] == [4, 4] and "<svg" in (tmp_path / "recon.svg").read_text()
     told = capsys.readouterr()
     assert "ours" in told.err
     # the paper's layout, with a column that says what is missing
@@ -318,8 +319,8 @@ def test_bench_writes_a_row_for_every_configuration(world, tmp_path, monkeypatch
     assert again[:2] == rows and [r["configuration"] for r in again] == ["ours", "true time", "fixed"]
     assert "2 rows are kept from an earlier run; 1 are to be measured" in capsys.readouterr().err
     # another protocol is neither mixed with them nor written over them
-    assert main([*args, "--steps", "5"]) == 2
-    assert "protocol differs: steps 4, now 5" in capsys.readouterr().err
+    assert main([*args, "--batch", "3"]) == 2
+    assert "protocol differs: batch 2, now 3" in capsys.readouterr().err
     assert json.loads((tmp_path / "recon.json").read_text())["rows"] == again
     assert main([*args[:-4], "theirs", "--out", str(tmp_path)]) == 2
     assert "rows: expected some of ours" in capsys.readouterr().err
