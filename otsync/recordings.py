@@ -41,6 +41,7 @@ from .priors.cache import Cache, digest_of
 from .priors.stereo import HullStereo, Rig
 from .refine import Refiner, SplineRefine
 from .scan import LikelihoodScan
+from .shutter import check_within_a_frame
 from .sync import MapLike, synchronize
 from .tracks import Selection, Tracking, pixel_tracks, track_labels
 from .types import Offsets, Status, TrackSet, Video
@@ -112,6 +113,8 @@ def synchronize_scene(
         map: any map-like callable; two threads use two cores.
         tell: receives one line per stage.
     """
+    for video in scene.videos:
+        check_within_a_frame(video.camera.readout, video.times, f"camera.readout of {video.name!r}")
     stages, cache = with_labels(stages or Stages(), scene), cache or Cache()
     chosen, why = choose_route(scene, route, stages)
     for line in why:

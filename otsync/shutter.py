@@ -50,12 +50,7 @@ def at_frame_times(tracks: TrackSet) -> TrackSet:
     done = replace(camera, readout=None)
     if tracks.n_frames < 2:
         return replace(tracks, camera=done)
-    frame = float(np.median(np.diff(tracks.times)))
-    if camera.readout > LONGEST * frame:
-        raise ValueError(
-            f"camera.readout of {tracks.name or 'the tracks'!r}: expected seconds, no longer than a frame "
-            f"({frame:.4g} s); found {camera.readout:g}. Give seconds, not milliseconds, or leave it out."
-        )
+    check_within_a_frame(camera.readout, tracks.times, f"camera.readout of {tracks.name or 'the tracks'!r}")
     shift = _Shift(tracks.times, camera.readout * rows(tracks, camera), tracks.seen)
     uv = None if tracks.uv is None else shift(tracks.uv)
     xyz = None
@@ -65,6 +60,16 @@ def at_frame_times(tracks: TrackSet) -> TrackSet:
         moved = camera.to_world(shift(camera.to_camera(tracks.positions())))
         xyz = np.where(tracks.seen[..., None], moved, tracks.xyz).astype(tracks.xyz.dtype, copy=False)
     return replace(tracks, uv=uv, xyz=xyz, camera=done)
+
+
+def check_within_a_frame(seconds: float | None, times: Float[np.ndarray, " T"], what: str) -> None:
+    """ValueError, which begins with ``what``, for a readout or an exposure that is longer than a frame."""
+    frame = float(np.median(np.diff(times))) if len(times) > 1 else np.inf
+    if seconds is not None and not seconds <= LONGEST * frame:
+        raise ValueError(
+            f"{what}: expected seconds, no longer than a frame ({frame:.4g} s); found {seconds:g}. Give seconds, not "
+            "milliseconds, or leave it out."
+        )
 
 
 def rows(tracks: TrackSet, camera: Camera) -> Float[np.ndarray, "N T"]:

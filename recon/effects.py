@@ -33,7 +33,9 @@ class Shot:
         t: world seconds, a float64 scalar; renderings are differentiable in it.
         box: (x0, y0, x1, y1) of the wanted crop, pixels of the working image; x1 and y1 are exclusive.
         height: rows of the whole working image, which a rolling shutter reads from the first to the last.
-        frame: index of the frame, whose pose a moving camera has.
+        frame: index of the frame. later: seconds of the camera's own clock that the instant comes after the frame's; a
+            camera that moves looks from where it is then.
+        rate: world seconds per second of the camera's own clock.
     """
 
     video: int
@@ -41,6 +43,12 @@ class Shot:
     box: tuple[int, int, int, int]
     height: int
     frame: int = 0
+    later: float = 0.0
+    rate: Tensor | float = 1.0
+
+    def after(self, seconds: float) -> Shot:
+        """The same a little later (or earlier, below 0) by the camera's own clock."""
+        return replace(self, t=self.t + self.rate * seconds, later=self.later + seconds)
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,6 +129,11 @@ def optics(effects: Sequence[Effect], readout: float | None, video: int | None =
     return with_declared(own, [readout])
 
 
+def common_exposure(effects: Sequence[Effect]) -> float:
+    """Seconds that all shutters were open, as far as ``effects`` tell; 0: sharp, or each its own."""
+    return next((e.exposure for e in effects if isinstance(e, MotionBlur) and not isinstance(e.exposure, tuple)), 0.0)
+
+
 def prior(effects: Sequence[Effect], params: Params) -> Tensor | None:
     """Sum of the effects' priors; None when no effect has one."""
     terms = [term for effect in effects if (term := effect.prior(params)) is not None]
@@ -183,7 +196,7 @@ class MotionBlur:
     """A shutter that is open for a while: the mean over ``samples`` instants spread evenly over the exposure.
 
     Args:
-        exposure: seconds, one for all videos or one per video; 0: no blur, the same bits.
+        exposure: seconds of the own clock, one for all videos or one per video; 0: no blur, the same bits.
         samples: instants per frame; each one is a rendering. They lie in the middles of equal parts of the exposure
             (midpoint rule), symmetrically about the frame's time.
     """
@@ -218,7 +231,7 @@ class MotionBlur:
             if exposure == 0:
                 return observe(shot)
             moments = [((i + 0.5) / self.samples - 0.5) * exposure for i in range(self.samples)]
-            return _mean([observe(replace(shot, t=shot.t + moment)) for moment in moments])
+            return _mean([observe(shot.after(moment)) for moment in moments])
 
         return blurred
 
@@ -228,7 +241,7 @@ class RollingShutter:
     """Rows are read one after the other: row r is seen at ``t + readout * ((r + 1/2) / height - 1/2)``.
 
     Args:
-        readout: seconds from the first to the last row (``Camera.readout``), one for all videos or one per video; 0: all
+        readout: seconds of the own clock from the first to the last row (``Camera.readout``), one for all videos or one per video; 0: all
             rows at once, the same bits.
         bands: equal bands of rows that share the time of their middle; each one is a rendering of its rows only. They
             divide the whole image, so that a crop shows what the image would. A row is at most
@@ -272,7 +285,7 @@ class RollingShutter:
                     continue
                 later = readout * ((top + bottom) / (2 * shot.height) - 0.5)
                 box = (x0, max(top, y0), x1, min(bottom, y1))
-                parts.append(observe(replace(shot, t=shot.t + later, box=box)))
+                parts.append(observe(replace(shot.after(later), box=box)))
             return _stack(parts)
 
         return rolled

@@ -17,6 +17,7 @@ from jaxtyping import Float, UInt8
 
 from otsync.types import Camera, Offsets, Status, TrackSet
 from recon.depth import Depths
+from recon.effects import with_declared
 from recon.features import FeatureFrame, as_tracks, lift_features
 from recon.fit import LOSSES, fit
 from recon.footage import Footage
@@ -109,8 +110,9 @@ def fit_alone(
         return scene
     shown = footage if footage.background is not None else before_black(footage)
     return fit(
-        scene, [shown], own, losses=options.losses, rates=options.rates, steps=options.steps, batch=1, seed=seed
-    ).scene
+        scene, [shown], own, losses=options.losses, effects=with_declared((), [footage.readout]), rates=options.rates,
+        steps=options.steps, batch=1, seed=seed,
+    ).scene  # fmt: skip
 
 
 def tracks_of(
@@ -149,7 +151,9 @@ def tracks_of(
             f"video {footage.name}: expected Gaussians that are seen for {options.least_life:g} s; found none. Check "
             "masks and depth, or lower least_life and least_pixels."
         )
-    return replace(found, uv=footage.camera.project(found.positions()), camera=footage.camera)
+    # at the frames' own times, as by a shutter that sees all rows at once
+    camera = replace(footage.camera, readout=None)
+    return replace(found, uv=camera.project(found.positions()), camera=camera)
 
 
 def seen_weights(scene: Gaussians4D, footage: Footage) -> Float[np.ndarray, "N T"]:

@@ -104,7 +104,8 @@ def fit(
 
     Args:
         footage: the videos; each is found by name in ``offsets``, whose reference keeps its place.
-        losses, effects: what is in the tuple is computed, nothing else.
+        losses, effects: what is in the tuple is computed, nothing else; not even a rolling shutter that a camera declares,
+            which :func:`recon.effects.with_declared` adds.
         rates: learning rate of each parameter group at the start; a group without one is frozen, "offsets" too.
         steps, budget: how long: a number of steps, or wall seconds, which are turned into a number of steps once the
             first ones have shown their speed (120 at the least). Default: 2000 steps.

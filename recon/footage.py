@@ -15,6 +15,7 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Bool, Float, Int, UInt8
 from scipy.ndimage import maximum_filter
+from scipy.spatial.transform import Rotation
 
 from otsync.types import Camera, Video
 
@@ -85,6 +86,23 @@ class Footage:
     def pose(self, frame: int) -> Float[np.ndarray, "4 4"]:
         """World to camera of a frame."""
         return self.w2c if self.w2c.ndim == 2 else self.w2c[frame]
+
+    def pose_after(self, frame: int, later: float) -> Float[np.ndarray, "4 4"]:
+        """World to camera ``later`` seconds after a frame (before it, below 0), on the own clock.
+
+        A camera that moves turns about one axis and goes along a line from frame to frame, and beyond its last ones.
+        """
+        if self.w2c.ndim == 2 or len(self) < 2 or later == 0:
+            return self.pose(frame)
+        first = min(max(frame if later > 0 else frame - 1, 0), len(self) - 2)
+        c2w = np.linalg.inv(self.w2c[first : first + 2])
+        start, end = self.times[first : first + 2]
+        share = (self.times[frame] + later - start) / (end - start)
+        turn = Rotation.from_matrix(c2w[0, :3, :3].T @ c2w[1, :3, :3]).as_rotvec()
+        between = np.eye(4)
+        between[:3, :3] = c2w[0, :3, :3] @ Rotation.from_rotvec(share * turn).as_matrix()
+        between[:3, 3] = c2w[0, :3, 3] + share * (c2w[1, :3, 3] - c2w[0, :3, 3])
+        return np.linalg.inv(between)
 
     def nearest(self, seconds: float) -> int | None:
         """The readable frame nearest to ``seconds`` on the own clock; None when there is none."""

@@ -135,10 +135,10 @@ class View:
         """Colours [h,w,3] and alpha [h,w,1] of the Gaussians ``at`` a time, through the camera's optics."""
 
         def observe(shot: Shot) -> Rendered:
-            return Rendered(*_draw(at(float(shot.t)), self.footage, frame, near, shot.box))
+            return Rendered(*_draw(at(float(shot.t)), self.footage, frame, near, shot.box, shot.later))
 
         w, h = self.footage.size
-        shot = Shot(0, torch.tensor(t, dtype=torch.float64), box or (0, 0, w, h), h, frame)
+        shot = Shot(0, torch.tensor(t, dtype=torch.float64), box or (0, 0, w, h), h, frame, rate=self.clock.rate)
         seen = compose(observe, self.optics, {})(shot)
         return seen.rgb, seen.alpha
 
@@ -275,14 +275,15 @@ def _static_views(scene: Gaussians4D, footage: Footage) -> Tensor | None:
 
 
 def _draw(
-    gaussians: Gaussians, footage: Footage, frame: int, near: float, box: tuple[int, int, int, int] | None = None
-) -> tuple[Tensor, Tensor]:
-    """Colours [h,w,3] and alpha [h,w,1] of a part of the image."""
+    gaussians: Gaussians, footage: Footage, frame: int, near: float, box: tuple[int, int, int, int] | None = None,
+    later: float = 0.0,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Colours [h,w,3] and alpha [h,w,1] of a part of the image, ``later`` seconds after the frame."""
     x0, y0, x1, y1 = box or (0, 0, *footage.size)
     K = torch.as_tensor(footage.K, dtype=torch.float32).clone()
     K[0, 2] -= x0
     K[1, 2] -= y0
-    w2c = torch.as_tensor(footage.pose(frame), dtype=torch.float32)
+    w2c = torch.as_tensor(footage.pose_after(frame, later), dtype=torch.float32)
     with torch.no_grad():
         out = render(
             gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, colours(gaussians, w2c[None]),

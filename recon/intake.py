@@ -10,6 +10,7 @@ import numpy as np
 
 from otsync.io import Scene
 from otsync.io.mend import keep_frames, unreadable
+from otsync.shutter import check_within_a_frame
 from otsync.types import Offsets, Video
 from recon.held_out import Clock
 from recon.plan import MapLike, Progress
@@ -17,6 +18,9 @@ from recon.plan import MapLike, Progress
 
 def readable(scene: Scene, cache: Any, map: MapLike, progress: Progress) -> Scene:
     """The scene without frames that cannot be read, each of which is noted. ValueError when one video has none left."""
+
+    for video in scene.videos:
+        check_within_a_frame(video.camera.readout, video.times, f"camera.readout of {video.name!r}")
 
     def look(item: tuple[Video, Any]) -> dict[str, np.ndarray]:
         video, masks = item

@@ -16,7 +16,7 @@ from otsync.files import write_json
 from otsync.io import Scene
 from otsync.io.mend import cut
 from otsync.types import Offsets, TrackSet
-from recon.effects import Effect, Gain, MotionBlur, optics, with_declared
+from recon.effects import Gain, MotionBlur, common_exposure, optics, with_declared
 from recon.evaluate import offset_error
 from recon.fit import Reconstruction, fit
 from recon.held_out import Clock, ViewScore, view
@@ -170,11 +170,6 @@ def _write(
     )  # fmt: skip
 
 
-def common_exposure(effects: Sequence[Effect]) -> float:
-    """Seconds that all shutters were open, as far as ``effects`` tell; 0: sharp, or each its own."""
-    return next((e.exposure for e in effects if isinstance(e, MotionBlur) and not isinstance(e.exposure, tuple)), 0.0)
-
-
 def offset_figures(offsets: Offsets, true: np.ndarray) -> dict[str, Any]:
     """Mean and largest absolute error in frames, relative to the reference."""
     step = 1.0 / float(offsets.fps[offsets.reference])
@@ -205,7 +200,8 @@ def evaluate(
 ) -> tuple[tuple[ViewScore, ...], str]:
     """Scores of the named cameras against a finished result, and why LPIPS is missing ("" when it is not).
 
-    Clocks: as ``offsets`` say, else those of the result, else found on the frozen scene.
+    Clocks: as ``offsets`` say, else those of the result, else found on the frozen scene. Views are through the shutters
+    that the scene's cameras declare and the exposure that the result was fitted with, where all cameras had the same.
     """
     from otsync.priors.cache import Cache
 

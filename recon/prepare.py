@@ -14,9 +14,10 @@ import numpy as np
 
 from otsync.io import Scene
 from otsync.io.mend import cut
-from otsync.shutter import at_frame_times
+from otsync.shutter import at_frame_times, check_within_a_frame
 from otsync.types import Offsets, TrackSet
 from recon.backdrop import StaticFit, with_backdrop
+from recon.effects import common_exposure
 from recon.footage import Footage
 from recon.gaussians4d import Gaussians4D
 from recon.held_out import Clock
@@ -79,6 +80,8 @@ def prepare(
     from otsync.priors.cache import Cache
 
     plan, progress, cache = plan or Plan(), progress or Progress(), cache or Cache()
+    for video in scene.videos:
+        check_within_a_frame(common_exposure(plan.effects), video.times, "exposure")
     if plan.frames is not None:
         scene = cut(scene, *plan.frames)
     with progress.stage("reading"):

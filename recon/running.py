@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -84,6 +84,12 @@ class Run:
         """World seconds at which a frame was taken, differentiable in its video's clock."""
         return values["clock_rates"][video] * self.problem.times[video][frame] + values["offsets"][video]
 
+    def shot(self, values: Mapping[str, Tensor], video: int, frame: int) -> Shot:
+        """What is asked for of a frame: the box where something may move, at the world time that its clock gives."""
+        clip, rate = self.problem.clips[video], values["clock_rates"][video]
+        t = self.world_time(values, video, frame)
+        return Shot(video, t, clip.box(frame), clip.size[1], frame, rate=rate)
+
     def advance(self, map: MapLike, densify: Densify | None) -> None:
         """A step, and what is due after it: all of it, or none."""
         self.one_step(map, probe=densify is not None)
@@ -126,7 +132,8 @@ class Run:
         p, clip = self.problem, self.problem.clips[video]
         box = clip.box(frame)
         observe = observer(assemble(self.scene, values), p.clips, values["offsets"])
-        shot = Shot(video, self.world_time(values, video, frame) + later, box, clip.size[1], frame)
+        shot = self.shot(values, video, frame)
+        shot = replace(shot, t=shot.t + later)
         with torch.no_grad():
             return compose_over(compose(observe, p.effects, values)(shot), clip.behind(box))
 
@@ -145,7 +152,7 @@ class Run:
         p = self.problem
         probes: list[tuple[Tensor, Tensor]] = []
         scene = assemble(self.scene, values)
-        shots = [Shot(v, self.world_time(values, v, k), p.clips[v].box(k), p.clips[v].size[1], k) for v, k in keys]
+        shots = [self.shot(values, v, k) for v, k in keys]
         clocks, depth, asked = values["offsets"], p.needs("depth"), probes if probe else None
         observe = (
             observer(scene, p.clips, clocks, depth=depth, probes=asked) if len(shots) == 1

@@ -3,6 +3,8 @@
 At the middle of the clip every surface voxel gets a Gaussian and is bound to the scaffold. At each further moment the
 model is warped there, and only where it has nothing near are new ones added: what a moment shows that an earlier one
 hid. Their means are those of that moment, so each moment is a rest of the scaffold.
+
+A rolling shutter is not undone here: its rows are up to half a readout off, which the fit then corrects.
 """
 
 from __future__ import annotations

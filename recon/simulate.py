@@ -160,10 +160,15 @@ def synthetic(
 
 @dataclass(frozen=True, eq=False)
 class Instant:
-    """What a camera sees at one instant: rgb [h,w,3] and alpha [h,w,1] of what moves."""
+    """What a camera sees at one instant: rgb [h,w,3] and alpha [h,w,1] of what moves.
+
+    z [h,w,1]: its depth, and solid [h,w,1]: its alpha, both as they are without blur, which a depth estimator looks through.
+    """
 
     rgb: Tensor
     alpha: Tensor
+    z: Tensor
+    solid: Tensor
 
 
 See = Callable[[float], Instant]
@@ -198,7 +203,8 @@ class Blur:
         def blurred(t: float) -> Instant:
             steps = ((np.arange(self.samples) + 0.5) / self.samples - 0.5) * self.exposure
             seen = [see(t + step) for step in steps]
-            return Instant(torch.stack([s.rgb for s in seen]).mean(0), torch.stack([s.alpha for s in seen]).mean(0))
+            middle, rgb, alpha = see(t), [s.rgb for s in seen], [s.alpha for s in seen]
+            return Instant(torch.stack(rgb).mean(0), torch.stack(alpha).mean(0), middle.z, middle.solid)
 
         return blurred
 
@@ -219,8 +225,8 @@ class Rolling:
             for b in np.unique(band):
                 own = torch.as_tensor(np.flatnonzero(band == b))
                 seen = see(t + self.readout * float(rows[band == b].mean() - 0.5))
-                parts.append(Instant(seen.rgb[own], seen.alpha[own]))
-            return Instant(torch.cat([p.rgb for p in parts]), torch.cat([p.alpha for p in parts]))
+                parts.append([x[own] for x in (seen.rgb, seen.alpha, seen.z, seen.solid)])
+            return Instant(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
         return rolled
 
@@ -285,31 +291,29 @@ class Film:
         return cls(world, camera, effects, gain, tuple(noise))
 
     def shoot(self, times: Float[np.ndarray, " T"]) -> Shots:
-        """Frames at world ``times``. Depth is that of the instant, without blur or readout."""
+        """Frames at world ``times``. Depth is that of the rows' instants, without blur."""
         with torch.no_grad():
-            backdrop, wall = self._render(self.world.static, NEAR)
+            backdrop = self._render(self.world.static, NEAR)
+            wall = backdrop.z[..., 0].numpy()
+            see = self._see()
             images, masks, depths = [], [], []
             for t in times:
-                body, z = self._render(self._moving(float(t)), 0.01)
-                seen = self._see(body)(float(t))
+                seen = see(float(t))
                 image = (seen.rgb + (1 - seen.alpha) * backdrop.rgb).numpy() * self.gain
                 for size, rng in self.noise:
                     image = image + size * rng.standard_normal(image.shape)
                 images.append(np.rint(255 * image.clip(0, 1)).astype(np.uint8))
                 masks.append(seen.alpha[..., 0].numpy() > 0.5)
-                alpha = body.alpha[..., 0].numpy()
+                alpha, z = seen.solid[..., 0].numpy(), seen.z[..., 0].numpy()
                 depths.append(np.where(alpha > 0.6, z, np.where(alpha < 0.05, wall, 0)).astype(np.float32))
         return Shots(np.stack(images), np.stack(masks), np.stack(depths))
 
-    def _see(self, now: Instant) -> See:
-        """The camera through its effects. Without any, the instant at hand is not rendered twice."""
-        optics = [e for e in self.effects if isinstance(e, Blur | Rolling)]
-        if not optics:
-            return lambda t: now
-
-        see: See = lambda t: self._render(self._moving(t), 0.01)[0]  # noqa: E731
-        for effect in optics:
-            see = effect(see, self.camera)
+    def _see(self) -> See:
+        """The camera through its effects."""
+        see: See = lambda t: self._render(self._moving(t), 0.01)  # noqa: E731
+        for effect in self.effects:
+            if isinstance(effect, Blur | Rolling):
+                see = effect(see, self.camera)
         return see
 
     def _moving(self, t: float) -> Gaussians:
@@ -321,8 +325,8 @@ class Film:
             moving = replace(moving, sh=moving.sh + torch.as_tensor(light / sh.C0, dtype=torch.float32)[:, None])
         return moving
 
-    def _render(self, gaussians: Gaussians, near: float) -> tuple[Instant, np.ndarray]:
-        """What the camera sees of them, and the expected depth [h,w], 0 where there is nothing."""
+    def _render(self, gaussians: Gaussians, near: float) -> Instant:
+        """What the camera sees of them; depth 0 where there is nothing."""
         colors = (sh.C0 * gaussians.sh[:, 0] + 0.5).clamp(0, 1)
         w2c = torch.as_tensor(self.camera.w2c, dtype=torch.float32)[None]
         K = torch.as_tensor(self.camera.K, dtype=torch.float32)[None]
@@ -331,7 +335,7 @@ class Film:
             self.camera.width, self.camera.height, near_plane=near,
         )  # fmt: skip
         assert out.depths is not None
-        return Instant(out.colors[0], out.alphas[0]), out.depths[0, ..., 0].numpy()
+        return Instant(out.colors[0], out.alphas[0], out.depths[0], out.alphas[0])
 
 
 def _world(seed: int) -> World:

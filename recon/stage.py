@@ -77,16 +77,18 @@ class Clip:
         x0, y0, x1, y1 = box
         return self.background[y0:y1, x0:x1]
 
-    def pose(self, frame: int) -> Tensor:
-        """w2c [4,4] of a frame."""
+    def pose(self, frame: int, later: float = 0.0) -> Tensor:
+        """w2c [4,4] of a frame, or ``later`` seconds after it on the own clock."""
+        if len(self.w2c) > 1 and later != 0:
+            return torch.as_tensor(self.footage.pose_after(frame, later)).to(self.w2c)
         return self.w2c[frame if len(self.w2c) > 1 else 0]
 
-    def view(self, frame: int, box: Box) -> tuple[Tensor, Tensor]:
+    def view(self, frame: int, box: Box, later: float = 0.0) -> tuple[Tensor, Tensor]:
         """(w2c [1,4,4], K [1,3,3]) of a frame, for an image that begins at the box's corner."""
         K = self.K.clone()
         K[0, 2] -= box[0]
         K[1, 2] -= box[1]
-        return self.pose(frame)[None], K[None]
+        return self.pose(frame, later)[None], K[None]
 
 
 def observer(
@@ -104,7 +106,7 @@ def observer(
     def observe(shot: Shot) -> Rendered:
         clip = clips[shot.video]
         moving = scene.moving(shot.t, clocks)
-        w2c, K = clip.view(shot.frame, shot.box)
+        w2c, K = clip.view(shot.frame, shot.box, shot.later)
         together = clip.background is None and scene.static is not None
         n = len(moving)
         drawn = join(moving, scene.static) if together and scene.static is not None else moving
@@ -140,7 +142,7 @@ def observer_at_once(
     largest box and are cut; a splat that begins beyond its own box, where the projection stops following it, may be
     shaped a little differently.
     """
-    g, views = scene.dynamic, [clips[s.video].view(s.frame, s.box) for s in shots]
+    g, views = scene.dynamic, [clips[s.video].view(s.frame, s.box, s.later) for s in shots]
     w2c, K = torch.cat([w for w, _ in views]), torch.cat([k for _, k in views])
     means, quats = scene.motion.warp(g.means, g.quats, torch.stack([s.t for s in shots]), clocks)
     means, quats = means.expand(len(shots), -1, -1), quats.expand(len(shots), -1, -1)

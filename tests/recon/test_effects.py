@@ -239,3 +239,17 @@ def test_the_optics_of_one_camera():
     assert optics(effects, 0.01) == (RollingShutter(0.03),)
     assert optics(effects[:2], 0.01) == (RollingShutter((0.01,)),)
     assert optics((), None) == ()
+
+
+def test_effects_tell_time_by_the_cameras_own_clock():
+    """In slow motion a readout and an exposure cover less of the world's time."""
+    asked = []
+
+    def watched(shot: Shot) -> Rendered:
+        asked.append((round(float(shot.t), 9), round(shot.later, 9)))
+        return observe(shot)
+
+    slow = replace(shot(0.5), rate=0.25)
+    MotionBlur(0.03, samples=3).wrap(watched, {})(slow)
+    RollingShutter(0.04, bands=2).wrap(watched, {})(slow)
+    assert asked == [(0.4975, -0.01), (0.5, 0.0), (0.5025, 0.01), (0.4975, -0.01), (0.5025, 0.01)]

@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from otsync.partners import Candidates
 from otsync.priors.features import LabHistogram
 from otsync.priors.working import WorkingFrames
+from otsync.shutter import at_frame_times
 from recon.capture import write_capture
 from recon.cli import main
 from recon.dense_features import DaisyMaps, LabMaps
@@ -215,3 +216,15 @@ def test_the_lifting_suite_writes_its_table(tmp_path, capsys):
     write_capture(synthetic(5, cameras=2, held_out=0, frames=4, size=(40, 24), offsets=[0, 0.5]), other)
     assert main(["bench", str(other), "--suite", "lifting", "--truth", str(other / "truth.json")]) == 2
     assert "truly synchronised" in capsys.readouterr().err
+
+
+def test_tracks_of_a_rolling_shutter_are_at_the_frames_times_and_say_so(capture, scene):
+    footage, flow, _ = inputs(capture)
+    tracks = tracks_of(scene, replace(footage, readout=0.02), flow, colours)
+    assert at_frame_times(tracks) is tracks
+    np.testing.assert_array_equal(tracks.xyz, tracks_of(scene, footage, flow, colours).xyz)
+    plain, rolled = (
+        fit_alone(replace(footage, readout=r), flow, capture.depth[0].__getitem__, options=Alone(steps=2))
+        for r in (None, 0.02)
+    )
+    assert not np.array_equal(plain.dynamic.means.numpy(), rolled.dynamic.means.numpy())

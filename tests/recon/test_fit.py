@@ -16,7 +16,7 @@ import torch
 
 from otsync.types import Offsets, Status
 from recon.density import Densify
-from recon.effects import Gain, MotionBlur, RollingShutter
+from recon.effects import Gain, MotionBlur, RollingShutter, Shot
 from recon.fit import LOSSES, RATES, Diverged, fit
 from recon.gaussians import Gaussians
 from recon.gaussians4d import Gaussians4D
@@ -28,6 +28,7 @@ from recon.raster import set_threads
 from recon.raster.cpu.threads import get_threads
 from recon.running import Run
 from recon.simulate import synthetic
+from recon.stage import Clip, observer
 
 ROOT = Path(__file__).parents[2]
 
@@ -401,6 +402,25 @@ def test_a_camera_that_moves_is_seen_from_its_pose_of_the_frame(capture, scene):
     for f in turned:
         f.w2c[1:, 0, 3] += 0.5
     assert not same(a, fit(scene, turned, believed(capture), steps=2))
+
+
+def test_the_rows_of_a_camera_that_moves_are_seen_from_where_it_is_then(capture, scene):
+    """What is static is slanted too: every band of rows is what a camera in between would show."""
+    f, box = replace(capture.footage[0], background=None), (0, 0, *capture.footage[0].size)
+    path = np.repeat(f.w2c[None], len(f), 0)
+    path[:, 0, 3] += 0.6 * np.arange(len(f))
+    moving = Clip.of(replace(f, w2c=path))
+    readout, bands, k = 0.03, 4, 3
+    asked = Shot(0, torch.tensor(k / 30, dtype=torch.float64), box, box[3], k)
+    with torch.no_grad():
+        rolled = RollingShutter(readout, bands).wrap(observer(scene, [moving]), {})(asked).rgb
+        for b in range(bands):
+            later = readout * ((b + 0.5) / bands - 0.5)
+            there = Clip.of(replace(f, w2c=moving.footage.pose_after(k, later)))
+            rows = slice(box[3] * b // bands, box[3] * (b + 1) // bands)
+            seen = observer(scene, [there])(replace(asked, t=asked.t + later)).rgb
+            torch.testing.assert_close(rolled[rows], seen[rows], atol=1e-3, rtol=0)
+        assert not torch.allclose(rolled, observer(scene, [moving])(asked).rgb, atol=0.02)
 
 
 def test_a_spline_far_beyond_its_knots_still_renders(capture, scene):

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import logging
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from otsync.types import Camera, Video
 from recon.depth import background_depth, depth_at, working_depth
@@ -292,3 +294,25 @@ def test_a_real_recording(data):
     assert f.size == (320, 180) and not f.bad.any() and f.background_seen.mean() > 0.99
     assert f.K[0, 0] == pytest.approx(scene.videos[1].camera.K[0, 0] / 2)
     assert (f.boxes[:, 2] > f.boxes[:, 0]).all()
+
+
+def test_a_camera_that_moves_is_between_its_frames_and_beyond_them():
+    """Turning evenly about one axis and going along a line it is where it must be at any time."""
+    times = np.array([0.0, 0.1, 0.3, 0.4])
+
+    def w2c(t):
+        c2w = np.eye(4)
+        c2w[:3, :3] = Rotation.from_rotvec(t * np.array([0.3, -0.8, 0.5])).as_matrix()
+        c2w[:3, 3] = [1 + 2 * t, -t, 0.5]
+        return np.linalg.inv(c2w)
+
+    video = Video(
+        [np.zeros((8, 8, 3), np.uint8)] * 4,
+        Camera(np.eye(3), np.stack([w2c(t) for t in times]), 8, 8),
+        timestamps=times,
+    )
+    footage = footage_of(video, width=8)
+    for frame, later in ((0, 0.03), (1, 0.15), (1, -0.04), (2, 0.0), (3, 0.02), (0, -0.02)):
+        np.testing.assert_allclose(footage.pose_after(frame, later), w2c(times[frame] + later), atol=1e-9)
+    still = replace(footage, w2c=footage.w2c[0])
+    np.testing.assert_array_equal(still.pose_after(2, 0.05), still.w2c)

@@ -272,6 +272,16 @@ def test_declared_readouts_and_given_exposures_reach_the_fit(tmp_path, monkeypat
     told = json.loads((tmp_path / "r" / "metrics.json").read_text())
     assert main(["eval", str(tmp_path / "r"), str(world), "--out", str(tmp_path / "eval.json")]) == 0
     assert json.loads((tmp_path / "eval.json").read_text())["held_out"] == told["held_out"]
+    assert main([*args, "--exposure", "20"]) == 2
+    assert "exposure: expected seconds, no longer than a frame" in capsys.readouterr().err
+    document = json.loads((world / "scene.json").read_text())
+    document["videos"][0]["camera"]["readout"] = 20
+    (world / "scene.json").write_text(json.dumps(document))
+    for verb in (args, ["eval", str(tmp_path / "r"), str(world), "--held-out", "cam0"]):
+        assert main(verb) == 2
+        assert "camera.readout of 'cam0': expected seconds" in capsys.readouterr().err
+    assert otsync(["sync", str(world), "--out", str(tmp_path / "s")]) == 2
+    assert "camera.readout of 'cam0': expected seconds" in capsys.readouterr().err
     assert main(["simulate", str(tmp_path / "x"), "--noise", "nan"]) == 2
     assert "--noise" in capsys.readouterr().err
 

@@ -184,6 +184,19 @@ def test_rows_are_read_one_after_the_other(capture):
     assert psnr(whole[1], rolled.images[4, ::4]) > psnr(whole[-1], rolled.images[4, ::4]) + 1
 
 
+def test_depth_is_that_of_the_rows(capture):
+    readout, bands = 1 / FPS, 12
+    rolled = synthetic(3, **SMALL, effects=(Rolling(readout, bands=bands),)).depth[1]
+    for b in (0, 5, 11):
+        late = readout * ((b + 0.5) / bands - 0.5) * FPS
+        shifted = synthetic(3, **{**SMALL, "offsets": capture.offsets * FPS + late}).depth[1]
+        rows = slice(48 // bands * b, 48 // bands * (b + 1))
+        known = (rolled[4, rows] > 0) & (shifted[4, rows] > 0)
+        # the errors of whole frames and pixels are the same draws
+        np.testing.assert_allclose(rolled[4, rows][known], shifted[4, rows][known], rtol=1e-3)
+    assert not np.allclose(rolled, capture.depth[1], rtol=1e-3)
+
+
 def test_sheen_is_brightest_half_way_between_lamp_and_camera():
     lamp, eye = np.array([0.0, 0, 1]), np.array([[3.0, 0, 3.0]])
     half = np.array([np.sin(np.pi / 8), 0, np.cos(np.pi / 8)])
