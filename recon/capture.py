@@ -16,7 +16,7 @@ from otsync.types import Offsets, Status
 from recon.footage import Footage
 from recon.gaussians4d import Gaussians4D
 from recon.motion import ScaffoldOptions, build_scaffold
-from recon.seed import seed
+from recon.seed import Seeding, seed
 from recon.simulate import Capture
 
 CAMERA_DISTANCE = 2.6
@@ -89,7 +89,9 @@ def _png(path: Path, image: np.ndarray) -> None:
         Image.fromarray(image).save(stream, "PNG")
 
 
-def begun(capture: Capture, offsets: Offsets, options: ScaffoldOptions | None = None) -> Gaussians4D:
+def begun(
+    capture: Capture, offsets: Offsets, options: ScaffoldOptions | None = None, *, seeding: Seeding | None = None
+) -> Gaussians4D:
     """The scene that a fit of a capture begins with: scaffold and seeds from the believed ``offsets``, and the true
     static Gaussians, so that what moves is judged by itself."""
     footprint = float(np.median([CAMERA_DISTANCE / f.K[0, 0] for f in capture.footage]))
@@ -99,6 +101,6 @@ def begun(capture: Capture, offsets: Offsets, options: ScaffoldOptions | None = 
     )
     scene = seed(
         motion, capture.footage, offsets, [z.__getitem__ for z in capture.depth], footprint=footprint,
-        frame_step=capture.frame_step, span=span,
+        frame_step=capture.frame_step, span=span, options=seeding,
     )  # fmt: skip
     return replace(scene, static=capture.world.static, near=capture.near)
