@@ -26,6 +26,7 @@ def plot(rows: Sequence[dict[str, Any]], path: Path) -> None:
     matplotlib.use("Agg")
     from matplotlib import color_sequences
     from matplotlib import pyplot as plt
+    from matplotlib.ticker import LogLocator
 
     amplitude = min(r["amplitude"] for r in rows)
     rows = [r for r in rows if r["amplitude"] == amplitude]
@@ -40,8 +41,14 @@ def plot(rows: Sequence[dict[str, Any]], path: Path) -> None:
                     continue
                 axes.plot(points[:, 0], points[:, 1], ".-", color=colors.get(name, "0.5"), label=name)
             axes.set(xscale="log", xlabel="CPU seconds of the fit", ylabel=label)
+            axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axes.xaxis.set_major_formatter("{x:g}")
+            axes.xaxis.set_minor_formatter("")
             axes.grid(alpha=0.25)
         all_axes[0].set_yscale("log")
+        all_axes[0].yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        all_axes[0].yaxis.set_major_formatter("{x:g}")
+        all_axes[0].yaxis.set_minor_formatter("")
         handles, labels = all_axes[1].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=len(names), fontsize=8)
         about = machine()
