@@ -96,7 +96,8 @@ class Material:
     Args:
         scene: training and held-out videos; the training ones with depth. tracks: that scaffolds are built from.
         kept: tracks that none is. truth: offsets of every video.
-        backdrop: the static part, where cameras that do not train have a share in it.
+        backdrop: the static part, where cameras that do not train have a share in it; its gains are those of ``train``.
+            None: every row fits one to its training videos.
     """
 
     scene: Scene
@@ -148,9 +149,11 @@ def material_of(
             plan = Plan(width=protocol.width, backdrop_steps=protocol.backdrop_steps, device=protocol.device)
             footage = read_footage(rig, protocol.width, cache, map, progress)
             backdrop = backdrop_of_scene(rig, tracks, footage, plan, cache, progress)
-            if backdrop is not None:
-                own = [rig.names.index(n) for n in train.names]
-                backdrop = replace(backdrop, gains=backdrop.gains[own], psnr=backdrop.psnr[own])
+            if backdrop is None:
+                progress.note("the whole rig gave no static part: every row makes one from its training cameras alone")
+            else:
+                at = [rig.names.index(n) for n in train.names]
+                backdrop = replace(backdrop, gains=backdrop.gains[at], psnr=backdrop.psnr[at])
         tracks = tuple(t for t in tracks if t.name in train.names)
     held = scene.take(protocol.held_out) if protocol.held_out else None
     if held is not None:
