@@ -430,6 +430,24 @@ def test_run_tells_the_reconstruction_which_frames(world, synchronized, tmp_path
     assert after["held_out"]["psnr"] == pytest.approx(before["held_out"]["psnr"], abs=1e-6)
 
 
+def test_run_tells_the_fit_how_long_shutters_were_open(world, synchronized, tmp_path, monkeypatch):
+    import recon.pipeline
+    from recon.effects import MotionBlur
+
+    seen, fit = [], recon.pipeline.fit
+
+    def spied(*args, **kwargs):
+        seen.append(kwargs["effects"])
+        return fit(*args, **kwargs)
+
+    monkeypatch.setattr(recon.pipeline, "fit", spied)
+    args = ["run", str(world), "--out", str(tmp_path / "r"), "--steps", "1", "--width", str(SIZE[0]), "--frames", "2",
+            "12", "--held-out", "held0", "--exposure", "0.015"]  # fmt: skip
+    assert otsync(args) == 0
+    assert [e.exposure for e in seen[0] if isinstance(e, MotionBlur)] == [0.015]
+    assert load_result(tmp_path / "r").options["exposure"] == 0.015
+
+
 def test_run_says_what_it_cannot_do(world, tmp_path, capsys):
     base = ["run", str(world), "--out", str(tmp_path / "r"), "--steps", "3"]
     for more, says in (
