@@ -27,6 +27,7 @@ from otsync.types import Offsets, TrackSet
 from recon.backdrop import StaticFit
 from recon.bench_plot import plot
 from recon.bench_rows import KEY, find, measured_before, paper_tables
+from recon.checks import check_number, check_whole
 from recon.configurations import CONFIGURATIONS, Configuration
 from recon.device import device_of
 from recon.effects import Gain, with_declared
@@ -82,6 +83,13 @@ class Protocol:
     held_out_tracks: float = 0.1
     backdrop_steps: int = 1500
     device: str = "cpu"
+
+    def plan(self, **more: Any) -> Plan:
+        """What is done with the recording, as far as all rows agree, and what ``more`` says of one."""
+        return Plan(
+            width=self.width, seeding=Seeding(voxel=self.voxel, sh_degree=self.sh_degree), batch=self.batch,
+            backdrop_steps=self.backdrop_steps, device=self.device, **more,
+        )  # fmt: skip
 
     @property
     def lengths(self) -> tuple[int, ...]:
@@ -146,9 +154,8 @@ def material_of(
     if protocol.cameras is not None:
         train = rig.take(protocol.cameras)
         with progress.stage("backdrop"):
-            plan = Plan(width=protocol.width, backdrop_steps=protocol.backdrop_steps, device=protocol.device)
             footage = read_footage(rig, protocol.width, cache, map, progress)
-            backdrop = backdrop_of_scene(rig, tracks, footage, plan, cache, progress)
+            backdrop = backdrop_of_scene(rig, tracks, footage, protocol.plan(), cache, progress)
             if backdrop is None:
                 progress.note("the whole rig gave no static part: every row makes one from its training cameras alone")
             else:
@@ -175,11 +182,7 @@ def measure(
     believed = material.believed(amplitude, seed)
     built_from = believed if configuration.start == "given" else material.truth
     margin = max(configuration.scaffold.margin, (amplitude + 1) / float(believed.fps[believed.reference]))
-    plan = Plan(
-        width=protocol.width, scaffold=replace(configuration.scaffold, margin=margin), losses=configuration.losses,
-        seeding=Seeding(voxel=protocol.voxel, sh_degree=protocol.sh_degree), batch=protocol.batch, backdrop_steps=protocol.backdrop_steps,
-        device=protocol.device,
-    )  # fmt: skip
+    plan = protocol.plan(scaffold=replace(configuration.scaffold, margin=margin), losses=configuration.losses)
     ready = prepare(
         material.scene, built_from, material.tracks, plan=plan, held_out=material.held_out, backdrop=material.backdrop,
         cache=cache, map=map,
@@ -281,7 +284,11 @@ def run(
     unknown = [r for r in rows if r not in CONFIGURATIONS]
     if unknown:
         raise ValueError(f"rows: expected some of {', '.join(CONFIGURATIONS)}; found {', '.join(unknown)}.")
-    device_of(protocol.device)  # before the work, not after it
+    protocol.plan()  # says what is wrong before the work, not after it
+    for steps in protocol.steps:
+        check_whole("steps", steps, 0)
+    if protocol.budget is not None:
+        check_number("budget", protocol.budget)
     kept, progress, lpips = Cache(cache or out / "stages"), Progress(tell), lpips or Lpips()
     description = about(protocol, scene, truth)
     found = measured_before(out, description)

@@ -126,6 +126,7 @@ class Fit:
     def run(self) -> int:
         from otsync.types import Offsets, TrackSet
 
+        self.fit.length(), self.fit.plan()  # before the work, not after it
         scene = opened(self.scene, self.fit.allow_outside)
         offsets = Offsets.load(self.offsets)
         tracks = tuple(TrackSet.load(path) for path in self.tracks) or None

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
+from recon.checks import check_whole
 from recon.density import Densify
 from recon.device import device_of
 from recon.effects import Effect
@@ -32,6 +33,8 @@ class Plan:
         views: frames of every camera that are compared at the end. backdrop_steps: of the fit of the static part.
         save_every: seconds between savings of the fit.
         device: where static part and motion are fitted: "cpu", or "cuda" for a GPU; the rest is done on the CPU.
+
+    ValueError names a number that makes no sense, and a device that is not there.
     """
 
     width: int = 320
@@ -50,6 +53,8 @@ class Plan:
     device: str = "cpu"
 
     def __post_init__(self) -> None:
+        for name, least in (("width", 1), ("batch", 1), ("views", 1), ("backdrop_steps", 0)):
+            check_whole(name, getattr(self, name), least)
         device_of(self.device)
 
 
