@@ -121,6 +121,10 @@ def test_a_refused_answer_exits_with_one(tmp_path, capsys):
         (["match", "{world}/video0.npz", "{world}/video1.npz", "matcher:partial-fgw", "--matcher.mass", "7"], "PartialFGW.mass"),
         (["simulate", "{world}/x", "--motion", "waltz"], "waltz"),
         (["simulate", "{world}/x", "--fps", "0"], "fps"),
+        (["bench", "raster", "--first-seed", "3"], "--first-seed: expected with suite core, match, sync, panoptic; found raster"),
+        (["bench", "panoptic", "--seeds", "3"], "--seeds: expected with suite core, match, sync; found panoptic"),
+        (["bench", "sync", "--gate", "--first-seed", "8100"], "--first-seed: expected without --gate and --rebase"),
+        (["bench", "sync", "--seeds", "0"], "--seeds: expected 1 or more; found 0"),
     ],
 )  # fmt: skip
 def test_bad_arguments_and_files_exit_with_two(args, message, world, capsys, monkeypatch, tmp_path):
@@ -139,6 +143,23 @@ def shell(*args: str, **options) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, "-m", "otsync.cli", *args], capture_output=True, text=True, cwd=ROOT, timeout=120, **options
     )
+
+
+@pytest.mark.parametrize(
+    ("args", "module", "drawn"),
+    [
+        (["sync", "--first-seed", "8100", "--seeds", "5"], "sync", {"first_seed": 8100, "seeds": 5}),
+        (["sync", "--first-seed", "0", "--promises"], "sync", {"first_seed": 0, "promises": True}),
+        (["match", "--seeds", "3", "--promises"], "match_limits", {"seeds": 3}),
+        (["core", "--first-seed", "7100"], "core", {"first_seed": 7100}),
+        (["sync"], "sync", {}),
+    ],
+)
+def test_chosen_seeds_reach_every_benchmark_that_draws(args, module, drawn, monkeypatch):
+    seen = []
+    monkeypatch.setattr(f"otsync.bench.{module}.run", lambda out, **options: seen.append(options) or 0)
+    assert main(["bench", *args]) == 0
+    assert [{k: v for k, v in options.items() if k not in ("gate", "rebase")} for options in seen] == [drawn]
 
 
 def test_version_help_and_unknown_commands():
