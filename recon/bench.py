@@ -317,12 +317,9 @@ def run(
 def about(protocol: Protocol, scene: Scene, truth: Offsets) -> Mapping[str, Any]:
     """What the figures were made with; rows are continued where all of it agrees."""
     clips = [[v.name, len(v.frames), v.camera.width, v.camera.height] for v in scene.videos]
-    settings = dict(vars(protocol))
-    if protocol.device == "cpu":  # as in files from before there was a choice: their rows are continued
-        del settings["device"]
     true = {n: round(float(s), 6) for n, s in zip(truth.names, truth.seconds, strict=True)}
     return {
-        "protocol": settings, "figures": FIGURES, "recording": {"videos": clips, "truth": true},
+        "protocol": dict(vars(protocol)), "figures": FIGURES, "recording": {"videos": clips, "truth": true},
         "published": PUBLISHED, "unit": "frames, dB, footprints",
     }  # fmt: skip
 

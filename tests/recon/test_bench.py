@@ -183,16 +183,6 @@ def test_rows_are_continued_only_where_they_were_measured_alike(tmp_path):
             measured_before(tmp_path, about)
 
 
-def test_rows_of_the_cpu_go_on_and_those_of_a_gpu_stand_apart():
-    """Files from before there was a choice name no device."""
-    scene = SimpleNamespace(videos=())
-    here, there = (
-        bench.about(bench.Protocol(device=d), scene, clocks(("a",), np.zeros(1), 30.0))["protocol"]  # type: ignore[arg-type]
-        for d in ("cpu", "cuda")
-    )
-    assert "device" not in here and there == {**here, "device": "cuda"}
-
-
 def test_a_row_without_lpips_is_measured_again_once_there_are_weights():
     rows = [row("ours"), row("fixed", lpips=0.1)]
     assert find(rows, ("ours", 1.0, 0, 2500), lpips=False) is rows[0]
