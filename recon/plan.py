@@ -27,9 +27,11 @@ class Plan:
     Args:
         width: working pixels. frames: first and last (exclusive) frame of every video; None: all.
         scaffold: how the motion is built. seeding: how densely Gaussians begin.
-        losses, effects, densify: of the fit; effects get the gains of the backdrop by themselves.
+        losses, effects, densify: of the fit. The rolling shutters that cameras declare and the gains of the backdrop
+            are added to the effects by themselves.
         freeze: parameter groups that the fit holds, "offsets" for instance.
-        batch: images a step, each on a thread of its own.
+        batch: images a step. On a CPU each is rendered on a thread of its own; on a GPU all are one rendering, unless
+            a shutter or an exposure is modelled or the scene is drawn together with its static part.
         views: frames of every camera that are compared at the end. backdrop_steps: of the fit of the static part.
         save_every: seconds between savings of the fit.
         device: where static part and motion are fitted: "cpu", or "cuda" for a GPU; the rest is done on the CPU.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -215,9 +216,24 @@ def test_the_plot_has_a_line_a_configuration_and_a_point_a_length(tmp_path):
     plot(rows, tmp_path / "recon.svg")
     drawn = (tmp_path / "recon.svg").read_text()
     assert all(name in drawn for name in ("ours", "fixed", "true time", "errors of up to 1 frames"))
+    assert ">CPU seconds of the fit<" in drawn and "GPU" not in drawn
     again = tmp_path / "again.svg"
     plot(rows, again)
     assert again.read_text() == drawn
+
+
+def test_the_plot_of_fits_on_a_gpu_is_against_wall_seconds(tmp_path):
+    rows = [row("ours", steps=n, seconds=n / 100, gpu_gb=0.5, mean=30 / n) for n in (300, 3000)]
+    np.testing.assert_allclose(curve(rows, "mean", "seconds"), [[3, 0.1], [30, 0.01]])
+    plot(rows, tmp_path / "recon.svg")
+    drawn = (tmp_path / "recon.svg").read_text()
+    assert ">wall seconds of the fit, on a GPU<" in drawn and "CPU seconds" not in drawn
+    cpu = [{k: v for k, v in r.items() if k != "gpu_gb"} | {"cpu_seconds": r["seconds"]} for r in rows]
+    plot(cpu, tmp_path / "cpu.svg")
+    lines = [
+        re.findall(r'<path d="M[^"]*L[^"]*" clip-path', text) for text in (drawn, (tmp_path / "cpu.svg").read_text())
+    ]
+    assert lines[0] == lines[1] != []  # drawn at the seconds, not at the CPU's
 
 
 def test_tables_hold_the_longest_fits():
