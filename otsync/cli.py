@@ -278,7 +278,7 @@ class Bench:
         modules = [importlib.import_module(name) for name in suites]
         return max(module.run(self.out, gate=self.gate, rebase=self.rebase, **drawn) for module in modules)
 
-    def _seeds(self) -> dict[str, int]:
+    def _seeds(self) -> dict[str, Any]:
         """The options that choose seeds, as far as they are given. ValueError where nothing would heed them."""
         drawn = {k: v for k, v in (("first_seed", self.first_seed), ("seeds", self.seeds)) if v is not None}
         for name, value in drawn.items():

@@ -78,8 +78,8 @@ class Protocol:
     budget: float | None = None
     batch: int = 2
     width: int = 320
-    voxel: float = 2.7
-    sh_degree: int = 0
+    voxel: float = Seeding.voxel
+    sh_degree: int = Seeding.sh_degree
     held_out_tracks: float = 0.1
     backdrop_steps: int = 1500
     device: str = "cpu"
@@ -246,15 +246,15 @@ def motion_figures(scene: Gaussians4D, ready: Prepared, kept: Sequence[TrackSet]
 
 def positions_at(tracks: TrackSet, times: np.ndarray) -> np.ndarray:
     """(N,T,3) at seconds of the video's own clock: between two neighbouring frames on the line; nan where not seen."""
-    own, held = tracks.times, np.full((len(tracks), len(times), 3), np.nan)
-    if len(own) < 2:
+    frame_times, held = tracks.times, np.full((len(tracks), len(times), 3), np.nan)
+    if len(frame_times) < 2:
         return held
     positions = tracks.positions()
-    after = np.searchsorted(own, times).clip(1, len(own) - 1)
-    gap = own[after] - own[after - 1]
-    share = (times - own[after - 1]) / gap
+    after = np.searchsorted(frame_times, times).clip(1, len(frame_times) - 1)
+    gap = frame_times[after] - frame_times[after - 1]
+    share = (times - frame_times[after - 1]) / gap
     on_one = np.minimum(np.abs(share), np.abs(1 - share)) < NEAR
-    inside = on_one | (share > 0) & (share < 1) & (gap < 1.5 * np.median(np.diff(own)))
+    inside = on_one | (share > 0) & (share < 1) & (gap < 1.5 * np.median(np.diff(frame_times)))
     before, behind, share = positions[:, after - 1], positions[:, after], share[None, :, None]
     # on a frame its neighbour does not matter, which may not have seen the point
     between = np.where(share < NEAR, before, np.where(share > 1 - NEAR, behind, before + share * (behind - before)))

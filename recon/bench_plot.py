@@ -67,8 +67,8 @@ def curve(rows: Sequence[dict[str, Any]], key: str, cost: str = "cpu_seconds") -
     """(lengths, 2): mean cost and mean figure of every length, by length; lengths without the figure left out."""
     points = []
     for steps in sorted({r["steps"] for r in rows}):
-        own = [r for r in rows if r["steps"] == steps]
-        values = [float(r[key]) for r in own if r.get(key) is not None]
+        alike = [r for r in rows if r["steps"] == steps]
+        values = [float(r[key]) for r in alike if r.get(key) is not None]
         if values:
-            points.append((math.fsum(r[cost] for r in own) / len(own), math.fsum(values) / len(values)))
+            points.append((math.fsum(r[cost] for r in alike) / len(alike), math.fsum(values) / len(values)))
     return np.array(points).reshape(-1, 2)

@@ -285,11 +285,11 @@ class Offsets:
             )
         seconds, rates, fps = column("offset_seconds"), column("rate", above=0), column("fps", above=0)
         for key, values in (("rate", rates), ("fps", fps)):
-            for v in np.flatnonzero(np.isfinite(seconds) & np.isnan(values)):
+            for v in np.flatnonzero(np.isfinite(seconds) & np.isnan(values)).tolist():
                 raise ValueError(
                     f"videos, {videos[v]['name']}: {key}: expected a number, since it has an offset; found null"
                 )
-        for v in np.flatnonzero(component == np.arange(len(videos))):
+        for v in np.flatnonzero(component == np.arange(len(videos))).tolist():
             # one that hangs together with no other may have no answer; the reference is where the world's clock begins
             if seconds[v] != 0 and (v == reference or np.isfinite(seconds[v])):
                 none = "" if v == reference else " or null"
