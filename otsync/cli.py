@@ -244,7 +244,9 @@ class Bench:
     promises: bool = False
     """For sync and match: measure what is promised, on fresh seeds, instead of the tables."""
     first_seed: int | None = None
-    """Where the seeds of --promises begin, or panoptic's seed; default: the suite's own."""
+    """For core, match and sync: where the seeds begin; for panoptic: its seed; default: the suite's own."""
+    seeds: int | None = None
+    """For core, match and sync: how many seeds; default: the suite's own."""
     json: bool = False
     """For panoptic: one line of JSON on standard output instead of tables."""
     cache: Path | None = None
@@ -255,6 +257,7 @@ class Bench:
 
         if self.gate and self.rebase:
             raise ValueError("--gate, --rebase: expected one of them; a run is no judge of itself.")
+        drawn = self._seeds()
         if self.suite == "panoptic":
             if self.scene is None:
                 raise ValueError("scene: expected a recording: otsync bench panoptic SCENE.")
@@ -269,11 +272,27 @@ class Bench:
             if self.suite not in ("match", "sync"):
                 raise ValueError(f"--promises: expected suite match or sync; found {self.suite}.")
             if self.suite == "match":
-                return match_limits.run(self.out, first_seed=self.first_seed or 9500)
-            return sync_bench.run(self.out, promises=True, first_seed=self.first_seed or sync_bench.FRESH)
+                return match_limits.run(self.out, **drawn)
+            return sync_bench.run(self.out, promises=True, **drawn)
         suites = SUITES.values() if self.suite == "all" else [SUITES[self.suite]]
         modules = [importlib.import_module(name) for name in suites]
-        return max(module.run(self.out, gate=self.gate, rebase=self.rebase) for module in modules)
+        return max(module.run(self.out, gate=self.gate, rebase=self.rebase, **drawn) for module in modules)
+
+    def _seeds(self) -> dict[str, Any]:
+        """The options that choose seeds, as far as they are given. ValueError where nothing would heed them."""
+        drawn = {k: v for k, v in (("first_seed", self.first_seed), ("seeds", self.seeds)) if v is not None}
+        for name, value in drawn.items():
+            option, least = f"--{name.replace('_', '-')}", int(name == "seeds")
+            heeded = ("core", "match", "sync", *(("panoptic",) if name == "first_seed" else ()))
+            if self.suite not in heeded:
+                raise ValueError(f"{option}: expected with suite {', '.join(heeded)}; found {self.suite}.")
+            if self.gate or self.rebase:
+                raise ValueError(
+                    f"{option}: expected without --gate and --rebase: a baseline is of the suite's own seeds."
+                )
+            if value < least:
+                raise ValueError(f"{option}: expected {least} or more; found {value}.")
+        return drawn
 
 
 COMMANDS: dict[str, Callable[..., Any]] = {

@@ -10,6 +10,22 @@ import tyro
 
 from . import __version__
 
+EXTRAS = {
+    "torch": "recon", "plyfile": "recon", "av": "video", "cv2": "video", "PIL": "video", "gsplat": "cuda",
+    "ott": "rivals", "jax": "rivals",
+}  # fmt: skip
+"""The extra of otsync (pyproject.toml) that brings a package, by the name that it is imported by."""
+
+
+def lacking(error: ModuleNotFoundError) -> str:
+    """Which package is not there, and what to install."""
+    if not error.name:
+        return f"needs a package that is not installed: {error}"
+    package = error.name.partition(".")[0]
+    extra = EXTRAS.get(package)
+    what = "otsync" if extra is None else f"'otsync[{extra}]'"
+    return f"needs {error.name}. Install it: pip install {what}."
+
 
 def run_command(
     prog: str,
@@ -41,7 +57,7 @@ def run_command(
     except refused as error:
         code, said = 1, str(error)
     except ModuleNotFoundError as error:
-        code, said = 2, f"needs {error.name}. Install it: pip install 'otsync[recon,video]'."
+        code, said = 2, lacking(error)
     except (ValueError, OSError) as error:
         code, said = 2, str(error)
     except KeyboardInterrupt:

@@ -109,6 +109,7 @@ def settle(
     by_pair = {a.pair: a for a in answers} | {a.pair: a for a in linked}
     links = linked if lone else _links(n, linked, x, rates, anchor, trust)
     chosen = _best_tied(n, links, rates) if reference is None else reference
+    rates = rates / rates[chosen]  # they were fitted relative to the anchor; the reference's clock is the world's
     x, sigma, component = _by_component(n, links, rates, chosen, None if chosen != anchor else x)
     final = tuple(by_pair[a.pair] for a in answers)
     return _judge(n, final, links, x, sigma, rates, component, chosen, graph, trust)

@@ -17,7 +17,7 @@ from .types import Camera, TrackSet
 LONGEST = 1.1
 """Readout in frames beyond which it cannot be right: a sensor reads a frame before it begins the next."""
 
-LEAST_STEP = 0.5
+LEAST_SHARE = 0.5
 """Two samples closer in time than this share of their frames' distance tell no velocity: a track that leaps over half
 the image within a frame is none."""
 
@@ -103,8 +103,8 @@ class _Shift:
         taken, u = times + late, -late
         a = taken - np.take_along_axis(taken, self.before, 1)
         b = np.take_along_axis(taken, self.after, 1) - taken
-        has_before &= a >= LEAST_STEP * (times - times[self.before])
-        has_after &= b >= LEAST_STEP * (times[self.after] - times)
+        has_before &= a >= LEAST_SHARE * (times - times[self.before])
+        has_after &= b >= LEAST_SHARE * (times[self.after] - times)
         a, b = np.where(has_before, a, 1.0), np.where(has_after, b, 1.0)
         both = has_before & has_after
         self.from_before = np.where(both, u * (u - b) / (a * (a + b)), np.where(has_before, -u / a, 0.0))

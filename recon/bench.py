@@ -27,6 +27,7 @@ from otsync.types import Offsets, TrackSet
 from recon.backdrop import StaticFit
 from recon.bench_plot import plot
 from recon.bench_rows import KEY, find, measured_before, paper_tables
+from recon.checks import check_number, check_whole
 from recon.configurations import CONFIGURATIONS, Configuration
 from recon.device import device_of
 from recon.effects import Gain, with_declared
@@ -77,11 +78,18 @@ class Protocol:
     budget: float | None = None
     batch: int = 2
     width: int = 320
-    voxel: float = 2.7
-    sh_degree: int = 0
+    voxel: float = Seeding.voxel
+    sh_degree: int = Seeding.sh_degree
     held_out_tracks: float = 0.1
     backdrop_steps: int = 1500
     device: str = "cpu"
+
+    def plan(self, **more: Any) -> Plan:
+        """What is done with the recording, as far as all rows agree, and what ``more`` says of one."""
+        return Plan(
+            width=self.width, seeding=Seeding(voxel=self.voxel, sh_degree=self.sh_degree), batch=self.batch,
+            backdrop_steps=self.backdrop_steps, device=self.device, **more,
+        )  # fmt: skip
 
     @property
     def lengths(self) -> tuple[int, ...]:
@@ -96,7 +104,8 @@ class Material:
     Args:
         scene: training and held-out videos; the training ones with depth. tracks: that scaffolds are built from.
         kept: tracks that none is. truth: offsets of every video.
-        backdrop: the static part, where cameras that do not train have a share in it.
+        backdrop: the static part, where cameras that do not train have a share in it; its gains are those of ``train``.
+            None: every row fits one to its training videos.
     """
 
     scene: Scene
@@ -145,12 +154,13 @@ def material_of(
     if protocol.cameras is not None:
         train = rig.take(protocol.cameras)
         with progress.stage("backdrop"):
-            plan = Plan(width=protocol.width, backdrop_steps=protocol.backdrop_steps, device=protocol.device)
             footage = read_footage(rig, protocol.width, cache, map, progress)
-            backdrop = backdrop_of_scene(rig, tracks, footage, plan, cache, progress)
-            if backdrop is not None:
-                own = [rig.names.index(n) for n in train.names]
-                backdrop = replace(backdrop, gains=backdrop.gains[own], psnr=backdrop.psnr[own])
+            backdrop = backdrop_of_scene(rig, tracks, footage, protocol.plan(), cache, progress)
+            if backdrop is None:
+                progress.note("the whole rig gave no static part: every row makes one from its training cameras alone")
+            else:
+                at = [rig.names.index(n) for n in train.names]
+                backdrop = replace(backdrop, gains=backdrop.gains[at], psnr=backdrop.psnr[at])
         tracks = tuple(t for t in tracks if t.name in train.names)
     held = scene.take(protocol.held_out) if protocol.held_out else None
     if held is not None:
@@ -172,11 +182,7 @@ def measure(
     believed = material.believed(amplitude, seed)
     built_from = believed if configuration.start == "given" else material.truth
     margin = max(configuration.scaffold.margin, (amplitude + 1) / float(believed.fps[believed.reference]))
-    plan = Plan(
-        width=protocol.width, scaffold=replace(configuration.scaffold, margin=margin), losses=configuration.losses,
-        seeding=Seeding(voxel=protocol.voxel, sh_degree=protocol.sh_degree), batch=protocol.batch, backdrop_steps=protocol.backdrop_steps,
-        device=protocol.device,
-    )  # fmt: skip
+    plan = protocol.plan(scaffold=replace(configuration.scaffold, margin=margin), losses=configuration.losses)
     ready = prepare(
         material.scene, built_from, material.tracks, plan=plan, held_out=material.held_out, backdrop=material.backdrop,
         cache=cache, map=map,
@@ -240,15 +246,15 @@ def motion_figures(scene: Gaussians4D, ready: Prepared, kept: Sequence[TrackSet]
 
 def positions_at(tracks: TrackSet, times: np.ndarray) -> np.ndarray:
     """(N,T,3) at seconds of the video's own clock: between two neighbouring frames on the line; nan where not seen."""
-    own, held = tracks.times, np.full((len(tracks), len(times), 3), np.nan)
-    if len(own) < 2:
+    frame_times, held = tracks.times, np.full((len(tracks), len(times), 3), np.nan)
+    if len(frame_times) < 2:
         return held
     positions = tracks.positions()
-    after = np.searchsorted(own, times).clip(1, len(own) - 1)
-    gap = own[after] - own[after - 1]
-    share = (times - own[after - 1]) / gap
+    after = np.searchsorted(frame_times, times).clip(1, len(frame_times) - 1)
+    gap = frame_times[after] - frame_times[after - 1]
+    share = (times - frame_times[after - 1]) / gap
     on_one = np.minimum(np.abs(share), np.abs(1 - share)) < NEAR
-    inside = on_one | (share > 0) & (share < 1) & (gap < 1.5 * np.median(np.diff(own)))
+    inside = on_one | (share > 0) & (share < 1) & (gap < 1.5 * np.median(np.diff(frame_times)))
     before, behind, share = positions[:, after - 1], positions[:, after], share[None, :, None]
     # on a frame its neighbour does not matter, which may not have seen the point
     between = np.where(share < NEAR, before, np.where(share > 1 - NEAR, behind, before + share * (behind - before)))
@@ -278,7 +284,11 @@ def run(
     unknown = [r for r in rows if r not in CONFIGURATIONS]
     if unknown:
         raise ValueError(f"rows: expected some of {', '.join(CONFIGURATIONS)}; found {', '.join(unknown)}.")
-    device_of(protocol.device)  # before the work, not after it
+    protocol.plan()  # says what is wrong before the work, not after it
+    for steps in protocol.steps:
+        check_whole("steps", steps, 0)
+    if protocol.budget is not None:
+        check_number("budget", protocol.budget)
     kept, progress, lpips = Cache(cache or out / "stages"), Progress(tell), lpips or Lpips()
     description = about(protocol, scene, truth)
     found = measured_before(out, description)
@@ -307,12 +317,9 @@ def run(
 def about(protocol: Protocol, scene: Scene, truth: Offsets) -> Mapping[str, Any]:
     """What the figures were made with; rows are continued where all of it agrees."""
     clips = [[v.name, len(v.frames), v.camera.width, v.camera.height] for v in scene.videos]
-    settings = dict(vars(protocol))
-    if protocol.device == "cpu":  # as in files from before there was a choice: their rows are continued
-        del settings["device"]
     true = {n: round(float(s), 6) for n, s in zip(truth.names, truth.seconds, strict=True)}
     return {
-        "protocol": settings, "figures": FIGURES, "recording": {"videos": clips, "truth": true},
+        "protocol": dict(vars(protocol)), "figures": FIGURES, "recording": {"videos": clips, "truth": true},
         "published": PUBLISHED, "unit": "frames, dB, footprints",
     }  # fmt: skip
 

@@ -23,6 +23,7 @@ from recon.commands_bench import Bench
 from recon.density import Densify
 from recon.export import Format
 from recon.motion import ScaffoldOptions
+from recon.seed import Seeding
 
 if TYPE_CHECKING:
     from otsync.io import Scene
@@ -58,9 +59,9 @@ class FitOptions:
     densify: Densify | None = None
     """Split what is pulled hardest, drop what is faint; off unless asked for."""
     scaffold: ScaffoldOptions = field(default_factory=ScaffoldOptions)
-    voxel: float = 2.7
+    voxel: float = Seeding.voxel
     """Working pixels between the Gaussians that what moves begins with: finer is slower and shows more."""
-    sh_degree: int = 0
+    sh_degree: int = Seeding.sh_degree
     """Harmonics of the colours of what moves, 1 to 4 where they depend on the view (sheen); 0: they do not."""
     exposure: float = 0.0
     """Seconds that the shutters were open, where moving things are blurred; 0: sharp. Readouts are in the scene."""
@@ -77,7 +78,6 @@ class FitOptions:
         """The pipeline's form of this."""
         from recon.effects import MotionBlur
         from recon.plan import Plan
-        from recon.seed import Seeding
 
         return Plan(
             effects=(MotionBlur(self.exposure),) if self.exposure else (),
@@ -126,6 +126,7 @@ class Fit:
     def run(self) -> int:
         from otsync.types import Offsets, TrackSet
 
+        self.fit.length(), self.fit.plan()  # before the work, not after it
         scene = opened(self.scene, self.fit.allow_outside)
         offsets = Offsets.load(self.offsets)
         tracks = tuple(TrackSet.load(path) for path in self.tracks) or None

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-WRITTEN = (type(None), bool, int, float, complex, str, bytes)  # their repr is all there is to them
+PLAIN = (type(None), bool, int, float, complex, str, bytes)  # their repr is all there is to them
 
 
 def content_key(*items: Any) -> str:
@@ -38,7 +38,7 @@ def _hash(x: Any, inside: tuple[int, ...]) -> hashlib.blake2b:
 
 def _feed(digest: hashlib.blake2b, x: Any, inside: tuple[int, ...]) -> None:
     """Add ``x``; inside: ids of the objects that hold it, from the outermost on."""
-    if type(x) in WRITTEN:
+    if type(x) in PLAIN:
         return _say(digest, x)
     if isinstance(x, Tensor):
         _say(digest, "tensor", str(x.dtype), tuple(x.shape))

@@ -16,7 +16,8 @@ def device_of(name: torch.device | str) -> torch.device:
         device = torch.device(name)
     except (RuntimeError, TypeError):
         device = None
-    if device is None or device.type not in ("cpu", "cuda"):
+    # "cpu:3" is a name to torch, but no tensor is there: they say that they are on "cpu"
+    if device is None or device.type not in ("cpu", "cuda") or (device.type == "cpu" and device.index is not None):
         raise ValueError(f"device: expected 'cpu', 'cuda' or 'cuda:N'; found {str(name)!r}.")
     if device.type == "cpu":
         return device

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
+from recon.checks import check_whole
 from recon.density import Densify
 from recon.device import device_of
 from recon.effects import Effect
@@ -26,12 +27,16 @@ class Plan:
     Args:
         width: working pixels. frames: first and last (exclusive) frame of every video; None: all.
         scaffold: how the motion is built. seeding: how densely Gaussians begin.
-        losses, effects, densify: of the fit; effects get the gains of the backdrop by themselves.
+        losses, effects, densify: of the fit. The rolling shutters that cameras declare and the gains of the backdrop
+            are added to the effects by themselves.
         freeze: parameter groups that the fit holds, "offsets" for instance.
-        batch: images a step, each on a thread of its own.
+        batch: images a step. On a CPU each is rendered on a thread of its own; on a GPU all are one rendering, unless
+            a shutter or an exposure is modelled or the scene is drawn together with its static part.
         views: frames of every camera that are compared at the end. backdrop_steps: of the fit of the static part.
         save_every: seconds between savings of the fit.
         device: where static part and motion are fitted: "cpu", or "cuda" for a GPU; the rest is done on the CPU.
+
+    ValueError names a number that makes no sense, and a device that is not there.
     """
 
     width: int = 320
@@ -50,6 +55,8 @@ class Plan:
     device: str = "cpu"
 
     def __post_init__(self) -> None:
+        for name, least in (("width", 1), ("batch", 1), ("views", 1), ("backdrop_steps", 0)):
+            check_whole(name, getattr(self, name), least)
         device_of(self.device)
 
 

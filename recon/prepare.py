@@ -74,8 +74,10 @@ def prepare(
         tracks: in space, one set a video; those of other than training videos are left out, with a note. Default:
             tracked and lifted here.
         held_out: names of videos that nothing here sees but their own footage.
-        backdrop: the static part, its gains those of the training videos; default: fitted here.
+        backdrop: the static part, its gains those of the training videos in their order; default: fitted here.
         cache: an :class:`otsync.priors.cache.Cache`. map: any map-like callable; two threads use two cores.
+
+    ValueError names what is missing or does not fit: a backdrop with gains of other videos, nothing that moves.
     """
     from otsync.priors.cache import Cache
 
@@ -87,6 +89,11 @@ def prepare(
     with progress.stage("reading"):
         scene = readable(scene, cache, map, progress)
         train, others, offsets, clocks = split(scene, offsets, held_out, progress)
+    if backdrop is not None and backdrop.gains.shape != (len(train.videos), 3):
+        raise ValueError(
+            f"backdrop: expected gains of shape ({len(train.videos)},3), of the videos to fit in their order "
+            f"({', '.join(train.names)}); found {backdrop.gains.shape}. Keep the gains of those videos alone."
+        )
     if tracks is None:
         with progress.stage("tracks"):
             tracks = lifted_tracks(train, offsets, cache, map, progress)
@@ -98,7 +105,9 @@ def prepare(
     if not any((f.boxes[:, 2] > f.boxes[:, 0]).any() for f in footage):
         raise ValueError("scene: expected something that moves; the masks are empty in every frame of every video.")
     with progress.stage("backdrop"):
-        static = backdrop or backdrop_of_scene(train, tracks, footage, plan, cache, progress)
+        static = backdrop
+        if static is None:
+            static = backdrop_of_scene(train, tracks, footage, plan, cache, progress)
     with progress.stage("initial scene"):
         initial = initial_scene(train, offsets, tuple(tracks), footage, static, plan, cache, map, progress)
     gains = np.ones((len(footage), 3)) if static is None else static.gains

@@ -19,6 +19,7 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from otsync.types import Offsets
+from recon.checks import check_number, check_whole
 from recon.depth import Depths, depth_at
 from recon.footage import Footage
 from recon.gaussians import Gaussians
@@ -54,8 +55,11 @@ class Seeding:
     sh_degree: int = 0
 
     def __post_init__(self) -> None:
-        if not (self.voxel > 0 and self.reach > 0 and self.scale > 0 and self.support >= 1 and 0 < self.opacity < 1):
-            raise ValueError(f"Seeding: expected positive lengths, support >= 1 and opacity in 0..1; found {self}.")
+        for name in ("voxel", "reach", "scale"):
+            check_number(name, getattr(self, name))
+        check_whole("support", self.support, 1)
+        check_number("opacity", self.opacity, 0, 1)
+        check_whole("sh_degree", self.sh_degree, 0, 4)
 
 
 def moments(span: tuple[float, float], frame_step: float, apart: float = APART) -> np.ndarray:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +17,7 @@ import pytest
 
 from otsync import Offsets, TrackSet, __version__
 from otsync.cli import Simulate, main
+from otsync.command_line import EXTRAS
 from otsync.types import Alignment, Refused, Status
 
 ROOT = Path(__file__).parents[1]
@@ -38,7 +41,31 @@ def test_simulate_writes_track_sets_and_the_truth(world):
     "error, code, says",
     [
         (Refused("align", Alignment(0.0, status=Status.WEAK)), 1, "otsync: align: weak"),
-        (ModuleNotFoundError("No module named 'torch'", name="torch"), 2, "otsync: needs torch. Install it: pip"),
+        (
+            ModuleNotFoundError("No module named 'torch'", name="torch"),
+            2,
+            "otsync: needs torch. Install it: pip install 'otsync[recon]'.",
+        ),
+        (
+            ModuleNotFoundError("No module named 'PIL'", name="PIL.Image"),
+            2,
+            "otsync: needs PIL.Image. Install it: pip install 'otsync[video]'.",
+        ),
+        (
+            ModuleNotFoundError("No module named 'ott'", name="ott"),
+            2,
+            "otsync: needs ott. Install it: pip install 'otsync[rivals]'.",
+        ),
+        (
+            ModuleNotFoundError("No module named 'tqdm'", name="tqdm"),
+            2,
+            "otsync: needs tqdm. Install it: pip install otsync.",
+        ),
+        (
+            ModuleNotFoundError("nothing to decode with"),
+            2,
+            "otsync: needs a package that is not installed: nothing to decode",
+        ),
         (ValueError("videos: expected two"), 2, "otsync: videos: expected two"),
         (FileNotFoundError("no such file"), 2, "otsync: no such file"),
         (KeyboardInterrupt(), 130, "otsync: interrupted; nothing half-written is left."),
@@ -51,6 +78,15 @@ def test_what_stops_a_command_decides_its_exit_code(error, code, says, tmp_path,
     monkeypatch.setattr(Simulate, "run", stop)
     assert main(["simulate", str(tmp_path)]) == code
     assert capsys.readouterr().err.startswith(says)
+
+
+def test_every_optional_package_names_the_extra_that_brings_it():
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    sold_as = {"cv2": "opencv-contrib-python-headless", "PIL": "pillow", "ott": "ott-jax", "jax": "ott-jax"}
+    for package, extra in EXTRAS.items():
+        assert any(re.match(r"[\w-]+", line)[0] == sold_as.get(package, package) for line in extras[extra]), package
+    optional = {re.match(r"[\w-]+", line)[0] for name in extras if name != "test" for line in extras[name]}
+    assert {sold_as.get(package, package) for package in EXTRAS} == optional - {"otsync"}
 
 
 def test_any_other_error_is_a_defect_and_shows_where(tmp_path, monkeypatch):
@@ -121,6 +157,10 @@ def test_a_refused_answer_exits_with_one(tmp_path, capsys):
         (["match", "{world}/video0.npz", "{world}/video1.npz", "matcher:partial-fgw", "--matcher.mass", "7"], "PartialFGW.mass"),
         (["simulate", "{world}/x", "--motion", "waltz"], "waltz"),
         (["simulate", "{world}/x", "--fps", "0"], "fps"),
+        (["bench", "raster", "--first-seed", "3"], "--first-seed: expected with suite core, match, sync, panoptic; found raster"),
+        (["bench", "panoptic", "--seeds", "3"], "--seeds: expected with suite core, match, sync; found panoptic"),
+        (["bench", "sync", "--gate", "--first-seed", "8100"], "--first-seed: expected without --gate and --rebase"),
+        (["bench", "sync", "--seeds", "0"], "--seeds: expected 1 or more; found 0"),
     ],
 )  # fmt: skip
 def test_bad_arguments_and_files_exit_with_two(args, message, world, capsys, monkeypatch, tmp_path):
@@ -139,6 +179,23 @@ def shell(*args: str, **options) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, "-m", "otsync.cli", *args], capture_output=True, text=True, cwd=ROOT, timeout=120, **options
     )
+
+
+@pytest.mark.parametrize(
+    ("args", "module", "drawn"),
+    [
+        (["sync", "--first-seed", "8100", "--seeds", "5"], "sync", {"first_seed": 8100, "seeds": 5}),
+        (["sync", "--first-seed", "0", "--promises"], "sync", {"first_seed": 0, "promises": True}),
+        (["match", "--seeds", "3", "--promises"], "match_limits", {"seeds": 3}),
+        (["core", "--first-seed", "7100"], "core", {"first_seed": 7100}),
+        (["sync"], "sync", {}),
+    ],
+)
+def test_chosen_seeds_reach_every_benchmark_that_draws(args, module, drawn, monkeypatch):
+    seen = []
+    monkeypatch.setattr(f"otsync.bench.{module}.run", lambda out, **options: seen.append(options) or 0)
+    assert main(["bench", *args]) == 0
+    assert [{k: v for k, v in options.items() if k not in ("gate", "rebase")} for options in seen] == [drawn]
 
 
 def test_version_help_and_unknown_commands():

@@ -8,6 +8,7 @@ import sys
 import pytest
 
 from otsync import progress
+from otsync.bench.sync_shutter import shutter_rows
 from otsync.bench.sync_worlds import pair_cases
 from otsync.cli import main
 
@@ -58,3 +59,7 @@ def test_simulations_and_benchmarks_are_counted(attach, tmp_path):
     cases = list(pair_cases(("clean",), (1,), ("boxes", "tennis")))
     assert [(c.motion, c.band) for c in cases] == [(m, b) for m in ("boxes", "tennis") for b in range(3)]
     assert "pairs:   0%" in terminal.getvalue() and "0/6" in terminal.getvalue()
+    few, more = (shutter_rows(seeds, ("clean",), (2, 3), ("boxes",)) for seeds in ((1,), (1, 2)))
+    told = terminal.getvalue()
+    assert "shutters, clean, 2 videos:   0%" in told and "0/2" in told
+    assert [a == b for a, b in zip(few, more, strict=True)] == [False] * 3 + [True] * 3  # of many videos the first seed

@@ -200,6 +200,11 @@ def test_rates_of_long_clips_are_fitted_over_the_graph():
     np.testing.assert_allclose(found.seconds, truth.offsets, atol=0.1 / 30)
     fixed = synchronize(tracks, matches=given)
     assert Status.RATE_MISMATCH in fixed.flags[1]
+    # whichever video is chosen, the world's clock is its own
+    chosen = synchronize(tracks, matches={p: m for p, m in given.items() if 1 in p}, rate="fit", reference="auto")
+    assert chosen.reference == 1 and chosen.rates[1] == 1.0 and chosen.seconds[1] == 0
+    np.testing.assert_allclose(chosen.rates, [1 / 1.001, 1, 1 / 1.001], atol=1.5e-4)
+    np.testing.assert_allclose(chosen.seconds, (truth.offsets - truth.offsets[1]) / 1.001, atol=0.1 / 30)
 
 
 def test_bad_arguments_are_refused_by_name(four):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 from collections.abc import Mapping
@@ -221,7 +222,11 @@ class Offsets:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Offsets:
-        """Read ``offsets.json``; matches, curves, paths and cost maps are not in the file. ValueError names file and field."""
+        """Read ``offsets.json``; matches, curves, paths and cost maps are not in the file.
+
+        A video with an offset has a rate and a frame rate; the reference's clock is the world's: offset 0, rate 1.
+        ValueError names file and field.
+        """
         data = read_json(path)
         if not isinstance(data, dict) or data.get("format") != FORMAT:
             raise ValueError(f"{path}: expected an offsets file written by otsync (format {FORMAT!r}); found another.")
@@ -265,8 +270,8 @@ class Offsets:
                 sigma=_float(p["sigma_seconds"], f"{what}: sigma_seconds", least=0),
                 hypotheses=_rows_of_two(p["hypotheses"], f"{what}: hypotheses"),
                 fps=_float(p["fps"], f"{what}: fps", above=0),
-                status=Status.from_code(p["status"]),
-                flags=tuple(Status.from_code(f) for f in p["flags"]),
+                status=_status(p["status"], f"{what}: status"),
+                flags=_flags(p["flags"], f"{what}: flags"),
                 stats={str(k): _float(x, f"{what}: stats, {k}") for k, x in p["stats"].items()},
             )
         reference = place(data["reference"], "reference")
@@ -278,16 +283,35 @@ class Offsets:
                 f"videos, {videos[v]['name']}: reference: expected a video that is its own reference; found "
                 f"{videos[v]['reference']!r}"
             )
+        seconds, rates, fps = column("offset_seconds"), column("rate", above=0), column("fps", above=0)
+        for key, values in (("rate", rates), ("fps", fps)):
+            for v in np.flatnonzero(np.isfinite(seconds) & np.isnan(values)).tolist():
+                raise ValueError(
+                    f"videos, {videos[v]['name']}: {key}: expected a number, since it has an offset; found null"
+                )
+        for v in np.flatnonzero(component == np.arange(len(videos))).tolist():
+            # one that hangs together with no other may have no answer; the reference is where the world's clock begins
+            if seconds[v] != 0 and (v == reference or np.isfinite(seconds[v])):
+                none = "" if v == reference else " or null"
+                raise ValueError(
+                    f"videos, {videos[v]['name']}: offset_seconds: expected 0{none} of a video that is its own reference; "
+                    f"found {json.dumps(videos[v]['offset_seconds'])}"
+                )
+        if rates[reference] != 1:
+            raise ValueError(
+                f"videos, {videos[reference]['name']}: rate: expected 1, since the clock of the reference is the world's; "
+                f"found {rates[reference]:g}"
+            )
         return cls(
             names=tuple(index),
-            fps=column("fps", above=0),
-            seconds=column("offset_seconds"),
-            rates=column("rate", above=0),
+            fps=fps,
+            seconds=seconds,
+            rates=rates,
             sigma=column("sigma_seconds", least=0),
             reference=reference,
             component=component,
-            status=tuple(Status.from_code(video["status"]) for video in videos),
-            flags=tuple(in_order(Status.from_code(f) for f in video["flags"]) for video in videos),
+            status=tuple(_status(video["status"], f"videos, {video['name']}: status") for video in videos),
+            flags=tuple(in_order(_flags(video["flags"], f"videos, {video['name']}: flags")) for video in videos),
             alignments=alignments,
             stats={str(k): _float(x, f"stats, {k}") for k, x in data["stats"].items()},
         )
@@ -309,6 +333,20 @@ def _float(x: Any, what: str, *, above: float = -math.inf, least: float = -math.
         bound = f" above {above:g}" if above > -math.inf else f" of {least:g} or more" if least > -math.inf else ""
         raise ValueError(f"{what}: expected a finite number{bound}, or null; found {x!r}")
     return float(x)
+
+
+def _status(code: Any, what: str) -> Status:
+    """The status of this code. ValueError begins with ``what``."""
+    try:
+        return Status.from_code(code)
+    except ValueError as error:
+        raise ValueError(f"{what}: {str(error).removeprefix('status: ').removesuffix('.')}") from None
+
+
+def _flags(codes: Any, what: str) -> tuple[Status, ...]:
+    if not isinstance(codes, list):
+        raise ValueError(f"{what}: expected a list of codes; found {str(codes)[:80]!r}")
+    return tuple(_status(code, what) for code in codes)
 
 
 def _rows_of_two(rows: Any, what: str) -> np.ndarray:

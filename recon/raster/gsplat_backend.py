@@ -83,6 +83,7 @@ def rasterize(
     if options.depth is not None:
         image, depths = image[..., :-1], image[..., -1:].to(dtype)
     radii = meta["radii"].reshape(c, n, 2).to(torch.int32)
+    # means2d in gsplat's own shape: a reshaped one would be no part of the graph, and have no gradient
     return Rendering(image.to(dtype), alphas.to(dtype), depths, meta["means2d"], radii, "gsplat")
 
 

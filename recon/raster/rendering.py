@@ -82,13 +82,16 @@ class Splats(NamedTuple):
 class Rendering:
     """Images of C cameras, and what densification asks for.
 
-    `means2d` takes part in the graph: call `rendering.means2d.retain_grad()` before `backward()` to read the gradient
-    of the loss with respect to the 2-D means (per pixel, [C,N,2]); `radii > 0` are the Gaussians that were drawn.
+    `means2d` takes part in the graph: call `rendering.means2d.retain_grad()` before `backward()`, or pass it to
+    `torch.autograd.grad`, to read the gradient of the loss with respect to the 2-D means (per pixel); `radii > 0` are
+    the Gaussians that were drawn. It is the very tensor that was rasterized: a view of it would be beside the graph and
+    have no gradient. So it keeps gsplat's own shape, which is [C,1,N,2] where means are [C,N,3], one set per camera;
+    bring gradients to one shape with `grad.reshape(rendering.radii.shape)`, which is [C,N,2] everywhere.
     """
 
     colors: Tensor  # [C,H,W,D]
     alphas: Tensor  # [C,H,W,1] 1 - transmittance
     depths: Tensor | None  # [C,H,W,1] z in the camera frame, expected or accumulated; None when not asked for
-    means2d: Tensor  # [C,N,2] pixels ([C,1,N,2] by gsplat, where every camera looks at another moment)
+    means2d: Tensor  # [C,N,2] pixels; by gsplat [C,1,N,2] where means are per camera
     radii: Tensor  # [C,N,2] int32 pixels
     backend: str  # "torch", "cpu" or "gsplat"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -10,16 +11,22 @@ import numpy as np
 import pytest
 import torch
 
-from otsync.types import TrackSet
+from otsync.io import open_scene
+from otsync.priors.cache import Cache
+from otsync.types import Offsets, TrackSet
 from recon import bench
 from recon.bench_plot import curve, held, plot
 from recon.bench_rows import find, measured_before, paper_tables
 from recon.capture import clocks
+from recon.configurations import CONFIGURATIONS
+from recon.effects import Gain, RollingShutter
 from recon.gaussians4d import Gaussians4D
 from recon.held_out import Clock
 from recon.motion import HermiteSpline, PerGaussian
+from recon.plan import Plan, Progress
+from recon.prepare import prepare
 
-from .worlds import FRAMES, capture
+from .worlds import FRAMES, SIZE, capture, write_world
 
 STEP = 1 / 30
 
@@ -84,6 +91,77 @@ def test_held_out_views_are_drawn_as_the_fit_drew_them(truth, monkeypatch, layer
     assert seen == [layered] and figures["psnr"] > 20 and np.isnan(figures["lpips"])
 
 
+TINY = bench.Protocol(held_out=("held0",), width=SIZE[0], backdrop_steps=5)
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory):
+    """A recording, its truth, and a cache that the stages of every protocol share."""
+    folder = write_world(tmp_path_factory.mktemp("world"))
+    return open_scene(folder), Offsets.load(folder / "truth.json"), Cache(folder / "stages")
+
+
+def material(world, *cameras: str, **changed) -> bench.Material:
+    scene, truth, cache = world
+    return bench.material_of(scene, truth, replace(TINY, cameras=cameras or None, **changed), cache, map, Progress())
+
+
+def test_few_cameras_in_another_order_keep_what_the_rig_gave_each(world):
+    """Their images alone are fewer: depth, tracks and the static part are those of all, each camera with its own."""
+    whole, few = material(world, "cam0", "cam1", "cam2"), material(world, "cam2", "cam0")
+    assert material(world).backdrop is None and whole.train == ("cam0", "cam1", "cam2")
+    assert few.scene.names == ("cam2", "cam0", "held0") == few.truth.names and few.train == ("cam2", "cam0")
+    assert few.truth.seconds.tolist() == [whole.truth.seconds[2], whole.truth.seconds[0], whole.truth.seconds[3]]
+    assert few.truth.names[few.truth.reference] == "cam0"
+    counts = [{t.name: len(t) + len(k) for t, k in zip(m.tracks, m.kept, strict=True)} for m in (few, whole)]
+    assert counts[0] == {n: counts[1][n] for n in ("cam0", "cam2")} and min(counts[0].values()) > 0
+    for name in few.train:
+        mine, theirs = (m.scene.videos[m.scene.names.index(name)] for m in (few, whole))
+        assert all(np.array_equal(a, b) for a, b in zip(mine.depth, theirs.depth, strict=True))
+    gains, psnr = whole.backdrop.gains, whole.backdrop.psnr
+    assert np.ptp(gains, axis=0).min() > 1e-4 and len(set(psnr)) == 3  # so that another camera's would be noticed
+    assert np.array_equal(few.backdrop.gains, gains[[2, 0]]) and np.array_equal(few.backdrop.psnr, psnr[[2, 0]])
+    assert torch.equal(few.backdrop.gaussians.means, whole.backdrop.gaussians.means)
+
+
+def test_a_backdrop_with_the_gains_of_other_videos_is_refused(world):
+    scene, truth, cache = world
+    whole = material(world, "cam0", "cam1", "cam2").backdrop
+    with pytest.raises(ValueError, match=r"backdrop: expected gains of shape \(2,3\).*\(cam0, cam1\); found \(3, 3\)"):
+        prepare(
+            scene, truth, capture().tracks, plan=Plan(width=SIZE[0]), held_out=("held0", "cam2"), backdrop=whole,
+            cache=cache,
+        )  # fmt: skip
+
+
+def test_a_rig_without_a_static_part_is_said(world):
+    scene, truth, cache = world
+    everywhere = [np.ones((len(v.frames), SIZE[1], SIZE[0]), bool) for v in scene.videos]
+    progress = Progress()
+    protocol = replace(TINY, cameras=("cam0", "cam1"))
+    found = bench.material_of(replace(scene, masks=tuple(everywhere)), truth, protocol, cache, map, progress)
+    assert found.backdrop is None
+    assert any("the whole rig gave no static part" in note for note in progress.notes)
+
+
+def test_declared_readouts_reach_the_fit_by_video(world, monkeypatch):
+    readouts, seen, fit = {"cam0": 0.01, "cam1": None, "cam2": 0.03}, [], bench.fit
+
+    def spied(*args, **options):
+        seen.append(([f.name for f in args[1]], options["effects"]))
+        return fit(*args, **options)
+
+    monkeypatch.setattr(bench, "fit", spied)
+    scene, truth, cache = world
+    videos = tuple(replace(v, camera=replace(v.camera, readout=readouts.get(v.name))) for v in scene.videos)
+    rolled = material((replace(scene, videos=videos), truth, cache), "cam2", "cam0", "cam1")
+    row = bench.measure("ours", CONFIGURATIONS["ours"], rolled, TINY, 1.0, 0, 1, cache, map)
+    ((names, (shutter, gain)),) = seen
+    assert names == ["cam2", "cam0", "cam1"] and shutter == RollingShutter((0.03, 0.01, 0.0))
+    assert isinstance(gain, Gain) and np.array_equal(gain.start, rolled.backdrop.gains)
+    assert row["images"] == TINY.batch
+
+
 def row(name: str, amplitude: float = 1.0, seed: int = 0, **figures: float | None) -> dict:
     base = {"steps": 2500, "cpu_seconds": 100.0, "start": 0.5, "mean": 0.1, "max": 0.2, "psnr": 25.0, "ssim": 0.9, "lpips": None, "mask_psnr": 20.0,
             "mask_ssim": 0.8, "neighbour_change": 0.3, "follow_20": 2.0}  # fmt: skip
@@ -104,16 +182,6 @@ def test_rows_are_continued_only_where_they_were_measured_alike(tmp_path):
         (tmp_path / "recon.json").write_text(text)
         with pytest.raises(ValueError, match=r"recon\.json: expected"):
             measured_before(tmp_path, about)
-
-
-def test_rows_of_the_cpu_go_on_and_those_of_a_gpu_stand_apart():
-    """Files from before there was a choice name no device."""
-    scene = SimpleNamespace(videos=())
-    here, there = (
-        bench.about(bench.Protocol(device=d), scene, clocks(("a",), np.zeros(1), 30.0))["protocol"]  # type: ignore[arg-type]
-        for d in ("cpu", "cuda")
-    )
-    assert "device" not in here and there == {**here, "device": "cuda"}
 
 
 def test_a_row_without_lpips_is_measured_again_once_there_are_weights():
@@ -148,9 +216,24 @@ def test_the_plot_has_a_line_a_configuration_and_a_point_a_length(tmp_path):
     plot(rows, tmp_path / "recon.svg")
     drawn = (tmp_path / "recon.svg").read_text()
     assert all(name in drawn for name in ("ours", "fixed", "true time", "errors of up to 1 frames"))
+    assert ">CPU seconds of the fit<" in drawn and "GPU" not in drawn
     again = tmp_path / "again.svg"
     plot(rows, again)
     assert again.read_text() == drawn
+
+
+def test_the_plot_of_fits_on_a_gpu_is_against_wall_seconds(tmp_path):
+    rows = [row("ours", steps=n, seconds=n / 100, gpu_gb=0.5, mean=30 / n) for n in (300, 3000)]
+    np.testing.assert_allclose(curve(rows, "mean", "seconds"), [[3, 0.1], [30, 0.01]])
+    plot(rows, tmp_path / "recon.svg")
+    drawn = (tmp_path / "recon.svg").read_text()
+    assert ">wall seconds of the fit, on a GPU<" in drawn and "CPU seconds" not in drawn
+    cpu = [{k: v for k, v in r.items() if k != "gpu_gb"} | {"cpu_seconds": r["seconds"]} for r in rows]
+    plot(cpu, tmp_path / "cpu.svg")
+    lines = [
+        re.findall(r'<path d="M[^"]*L[^"]*" clip-path', text) for text in (drawn, (tmp_path / "cpu.svg").read_text())
+    ]
+    assert lines[0] == lines[1] != []  # drawn at the seconds, not at the CPU's
 
 
 def test_tables_hold_the_longest_fits():

@@ -238,7 +238,7 @@ def test_a_gpu_that_is_not_there_is_refused_before_the_work(scene):
 
 
 def test_what_is_no_device_is_refused():
-    for name in ("gpu", "meta", "cuda:x", ""):
+    for name in ("gpu", "meta", "cuda:x", "", "cpu:3", "cpu:0"):
         with pytest.raises(ValueError, match="device: expected 'cpu', 'cuda' or 'cuda:N'; found"):
             device_of(name)
     assert device_of("cpu").type == "cpu"

@@ -16,7 +16,7 @@ import torch
 
 from otsync.types import Offsets, Status
 from recon.density import Densify
-from recon.effects import Gain, MotionBlur, RollingShutter, Shot
+from recon.effects import Gain, MotionBlur, RollingShutter, Shot, with_declared
 from recon.fit import LOSSES, RATES, Diverged, fit
 from recon.gaussians import Gaussians
 from recon.gaussians4d import Gaussians4D
@@ -126,6 +126,19 @@ def test_the_sign_of_an_offset(capture, scene):
         run.look({**run.values(), "offsets": torch.zeros(3).double()}, 1, 2, 0.05),
     )
     assert torch.equal(later, now)
+
+
+def test_every_video_is_seen_through_its_own_readout(capture, scene):
+    readouts = [0.02, None, 0.06]
+
+    def losses(effects) -> list[float]:
+        problem = Problem.of(scene, capture.footage, believed(capture), (Squared(),), effects, 1, 0)
+        run = Run(problem, dict(RATES), None, 1)
+        return [run.image_gradient(run.values(), ["offsets"], [(v, 4)], False).losses[0] for v in range(3)]
+
+    alone = [losses((RollingShutter(r or 0.0),)) for r in readouts]  # every video through each
+    assert losses(with_declared((), readouts)) == [alone[v][v] for v in range(3)]
+    assert all(len({seen[v] for seen in alone}) == 3 for v in range(3))  # so that another video's would be noticed
 
 
 @pytest.mark.parametrize("batch", [1, 3])

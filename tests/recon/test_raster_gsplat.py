@@ -12,7 +12,7 @@ from recon.raster import render, sh
 from recon.raster.cpu import backend as cpu_backend
 from recon.raster.projection import project, rotation_matrices
 from recon.raster.rendering import Settings
-from tests.recon.scenes import LEAVES, random_scene, relative, run
+from tests.recon.scenes import LEAVES, Scene, random_scene, relative, run
 
 gsplat = pytest.importorskip("gsplat", reason="gsplat is not installed: pip install 'otsync[cuda]'")
 reference = pytest.importorskip("gsplat.cuda._torch_impl")
@@ -185,17 +185,20 @@ def test_gsplat_without_cuda_says_what_to_do():
         SCENE.render("gsplat")
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
-@pytest.mark.parametrize("mode", ["classic", "antialiased"])
-def test_images_and_gradients_on_a_gpu(mode):
-    """gsplat's kernels against the float64 torch back end; a pixel at a threshold may flip."""
-    scene = random_scene(n=2000, width=128, height=96, seed=62, rasterize_mode=mode)
+def agrees_with_the_oracle(scene: Scene) -> None:
+    """Images and gradients of gsplat's kernels against the float64 torch back end; a pixel at a threshold may flip."""
     truth, true_gradients = run(scene, "torch", torch.float64)
     outputs, gradients = run(scene, "gsplat")
     for got, true in zip(outputs, truth, strict=True):
         assert float((got - true).abs().flatten().quantile(0.999)) < 1e-4
     for name, true in true_gradients.items():
         assert relative(gradients[name], true) < 1e-2, name
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+@pytest.mark.parametrize("mode", ["classic", "antialiased"])
+def test_images_and_gradients_on_a_gpu(mode):
+    agrees_with_the_oracle(random_scene(n=2000, width=128, height=96, seed=62, rasterize_mode=mode))
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
@@ -204,12 +207,7 @@ def test_cameras_that_look_at_other_moments_on_a_gpu():
     scene, g = random_scene(n=2000, width=128, height=96, cameras=3, seed=64), torch.Generator().manual_seed(2)
     means, quats = scene.means + 0.1 * torch.randn(3, 2000, 3, generator=g), torch.randn(3, 2000, 4, generator=g)
     scene = replace(scene, means=means, quats=quats)
-    truth, true_gradients = run(scene, "torch", torch.float64)
-    outputs, gradients = run(scene, "gsplat")
-    for got, true in zip(outputs, truth, strict=True):
-        assert float((got - true).abs().flatten().quantile(0.999)) < 1e-4
-    for name, true in true_gradients.items():
-        assert relative(gradients[name], true) < 1e-2, name
+    agrees_with_the_oracle(scene)
     there = {n: t.cuda() for n, t in scene.leaves().items()}
     there["means"].requires_grad_()
     out = render(*(there[n] for n in LEAVES[:6]), scene.Ks.cuda(), scene.width, scene.height)

@@ -135,7 +135,21 @@ def test_eval_repeats_the_figures_of_the_run(world, result, tmp_path, capsys):
         (["fit", "WORLD", "--offsets", "WORLD/start.json", "--device", "gpu"], "device: expected 'cpu', 'cuda'"),
         (["fit", "WORLD", "--offsets", "WORLD/start.json", "--device", "cuda:99"], "device: expected one that is there"),
         (["bench", "WORLD", "--truth", "WORLD/truth.json", "--device", "cuda:99"], "device: expected one that is there"),
+        (["fit", "WORLD", "--offsets", "WORLD/start.json", "--device", "cpu:3"], "device: expected 'cpu', 'cuda' or 'cuda:N'; found 'cpu:3'"),
         (["fit", "nowhere", "--offsets", "WORLD/start.json"], "nowhere"),
+        # said before anything is read
+        (["fit", "nowhere", "--offsets", "nowhere.json", "--voxel", "nan"], "voxel: expected a finite number above 0; found nan"),
+        (["fit", "nowhere", "--offsets", "nowhere.json", "--sh-degree", "5"], "sh_degree: expected a whole number, 0 to 4; found 5"),
+        (["fit", "nowhere", "--offsets", "nowhere.json", "--batch", "0"], "batch: expected a whole number, 1 or more; found 0"),
+        (["fit", "nowhere", "--offsets", "nowhere.json", "--width", "-4"], "width: expected a whole number, 1 or more; found -4"),
+        (["fit", "nowhere", "--offsets", "nowhere.json", "--backdrop-steps", "-1"], "backdrop_steps: expected a whole number, 0 or more"),
+        (["fit", "nowhere", "--offsets", "nowhere.json", "--exposure", "nan"], "exposure: expected seconds"),
+        (["fit", "nowhere", "--offsets", "nowhere.json", "--budget", "nan"], "--budget: expected seconds above 0"),
+        (["bench", "WORLD", "--truth", "WORLD/truth.json", "--sh-degree", "-1"], "sh_degree: expected a whole number, 0 to 4"),
+        (["bench", "WORLD", "--truth", "WORLD/truth.json", "--voxel", "inf"], "voxel: expected a finite number above 0; found inf"),
+        (["bench", "WORLD", "--truth", "WORLD/truth.json", "--batch", "0"], "batch: expected a whole number, 1 or more"),
+        (["bench", "WORLD", "--truth", "WORLD/truth.json", "--steps", "9", "-9"], "steps: expected a whole number, 0 or more; found -9"),
+        (["bench", "WORLD", "--truth", "WORLD/truth.json", "--budget", "0"], "budget: expected a finite number above 0"),
         (["fit", "WORLD", "--offsets", "WORLD/start.json", "--steps", "3", "--budget", "4"], "expected one of them"),
         (["fit", "WORLD", "--offsets", "WORLD/start.json", "--frames", "50", "60"], "expected first < stop"),
         (["fit", "WORLD", "--offsets", "WORLD/start.json", "--held-out", "cam0"], "the reference (cam0)"),
@@ -152,6 +166,7 @@ def test_bad_arguments_exit_with_two_and_say_what_was_expected(
     assert code == (0 if not says else 2), told.err
     if says:
         assert says in told.err and "Traceback" not in told.err
+    assert not (tmp_path / "bench").exists(), "refused after the work"
 
 
 def test_a_damaged_result_is_named(result, tmp_path, capsys):
@@ -423,14 +438,15 @@ def test_run_says_once_which_frames_it_leaves_out(world, synchronized, tmp_path,
         assert note in (out / "report.html").read_text()
 
 
-def test_run_tells_the_reconstruction_which_frames(world, synchronized, tmp_path):
-    """Evaluation compares only the frames that the scene was made from, so run.json must name them."""
+def test_run_tells_the_reconstruction_which_frames_and_how_long_shutters_were_open(world, synchronized, tmp_path):
+    """Evaluation compares only the frames that the scene was made from, as sharp: run.json must tell both."""
     out = tmp_path / "r"
     args = ["run", str(world), "--out", str(out), "--steps", "2", "--width", str(SIZE[0]), "--frames", "2", "12",
-            "--held-out", "held0"]  # fmt: skip
+            "--held-out", "held0", "--exposure", "0.015"]  # fmt: skip
     assert otsync(args) == 0
     assert synchronized == [[10] * 3]
-    assert json.loads((out / "run.json").read_text())["options"]["frames"] == [2, 12]
+    options = json.loads((out / "run.json").read_text())["options"]
+    assert options["frames"] == [2, 12] and options["exposure"] == 0.015  # as the effects of the fit tell
     times = load_result(out).video("cam1").times
     np.testing.assert_allclose(times, np.arange(2, 12) / 30)  # cut once, not twice
     before = json.loads((out / "metrics.json").read_text())
@@ -448,6 +464,8 @@ def test_run_says_what_it_cannot_do(world, tmp_path, capsys):
         (["--held-out", "held0", "--reference", "held0"], "--reference: expected one of cam0, cam1, cam2"),
         (["--budget", "9"], "expected one of them"),
         (["--device", "cuda:99"], "device: expected one that is there"),
+        (["--width", "0"], "width: expected a whole number, 1 or more"),
+        (["--exposure", "-0.1"], "exposure: expected seconds"),
         (["--frames", "5", "5"], "expected first < stop"),
         (["--recording.route", "stereo", "--held-out", "held0"], "3 videos are fewer than the 5"),
     ):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -131,13 +132,30 @@ def test_a_finer_voxel_plants_more(capture):
 def test_no_depth_is_a_clear_error(capture):
     with pytest.raises(ValueError, match="expected depth where something moves"):
         planted(capture, depth=[lambda k: None] * 3)
-    with pytest.raises(ValueError, match="Seeding: expected"):
-        Seeding(voxel=0)
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"voxel": 0}, "voxel: expected a finite number above 0; found 0"),
+        ({"voxel": math.inf}, "voxel: expected a finite number above 0; found inf"),
+        ({"reach": math.nan}, "reach: expected a finite number above 0; found nan"),
+        ({"scale": "1"}, "scale: expected a finite number above 0; found '1'"),
+        ({"support": 0}, "support: expected a whole number, 1 or more; found 0"),
+        ({"support": 1.5}, "support: expected a whole number, 1 or more; found 1.5"),
+        ({"opacity": 1}, "opacity: expected a number between 0 and 1; found 1"),
+        ({"sh_degree": 5}, "sh_degree: expected a whole number, 0 to 4; found 5"),
+        ({"sh_degree": True}, "sh_degree: expected a whole number, 0 to 4; found True"),
+        ({"sh_degree": 1.0}, "sh_degree: expected a whole number, 0 to 4; found 1.0"),
+    ],
+)
+def test_options_that_make_no_sense_are_refused_by_name(options, says):
+    with pytest.raises(ValueError, match=f"^{says}"):
+        Seeding(**options)
+    assert Seeding(voxel=np.float32(2.0), sh_degree=np.int64(4)).sh_degree == 4
 
 
 def test_room_for_colours_that_depend_on_the_view(capture):
     plain, shiny = planted(capture), planted(capture, options=Seeding(sh_degree=2))
     assert shiny.dynamic.sh.shape == (len(plain), 9, 3) and plain.dynamic.sh_degree == 0
     assert torch.equal(shiny.dynamic.sh[:, :1], plain.dynamic.sh) and not shiny.dynamic.sh[:, 1:].any()
-    with pytest.raises(ValueError, match="sh_degree: expected 0 to 4"):
-        planted(capture, options=Seeding(sh_degree=5))
