@@ -245,7 +245,10 @@ class Eval:
         document = metrics_of(views, {}, reason)
         if self.truth is not None:
             error = offset_figures(result.offsets, true_seconds(Offsets.load(self.truth), result.offsets))
-            print(f"offset error: mean {error['mean_frames']:.3f}, max {error['max_frames']:.3f} frames")
+            if error["mean_frames"] is None:
+                print("offset error: none, for there is one video only")
+            else:
+                print(f"offset error: mean {error['mean_frames']:.3f}, max {error['max_frames']:.3f} frames")
             document["offset_error"] = error
         out = self.out or self.result / "eval.json"
         write_json(out, document)

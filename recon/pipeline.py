@@ -171,10 +171,14 @@ def _write(
 
 
 def offset_figures(offsets: Offsets, true: np.ndarray) -> dict[str, Any]:
-    """Mean and largest absolute error in frames, relative to the reference."""
+    """Mean and largest absolute error in frames, relative to the reference; None where there is no other video."""
     step = 1.0 / float(offsets.fps[offsets.reference])
     error = offset_error(offsets.seconds, true, step, reference=offsets.reference)
-    return {"mean_frames": error.mean, "max_frames": error.max, "frames": [float(e) for e in error.errors]}
+    alone = len(error.errors) < 2
+    return {
+        "mean_frames": None if alone else error.mean, "max_frames": None if alone else error.max,
+        "frames": [float(e) for e in error.errors],
+    }  # fmt: skip
 
 
 def true_seconds(truth: Offsets, offsets: Offsets) -> np.ndarray:

@@ -20,6 +20,7 @@ from otsync.priors.points import ChainedFlow
 from otsync.recordings import synchronize_scene
 from otsync.types import Offsets, Status, TrackSet
 from recon.capture import clocks
+from recon.cli import main, offset_table
 from recon.footage import footage_of
 from recon.gaussians4d import Gaussians4D
 from recon.initial import lifted_tracks, world_footprint
@@ -307,9 +308,15 @@ def test_a_video_without_depth_only_adds_its_images(world, start, tmp_path):
 
 def test_one_camera_with_depth_is_a_scene(world, start, tmp_path):
     outcome = reconstruct(
-        open_scene(world).take(["cam0", "held0"]), start, tmp_path, plan=QUICK, held_out=("held0",), steps=4
-    )
+        open_scene(world).take(["cam0", "held0"]), start, tmp_path, plan=QUICK, held_out=("held0",), steps=4,
+        truth=Offsets.load(world / "truth.json"),
+    )  # fmt: skip
     assert outcome.found.offsets.names == ("cam0",) and len(outcome.found.scene) > 100
+    # no other video, no error of a clock: said so, in a file that any reader of JSON takes
+    error = json.loads((tmp_path / "metrics.json").read_text())["offset_error"]
+    assert error == {"mean_frames": None, "max_frames": None, "frames": [0.0]}
+    assert (tmp_path / "report.html").exists() and "nan" not in offset_table(outcome)
+    assert main(["eval", str(tmp_path), str(world), "--held-out", "held0", "--truth", str(world / "truth.json")]) == 0
     assert isinstance(Gaussians4D.load(tmp_path / "scene.npz"), Gaussians4D)
 
 
