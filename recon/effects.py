@@ -241,8 +241,8 @@ class RollingShutter:
     """Rows are read one after the other: row r is seen at ``t + readout * ((r + 1/2) / height - 1/2)``.
 
     Args:
-        readout: seconds of the own clock from the first to the last row (``Camera.readout``), one for all videos or one per video; 0: all
-            rows at once, the same bits.
+        readout: seconds of the own clock from the first to the last row (``Camera.readout``), one for all videos or one
+            per video; 0: all rows at once, the same bits.
         bands: equal bands of rows that share the time of their middle; each one is a rendering of its rows only. They
             divide the whole image, so that a crop shows what the image would. A row is at most
             ``readout / (2 * bands)`` from its own time.

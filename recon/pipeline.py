@@ -218,7 +218,7 @@ def evaluate(
     part = readable(part, cache, map, progress)
     known = {v.name: v for v in result.videos}
     scores = []
-    exposure = float(result.options.get("exposure") or 0.0)
+    exposure = float(result.options.get("exposure", 0.0))
     blur = (MotionBlur(exposure),) if exposure else ()
     for footage in read_footage(part, int(result.options["width"]), cache, map, progress):
         own = known.get(footage.name)

@@ -149,7 +149,7 @@ def load_result(folder: str | os.PathLike[str]) -> Result:
 
 
 def _options(found: dict[str, Any]) -> dict[str, Any]:
-    """What the fit was told, as far as evaluation needs it. ValueError for what is no width or no range of frames."""
+    """What the fit was told, as far as evaluation needs it. ValueError for no width, range of frames or exposure."""
     options = dict(found)
     if type(options["width"]) is not int or not 1 <= options["width"] <= MAX_SIDE:
         raise ValueError(f"options.width: expected 1 to {MAX_SIDE} pixels; found {options['width']!r}")
@@ -161,6 +161,9 @@ def _options(found: dict[str, Any]) -> dict[str, Any]:
         and 0 <= frames[0] < frames[1]
     ):
         raise ValueError(f"options.frames: expected null, or first and last frame; found {frames!r}")
+    exposure = options.get("exposure", 0.0)
+    if type(exposure) not in (int, float) or not 0 <= exposure < math.inf:
+        raise ValueError(f"options.exposure: expected seconds of 0 or more; found {exposure!r}")
     return options
 
 

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from otsync import Offsets, TrackSet, __version__
+from otsync.bench.sync_worlds import MOVING
 from otsync.cli import Simulate, main
 from otsync.command_line import EXTRAS
 from otsync.types import Alignment, Refused, Status
@@ -268,3 +269,10 @@ def test_an_interrupted_command_says_so(tmp_path):
     # gives -SIGINT, which a shell shows as 130 too
     assert run.returncode in (130, -signal.SIGINT, -signal.SIGABRT), err
     assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_a_gate_without_the_classes_of_its_baseline_judges_nothing(monkeypatch, tmp_path, capsys):
+    """Medians over other pairs would be called worse, or better."""
+    monkeypatch.setattr("otsync.bench.sync.motions", lambda: MOVING)
+    assert main(["bench", "sync", "--gate", "--out", str(tmp_path)]) == 2
+    assert "Set OTSYNC_DATA" in capsys.readouterr().err and not list(tmp_path.iterdir())

@@ -22,7 +22,7 @@ from . import record
 from .record import Row, table, write_rows
 from .sync_acceptance import WRONG, acceptance, pair_rows
 from .sync_shutter import READOUT, shutter_rows
-from .sync_worlds import BANDS, FPS, FRESH, many, motions, pair_cases
+from .sync_worlds import BANDS, FPS, FRESH, MOVING, many, motions, pair_cases
 
 METHODS: dict[str, tuple[Aligner, Refiner]] = {
     "paper (DTW, mode)": (DTW(), Unrefined()),
@@ -63,6 +63,11 @@ def run(
         promises: measure the acceptance figures instead of the tables.
         gate: compare with the committed baseline. rebase: make this the baseline.
     """
+    if (gate or rebase) and motions() == MOVING:
+        raise ValueError(
+            "--gate, --rebase: expected the motion capture that the baseline has among its classes (motion/*.bvh); found "
+            "none. Set OTSYNC_DATA to the data folder."
+        )
     seeds = seeds or (5 if promises else 1)
     chosen = range(first_seed, first_seed + seeds)
     about = {"seeds": seeds, "first_seed": first_seed, "classes": [m.split(":")[0] for m in motions()]}

@@ -191,6 +191,8 @@ def test_a_damaged_result_is_named(result, tmp_path, capsys):
         (("options",), {}),
         (("options", "width"), 0),
         (("options", "width"), "320"),
+        (("options", "exposure"), -1),
+        (("options", "exposure"), "long"),
         (("options", "frames"), 5),
         (("options", "frames"), [4]),
         (("options", "frames"), [4, "x"]),
@@ -273,6 +275,13 @@ def test_declared_readouts_and_given_exposures_reach_the_fit(tmp_path, monkeypat
         return fit(*args, **kwargs)
 
     monkeypatch.setattr(recon.pipeline, "fit", spied)
+    looked, view = {}, recon.pipeline.view
+
+    def looking(scene, footage, *args, **kwargs):
+        looked[footage.name] = kwargs["optics"]
+        return view(scene, footage, *args, **kwargs)
+
+    monkeypatch.setattr(recon.pipeline, "view", looking)
     assert main(["simulate", str(world), "--cameras", "2", "--held-out", "1", "--frames", "6", "--width", "64",
                  "--height", "40", "--readout", "0.02", "--exposure", "0.01", "--sheen", "0.2"]) == 0  # fmt: skip
     assert open_scene(world).videos[0].camera.readout == 0.02
@@ -282,6 +291,8 @@ def test_declared_readouts_and_given_exposures_reach_the_fit(tmp_path, monkeypat
     assert main([*args, "--exposure", "0.01", "--sh-degree", "1"]) == 0
     assert [type(e) for e in seen[0]] == [MotionBlur, RollingShutter, Gain]
     assert seen[0][0].exposure == 0.01 and seen[0][1].readout == (0.02, 0.02)
+    assert set(looked) == {"cam0", "cam1", "held0"}
+    assert all([type(e) for e in through] == [MotionBlur, RollingShutter] for through in looked.values())
     result = load_result(tmp_path / "r")
     assert result.scene.dynamic.sh_degree == 1 and result.options["exposure"] == 0.01
     told = json.loads((tmp_path / "r" / "metrics.json").read_text())
