@@ -10,6 +10,7 @@ WORKERS ?= 2
 
 $(VENV)/.core: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	rm -rf otsync.egg-info  # a stale one hides new entry points
 	$(PIP) -e .
 	touch $@
 

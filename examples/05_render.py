@@ -13,7 +13,8 @@ import torch
 import tyro
 
 from otsync.types import Camera
-from recon.gaussians import Gaussians, load_ply, save_ply
+from recon.scene.gaussians import Gaussians
+from recon.scene.ply import load_ply, save_ply
 
 
 def knot(n: int = 6000, seed: int = 0) -> Gaussians:

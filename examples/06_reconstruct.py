@@ -8,15 +8,16 @@ from pathlib import Path
 import tyro
 
 from otsync.io import open_scene
+from otsync.progress import Progress
 from otsync.types import Offsets, TrackSet
-from recon.capture import write_capture
-from recon.export import export, frame_times
-from recon.pipeline import reconstruct
-from recon.plan import Plan, Progress
-from recon.result import load_result
-from recon.showing import rendered
-from recon.simulate import synthetic
-from recon.video import write_images
+from recon.pipeline.plan import Plan
+from recon.pipeline.verb import reconstruct
+from recon.result.export import export, frame_times
+from recon.result.folder import load_result
+from recon.result.images import rendered
+from recon.result.video import write_images
+from recon.simulate.capture import synthetic
+from recon.simulate.recording import write_capture
 
 
 def main(out: Path = Path("out/reconstruct"), steps: int = 700, seed: int = 1) -> None:
@@ -31,9 +32,16 @@ def main(out: Path = Path("out/reconstruct"), steps: int = 700, seed: int = 1) -
 
     # Every choice is an object in a slot: Plan(losses=..., effects=..., scaffold=..., densify=...)
     outcome = reconstruct(
-        scene, start, out / "result", plan=Plan(width=160, backdrop_steps=300), tracks=tracks, held_out=("held0",),
-        truth=truth, steps=steps, progress=Progress(print),
-    )  # fmt: skip
+        scene,
+        start,
+        out / "result",
+        plan=Plan(width=160, backdrop_steps=300),
+        tracks=tracks,
+        held_out=("held0",),
+        truth=truth,
+        steps=steps,
+        progress=Progress(print),
+    )
     offsets = outcome.found.offsets
     for name, before, after, true in zip(
         offsets.names, outcome.coarse.frames, offsets.frames, outcome.truth, strict=True

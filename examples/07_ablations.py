@@ -14,16 +14,17 @@ from pathlib import Path
 
 from otsync.io import open_scene
 from otsync.types import Offsets
-from recon.bench import Protocol, run
-from recon.capture import write_capture
-from recon.configurations import CONFIGURATIONS
-from recon.simulate import synthetic
+from recon.bench.configurations import CONFIGURATIONS
+from recon.bench.fits import Protocol, run
+from recon.simulate.capture import synthetic
+from recon.simulate.recording import write_capture
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rows", nargs="+", default=["ours", "fixed", "w/o spline", "w/o scaffold"],
-                        choices=list(CONFIGURATIONS))  # fmt: skip
+    parser.add_argument(
+        "--rows", nargs="+", default=["ours", "fixed", "w/o spline", "w/o scaffold"], choices=list(CONFIGURATIONS)
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument(
         "--steps", type=int, nargs="+", default=[700], help="several: what accuracy costs, in recon.svg"

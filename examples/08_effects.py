@@ -13,13 +13,15 @@ import time
 
 import numpy as np
 
-from recon.capture import begun, clocks
-from recon.effects import MotionBlur, optics, with_declared
-from recon.evaluate import offset_error
-from recon.fit import fit
-from recon.held_out import Clock, view
-from recon.seed import Seeding
-from recon.simulate import Blur, Capture, Rolling, Sheen, synthetic
+from otsync.types import Clock, Offsets
+from recon.evaluate.figures import offset_error
+from recon.evaluate.views import view
+from recon.fit.verb import fit
+from recon.observe.effects import MotionBlur, optics, with_declared
+from recon.scene.seed import Seeding
+from recon.simulate.capture import Capture, synthetic
+from recon.simulate.effects import Blur, Rolling, Sheen
+from recon.simulate.recording import begun
 
 FILMED = {"none": (), "rolling": (Rolling(0.025),), "blur": (Blur(0.025),), "sheen": (Sheen(0.4),)}
 
@@ -42,7 +44,7 @@ def main() -> None:
     print("seed  model     offsets: mean, largest (frames)   held out: image, what moves (dB)   CPU seconds")
     for seed in args.seeds:
         capture = synthetic(seed, effects=FILMED[args.effect])
-        believed = clocks([f.name for f in capture.footage], np.zeros(len(capture.footage)), 30.0)
+        believed = Offsets.known([f.name for f in capture.footage], np.zeros(len(capture.footage)), 30.0)
         for name, (effects, seeding) in {"with": modelled(args.effect, capture), "without": ((), Seeding())}.items():
             scene = begun(capture, believed, seeding=seeding)
             started = time.process_time()
@@ -53,8 +55,10 @@ def main() -> None:
             through = optics(effects, held.readout) if effects else ()
             looking = view(found.scene, held, Clock(0.0), gain=np.ones(3), optics=through)
             score = looking.score(most=24, pictures=0).mean
-            print(f"{seed:4}  {name:8}  {error.mean:14.4f} {error.max:9.4f} {score['psnr']:22.2f} "
-                  f"{score['mask_psnr']:10.2f} {seconds:26.0f}")  # fmt: skip
+            print(
+                f"{seed:4}  {name:8}  {error.mean:14.4f} {error.max:9.4f} {score['psnr']:22.2f} "
+                f"{score['mask_psnr']:10.2f} {seconds:26.0f}"
+            )
 
 
 if __name__ == "__main__":

@@ -12,24 +12,26 @@ Tracks in, offsets out::
 Nouns are frozen dataclasses of arrays, verbs validate and report a status, algorithms are objects in slots.
 """
 
-from .align import DTW, ConstantShift, LikelihoodScan, align
-from .anchored import AnchoredFGW
-from .costs import Cosine, Labels, track_distance
-from .graph import Graph
-from .match import (
+from .align.likelihood import LikelihoodScan
+from .align.verb import align
+from .align.warping import DTW, ConstantShift
+from .costs.linear import Cosine, Labels, track_distance
+from .match.anchored import AnchoredFGW
+from .match.dense import (
     EntropicFGW,
     FusedGromovWasserstein,
     GromovWasserstein,
     NearestNeighbor,
     OptimalTransport,
     PartialFGW,
-    match,
-    matcher_for,
 )
-from .refine import SplineRefine, Unrefined, refine
-from .sync import synchronize
-from .trust import Trust
+from .match.verb import match, matcher_for
+from .refine.splines import SplineRefine
+from .refine.verb import Unrefined, refine
+from .sync.graph import Graph
+from .sync.verb import synchronize
 from .types import Alignment, Camera, Matches, Offsets, Refused, Status, TrackSet, Video
+from .types.trust import Trust
 
 __version__ = "0.1.0"
 

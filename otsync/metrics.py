@@ -13,6 +13,7 @@ from .types import Matches
 if TYPE_CHECKING:
     from .simulate import Truth
 
+
 #: a match is right within this share of the scene's size, on the same object
 TOLERANCE = 0.06
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from otsync.io.scene import FORMAT, VERSION
+from otsync.io.document import FORMAT, VERSION
 from otsync.types import Camera
 
 W, H, FPS = 320, 180, 30.0

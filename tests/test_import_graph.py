@@ -1,4 +1,4 @@
-"""Dependencies point one way, and importing the library is light."""
+"""The house's rules: who may know whom, by folder; no circles; no crowded folder; light imports."""
 
 from __future__ import annotations
 
@@ -12,47 +12,52 @@ import pytest
 ROOT = Path(__file__).parents[1]
 HEAVY = {"torch", "ot", "tslearn", "transformers", "dask", "numba", "sklearn", "pandas", "matplotlib", "cv2", "av"}
 
-#: what each story may import from the package; folders count as their first name
-ALLOWED = {
-    "files": set(),
-    "types": {"files"},
-    "jit": set(),
-    "kernels": {"jit"},
-    "costs": {"types", "kernels"},
-    "splines": set(),
-    "clock": {"types", "splines"},
-    "frontier": set(),
-    "sinkhorn": set(),
-    "vouch": {"types", "costs"},
-    "anchored": {"types", "costs", "kernels", "jit", "vouch"},
-    "match": {"types", "costs", "shutter", "frontier", "sinkhorn", "vouch", "anchored"},
-    "trust": set(),
-    "graph": set(),
-    "scan": {"types", "costs", "clock", "splines", "kernels", "trust"},
-    "align": {"types", "costs", "shutter", "clock", "kernels", "scan"},
-    "fit": {"splines", "kernels"},
-    "refine": {"types", "costs", "shutter", "clock", "splines", "fit", "trust"},
-    "rematch": {"types", "costs", "splines", "kernels"},
-    "settle": {"types", "graph", "trust"},
-    "metrics": {"types", "simulate"},
-    "progress": set(),
-    "simulate": {"types", "files", "progress"},
-    "io": {"types", "files"},
-    "geometry": {"types"},
-    "shutter": {"types", "geometry"},
-    "priors": {"types", "files", "geometry", "jit"},
-    "lift": {"types", "shutter"},
-    "tracks": {"types", "geometry", "priors", "kernels_tracks"},
-    "position_costs": {"types", "costs", "kernels_tracks"},
-    "partners": {"types", "costs", "match", "position_costs"},
-    "epipolar": {"types", "clock", "splines", "align", "geometry", "kernels_tracks"},
-    "epipolar_fit": {"types", "clock", "splines", "epipolar", "geometry", "trust"},
-    "check": {"types", "geometry", "io", "shutter"},
-    "command_line": {"__version__"},
+OTSYNC = """
+compute files progress plugins
+types
+geometry clocks costs io priors simulate metrics
+match align refine
+epipolar
+sync
+recordings
+report bench cli
+"""
+"""Floors of otsync, ground first: a folder (or file) knows what stands on floors below, and what ``BESIDE`` allows."""
+
+RECON = """
+raster footage
+motion
+scene
+losses observe
+backdrop fit evaluate simulate
+result
+features
+pipeline
+bench
+cli
+"""
+
+BESIDE = {
+    # costs are compared on one clock; lenses are geometry; worlds are made, not read
+    "otsync": {
+        "clocks": {"geometry"},
+        "costs": {"clocks", "geometry"},
+        "priors": {"geometry"},
+        "metrics": {"simulate"},
+        "bench": {"report"},
+        "cli": {"report", "bench"},
+    },
+    "recon": {
+        "backdrop": {"evaluate"},
+        "simulate": {"fit"},
+    },
 }
+"""Who on the same floor may be known. match, align and refine never know each other."""
+
+MOST_FILES = 18
 
 
-def modules_in(source: str, module: str) -> set[str]:
+def modules_in(source: str, module: str, *, package: bool = False) -> set[str]:
     """Dotted names of everything that the source of ``module`` imports, at any depth.
 
     ``import a.b`` is a.b, whatever it is called; ``from a.b import c`` is a.b.c, whether c is a module or not.
@@ -62,20 +67,44 @@ def modules_in(source: str, module: str) -> set[str]:
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
-            base = module.split(".")[: -node.level] if node.level else []
+            parts = module.split(".")
+            up = node.level - package
+            base = parts[: len(parts) - up] if node.level else []
             base += node.module.split(".") if node.module else []
             found |= {".".join([*base, alias.name]) for alias in node.names}
     return found
 
 
-def imports(path: Path, package: str) -> set[str]:
-    """What a file imports of ``package``."""
-    module = ".".join(path.relative_to(ROOT).with_suffix("").parts)
-    return {name for name in modules_in(path.read_text(), module) if within(name, package)}
-
-
 def within(name: str, *packages: str) -> bool:
     return any(name == package or name.startswith(f"{package}.") for package in packages)
+
+
+def files(package: str) -> list[Path]:
+    return sorted((ROOT / package).rglob("*.py"))
+
+
+def module_of(path: Path) -> str:
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+
+
+MODULES = {module_of(path): path for package in ("otsync", "recon") for path in files(package)}
+
+
+def imports(path: Path) -> set[str]:
+    """Everything that a file imports of the two packages, lazy imports too, as dotted names."""
+    module = module_of(path)
+    names = modules_in(path.read_text(), module, package=path.name == "__init__.py")
+    return {name for name in names if within(name, "otsync", "recon")}
+
+
+def imported_modules(path: Path) -> set[str]:
+    """The files behind the names: ``otsync.match.match`` is what ``otsync/match/__init__.py`` takes it from."""
+    found = set()
+    for name in imports(path):
+        while name not in MODULES:
+            name = name.rpartition(".")[0]
+        found.add(name)
+    return found - {module_of(path)}
 
 
 @pytest.mark.parametrize(
@@ -97,60 +126,116 @@ def test_every_kind_of_import_is_seen(line, found):
     assert modules_in(line, "recon.motion.nodes") == found
 
 
-@pytest.mark.parametrize("story", sorted(ALLOWED))
-def test_dependencies_point_one_way(story):
-    home = ROOT / "otsync" / story
-    files = sorted(home.rglob("*.py")) if home.is_dir() else [home.with_suffix(".py")]
-    for path in files:
-        found = {name.split(".")[1] if "." in name else name for name in imports(path, "otsync")}
-        beyond = found - ALLOWED[story] - {story}
-        assert not beyond, f"{path.relative_to(ROOT)} imports {beyond}"
+def test_imports_of_a_package_begin_in_its_folder():
+    assert modules_in("from .verb import match", "otsync.match", package=True) == {"otsync.match.verb.match"}
+    assert modules_in("from ..types import x", "otsync.match", package=True) == {"otsync.types.x"}
 
 
-def test_the_rasterizer_knows_only_types():
-    for path in sorted((ROOT / "recon" / "raster").rglob("*.py")):
-        beyond = {name for name in imports(path, "otsync") if not within(name, "otsync.types")}
-        assert not beyond, f"{path.relative_to(ROOT)} imports {beyond}"
+def rooms(package: str, floors: str) -> dict[str, int]:
+    """The floor of every folder and file that stands directly in a package."""
+    return {name: n for n, line in enumerate(floors.split("\n")) for name in line.split()}
 
 
-#: what stands on top of both packages: from a recording to a result, its page, and the command line
-ON_TOP = {
-    "initial.py",
-    "prepare.py",
-    "pipeline.py",
-    "report.py",
-    "cli.py",
-    "bench.py",
-    "bench_lifting.py",
-    "commands_bench.py",
-}
+@pytest.mark.parametrize("package, floors", [("otsync", OTSYNC), ("recon", RECON)])
+def test_every_folder_has_a_floor(package, floors):
+    there = {
+        path.name.removesuffix(".py")
+        for path in (ROOT / package).iterdir()
+        if path.name not in ("__init__.py", "__pycache__") and (path.is_dir() or path.suffix == ".py")
+    }
+    assert there == set(rooms(package, floors))
 
 
-#: what the rest of recon may import: nouns, readers and writers, when rows were read, worlds with answers, and how figures are written down
-LEAVES = (
-    "otsync.types", "otsync.io", "otsync.files", "otsync.progress", "otsync.shutter", "otsync.simulate", "otsync.bench",
-)  # fmt: skip
-
-
-def test_recon_never_imports_the_algorithms():
-    for path in sorted((ROOT / "recon").rglob("*.py")):
-        if path.parent.name == "recon" and path.name in ON_TOP:
+@pytest.mark.parametrize("package, floors", [("otsync", OTSYNC), ("recon", RECON)])
+def test_nobody_knows_what_stands_above(package, floors):
+    floor, wrong = rooms(package, floors), []
+    for path in files(package):
+        here = path.relative_to(ROOT).with_suffix("").parts
+        if len(here) == 2 and here[1] == "__init__":
             continue
-        beyond = {name for name in imports(path, "otsync") if not within(name, *LEAVES)}
-        assert not beyond, f"{path.relative_to(ROOT)} imports {beyond}"
+        allowed = {name for name, n in floor.items() if n < floor[here[1]]} | BESIDE[package].get(here[1], set())
+        for name in imports(path):
+            parts = name.split(".")
+            # the package's own face gives its version and public names to those on top
+            if parts[0] == package and len(parts) > 1 and parts[1] in floor and parts[1] not in {*allowed, here[1]}:
+                wrong.append(f"{path.relative_to(ROOT)} imports {name}")
+    assert not wrong, "\n".join(wrong)
 
 
-def test_nothing_in_recon_imports_what_stands_on_top():
-    names = [f"recon.{name[:-3]}" for name in sorted(ON_TOP)]
-    for path in sorted((ROOT / "recon").rglob("*.py")):
-        if path.parent.name == "recon" and path.name in ON_TOP:
+def test_otsync_never_knows_recon():
+    assert not [str(path) for path in files("otsync") if any(within(name, "recon") for name in imports(path))]
+
+
+ALGORITHMS = tuple(f"otsync.{name}" for name in ("match", "align", "refine", "epipolar", "sync", "recordings"))
+
+
+def test_only_the_top_of_recon_knows_the_algorithms():
+    for path in files("recon"):
+        if path.relative_to(ROOT).parts[1] in ("pipeline", "bench", "cli"):
             continue
-        beyond = {name for name in imports(path, "recon") if within(name, *names)}
+        beyond = {name for name in imports(path) if within(name, *ALGORITHMS)}
         assert not beyond, f"{path.relative_to(ROOT)} imports {beyond}"
 
 
-def test_the_command_line_is_light_until_something_runs():
-    code = "import sys, otsync.cli; print(' '.join(m.split('.')[0] for m in sys.modules))"
+def test_the_rasterizer_knows_only_the_ground():
+    for path in files("recon"):
+        if within(module_of(path), "recon.raster"):
+            beyond = {name for name in imports(path) if within(name, "otsync")}
+            beyond = {name for name in beyond if not within(name, "otsync.compute", "otsync.types")}
+            assert not beyond, f"{path.relative_to(ROOT)} imports {beyond}"
+
+
+def test_there_are_no_circles():
+    """Files that import each other, lazily or not, however long the way round. A package's face only hands names on."""
+    known = {
+        module: {name for name in imported_modules(path) if MODULES[name].name != "__init__.py"}
+        for module, path in MODULES.items()
+        if path.name != "__init__.py"
+    }
+    done: set[str] = set()
+
+    def visit(module: str, way: tuple[str, ...]) -> None:
+        assert module not in way, " -> ".join((*way[way.index(module) :], module))
+        if module not in done:
+            for other in sorted(known[module]):
+                visit(other, (*way, module))
+            done.add(module)
+
+    for module in sorted(known):
+        visit(module, ())
+
+
+def test_folders_know_each_other_one_way():
+    """Between two folders of a package imports run in one direction only."""
+    seen: dict[tuple[str, str], str] = {}
+    for module, path in MODULES.items():
+        here = ".".join(module.split(".")[:2])
+        if module in ("otsync", "recon"):
+            continue
+        for other in imported_modules(path):
+            there = ".".join(other.split(".")[:2])
+            if there not in ("otsync", "recon", here):
+                seen[here, there] = f"{module} -> {other}"
+    both = [f"{seen[a, b]}; {seen[b, a]}" for a, b in seen if a < b and (b, a) in seen]
+    assert not both, "\n".join(both)
+
+
+def test_no_folder_is_crowded():
+    for folder in {path.parent for package in ("otsync", "recon", "tests") for path in files(package)}:
+        count = len(list(folder.glob("*.py")))
+        assert count <= MOST_FILES, f"{folder.relative_to(ROOT)}: {count} files"
+
+
+def test_tests_stand_where_the_code_stands():
+    for package in ("otsync", "recon"):
+        for path in files(f"tests/{package}"):
+            folder = path.parent.relative_to(ROOT / "tests")
+            assert (ROOT / folder).is_dir(), f"{path.relative_to(ROOT)}: there is no {folder}"
+
+
+@pytest.mark.parametrize("module", ["otsync.cli", "otsync.cli.sync", "otsync.cli.recordings", "otsync.recordings"])
+def test_the_command_line_is_light_until_something_runs(module):
+    code = f"import sys, {module}; print(' '.join(m.split('.')[0] for m in sys.modules))"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True).stdout
     assert not {"torch", "ot", "tslearn", "transformers", "matplotlib", "cv2", "av", "recon"} & set(out.split())
 

@@ -8,14 +8,16 @@ from pathlib import Path
 
 import numpy as np
 
-from ..align import DTW, Aligner, ConstantShift, align
-from ..match import FusedGromovWasserstein, Matcher, OptimalTransport, match
+from ..align.verb import Aligner, align
+from ..align.warping import DTW, ConstantShift
+from ..match.dense import FusedGromovWasserstein, OptimalTransport
+from ..match.verb import Matcher, match
 from ..metrics import match_quality
 from ..progress import counted
 from ..simulate import matching_world, simulate
 from . import record
+from .effects import effect_costs
 from .record import run_python, table, write_rows
-from .simulate import effect_costs
 
 CLASSES = ("boxes", "juggle", "softball", "tennis", "basketball", "football")
 BANDS = ((0, 10), (10, 30), (30, 50))
@@ -104,9 +106,16 @@ def offset_table(
 def _row(aligner: str, preset: str, motion: str, band: str, errors: list[float]) -> dict:
     e = np.asarray(errors)
     return {
-        "aligner": aligner, "preset": preset, "motion": motion, "band": band, "mean": float(e.mean()),
-        "median": float(np.median(e)), "within_1": float((e <= 1).mean()), "over_2": float((e > 2).mean()), "n": len(e),
-    }  # fmt: skip
+        "aligner": aligner,
+        "preset": preset,
+        "motion": motion,
+        "band": band,
+        "mean": float(e.mean()),
+        "median": float(np.median(e)),
+        "within_1": float((e <= 1).mean()),
+        "over_2": float((e > 2).mean()),
+        "n": len(e),
+    }
 
 
 def summarise(rows: list[dict]) -> list[dict]:
@@ -120,9 +129,15 @@ def summarise(rows: list[dict]) -> list[dict]:
             cells = {key: float(np.mean([r["mean"] for r in group])) for key, group in groups.items()}
             low = [r for r in chosen if r["band"] != "30-50"]
             summary.append(
-                {"preset": preset, "aligner": aligner, **cells, "all": float(np.mean([r["mean"] for r in chosen])),
-                 "median": float(np.median([r["median"] for r in low])), "within_1 (<= 30)": float(np.mean([r["within_1"] for r in low]))}
-            )  # fmt: skip
+                {
+                    "preset": preset,
+                    "aligner": aligner,
+                    **cells,
+                    "all": float(np.mean([r["mean"] for r in chosen])),
+                    "median": float(np.median([r["median"] for r in low])),
+                    "within_1 (<= 30)": float(np.mean([r["within_1"] for r in low])),
+                }
+            )
     return summary
 
 

@@ -16,19 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from ..anchored import AnchoredFGW
-from ..costs import Cosine, total_cost
-from ..match import (
-    EntropicFGW,
-    FusedGromovWasserstein,
-    Matcher,
-    NearestNeighbor,
-    OptimalTransport,
-    PartialFGW,
-    from_plan,
-    normalised_structure,
-    uniform,
-)
+from ..costs.linear import Cosine, total_cost
+from ..match.anchored import AnchoredFGW
+from ..match.dense import EntropicFGW, FusedGromovWasserstein, NearestNeighbor, OptimalTransport, PartialFGW
+from ..match.problem import from_plan, normalised_structure, uniform
+from ..match.verb import Matcher
 from ..metrics import match_quality
 from ..progress import counted, say
 from ..simulate import matching_world

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from ..anchored import AnchoredFGW
-from ..costs import track_distance
-from ..match import match
+from ..costs.linear import track_distance
+from ..match.anchored import AnchoredFGW
+from ..match.verb import match
 from ..metrics import match_quality
 from ..progress import counted
 from ..simulate import matching_world

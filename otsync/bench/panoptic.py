@@ -21,24 +21,25 @@ from typing import Any
 
 import numpy as np
 
-from ..align import DTW
-from ..anchored import AnchoredFGW
-from ..costs import Cosine
-from ..files import atomic_write
+from ..align.warping import DTW
+from ..compute.threads import MapLike
+from ..costs.linear import Cosine
+from ..costs.positions import CurveDistance, MedianPosition
+from ..files.arrays import atomic_write
+from ..files.cache import Cache
 from ..geometry import common_target, seen_pixels, view_angle
-from ..graph import Graph
 from ..io import open_scene
 from ..io.scene import Scene
-from ..match import FusedGromovWasserstein, OptimalTransport, PartialFGW
-from ..partners import Candidates
-from ..position_costs import CurveDistance, MedianPosition
-from ..priors.cache import Cache
+from ..match.anchored import AnchoredFGW
+from ..match.candidates import Candidates
+from ..match.dense import FusedGromovWasserstein, OptimalTransport, PartialFGW
 from ..priors.stereo import Rig
 from ..progress import counted
-from ..recordings import COLOUR, Stages, pairs_in_pixels, pairs_in_space
-from ..refine import Unrefined
-from ..sync import MapLike, synchronize
-from ..tracks import pixel_tracks
+from ..recordings.routes import COLOUR, Stages, pairs_in_pixels, pairs_in_space
+from ..recordings.tracking import pixel_tracks
+from ..refine.verb import Unrefined
+from ..sync.graph import Graph
+from ..sync.verb import synchronize
 from ..types import Matches, Offsets, TrackSet
 from .record import table, write_rows
 
@@ -146,9 +147,14 @@ class Material:
         depth = stages.stereo(rig, straight, cache, tuple(content), map)
         tell(f"depth of {len(raw)} cameras: {time.perf_counter() - started:.0f} s")
         return cls(
-            scene, stages, tuple(r["uv"] for r in raw), tuple(r["features"] for r in raw), tuple(rich),
-            tuple(r["features"][c] for r, c in zip(raw, chosen, strict=True)), tuple(depth),
-        )  # fmt: skip
+            scene,
+            stages,
+            tuple(r["uv"] for r in raw),
+            tuple(r["features"] for r in raw),
+            tuple(rich),
+            tuple(r["features"][c] for r, c in zip(raw, chosen, strict=True)),
+            tuple(depth),
+        )
 
     def clip(self, v: int, start: int, stop: int, step: int, lifted: bool) -> TrackSet:
         """The tracks of camera v in frames start, start + step, ...; clocks begin at 0."""
@@ -203,9 +209,16 @@ def measure(
         names = material.scene.names
         angle = view_angle(material.scene.videos[a].camera, material.scene.videos[b].camera, target)
         return {
-            "route": route, "kind": kind, "a": names[a], "b": names[b], "angle": angle, "shift": shift if later else -shift,
-            "error": _number(error), "sigma": _number(found.sigma * found.fps), "flags": " ".join(f.code for f in found.flags),
-        }  # fmt: skip
+            "route": route,
+            "kind": kind,
+            "a": names[a],
+            "b": names[b],
+            "angle": angle,
+            "shift": shift if later else -shift,
+            "error": _number(error),
+            "sigma": _number(found.sigma * found.fps),
+            "flags": " ".join(f.code for f in found.flags),
+        }
 
     details = list(counted(map(pair, jobs), f"{route}: pairs", "pair", len(jobs)))
     seconds = time.perf_counter() - started
@@ -292,9 +305,15 @@ def _solver(route: str, stages: Stages) -> Callable[[list[TrackSet]], Offsets]:
 
 
 def _graph(
-    material: Material, solve: Callable[[list[TrackSet]], Offsets], lifted: bool, protocol: Protocol,
-    rng: np.random.Generator, cameras: int, kind: str, route: str,
-) -> list[dict[str, Any]]:  # fmt: skip
+    material: Material,
+    solve: Callable[[list[TrackSet]], Offsets],
+    lifted: bool,
+    protocol: Protocol,
+    rng: np.random.Generator,
+    cameras: int,
+    kind: str,
+    route: str,
+) -> list[dict[str, Any]]:
     """Errors of all but the reference for one draw of cameras and offsets 0-30."""
     chosen = rng.permutation(len(material.scene.videos))[:cameras]
     length = min(protocol.graph_frames, material.frames)
@@ -304,12 +323,17 @@ def _graph(
     error = found.frames - (starts - starts[0])
     return [
         {
-            "route": route, "kind": kind, "a": found.names[0], "b": found.names[v], "shift": int(starts[v] - starts[0]),
-            "error": _number(error[v]), "sigma": _number(found.sigma[v] * found.fps[v]),
+            "route": route,
+            "kind": kind,
+            "a": found.names[0],
+            "b": found.names[v],
+            "shift": int(starts[v] - starts[0]),
+            "error": _number(error[v]),
+            "sigma": _number(found.sigma[v] * found.fps[v]),
             "flags": " ".join(f.code for f in found.flags[v]),
         }
         for v in range(1, cameras)
-    ]  # fmt: skip
+    ]
 
 
 def _row(

@@ -14,7 +14,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from ..files import atomic_write, read_json, write_json
+from ..files.arrays import atomic_write, read_json, write_json
 
 Row = Mapping[str, Any]
 
@@ -60,7 +60,7 @@ def table(rows: Sequence[Row], columns: Sequence[str] | None = None) -> str:
 
 
 def gate(name: str, measured: Mapping[str, float], worse: Callable[[str, float, float], bool]) -> int:
-    """Compare figures with ``bench/baselines/name.json``; print what got worse; 0 when nothing did, else 1.
+    """Compare figures with the committed baseline; print what got worse; 0 when nothing did, else 1.
 
     Args:
         worse: ``worse(key, measured, baseline)``, with the tolerance that the figure's kind calls for.
@@ -87,8 +87,8 @@ def save_baseline(name: str, figures: Mapping[str, float]) -> None:
 
 
 def baseline_path(name: str) -> Path:
-    """Baselines live in the repository, beside the code that they judge."""
-    return Path(__file__).parents[2] / "bench" / "baselines" / f"{name}.json"
+    """Baselines stand beside the code that they judge, in an installed package too."""
+    return Path(__file__).parent / "baselines" / f"{name}.json"
 
 
 def _cell(value: Any) -> str:

@@ -7,8 +7,9 @@ from importlib.util import find_spec
 
 import numpy as np
 
-from ..costs import Cosine
-from ..match import Matcher, Problem, from_plan
+from ..costs.linear import Cosine
+from ..match.problem import Problem, from_plan
+from ..match.verb import Matcher
 from ..types import Matches, TrackSet
 
 

@@ -11,12 +11,15 @@ from pathlib import Path
 
 import numpy as np
 
-from ..align import DTW, Aligner, ConstantShift, LikelihoodScan, align
-from ..files import atomic_write
-from ..graph import Graph
+from ..align.likelihood import LikelihoodScan
+from ..align.verb import Aligner, align
+from ..align.warping import DTW, ConstantShift
+from ..files.arrays import atomic_write
 from ..progress import counted, say
-from ..refine import Refiner, SplineRefine, Unrefined, refine
-from ..sync import synchronize
+from ..refine.splines import SplineRefine
+from ..refine.verb import Refiner, Unrefined, refine
+from ..sync.graph import Graph
+from ..sync.verb import synchronize
 from ..types import Status
 from . import record
 from .record import Row, table, write_rows

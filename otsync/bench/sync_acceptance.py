@@ -10,11 +10,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..align import DTW, align
+from ..align.verb import align
+from ..align.warping import DTW
 from ..progress import counted
-from ..refine import SplineRefine, refine
+from ..refine.splines import SplineRefine
+from ..refine.verb import refine
 from ..simulate import simulate
-from ..sync import synchronize
+from ..sync.verb import synchronize
 from ..types import Alignment, Matches, TrackSet
 from .record import Row
 from .sync_worlds import BANDS, FPS, Case, label, many, motions, pair_case, pair_cases

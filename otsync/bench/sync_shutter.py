@@ -9,13 +9,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..align import align
-from ..graph import Graph
+from ..align.verb import align
 from ..progress import counted
-from ..refine import refine
+from ..refine.verb import refine
 from ..simulate import PRESETS, Rig, Truth, simulate
 from ..simulate.effects import Effect, RollingShutter
-from ..sync import synchronize
+from ..sync.graph import Graph
+from ..sync.verb import synchronize
 from ..types import TrackSet
 from .record import Row
 from .sync_worlds import FPS, label, motions
@@ -64,9 +64,11 @@ def measured(tracks: Sequence[TrackSet], truth: Truth) -> Iterator[tuple[float, 
 
 
 def shutter_rows(
-    seeds: Sequence[int], presets: Sequence[str] = ("clean", "mid", "hard"), videos: Sequence[int] = (2, 8),
+    seeds: Sequence[int],
+    presets: Sequence[str] = ("clean", "mid", "hard"),
+    videos: Sequence[int] = (2, 8),
     classes: Sequence[str] | None = None,
-) -> list[Row]:  # fmt: skip
+) -> list[Row]:
     """Errors in frames by number of videos, preset and shutter.
 
     Args:

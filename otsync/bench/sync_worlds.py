@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ..graph import Graph, Pair
 from ..progress import counted
 from ..simulate import Truth, simulate
+from ..sync.graph import Graph, Pair
 from ..types import Matches, TrackSet
 
 FPS = 30.0

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from .document import FORMAT, VERSION
 from .images import read_image
 from .panoptic import describe_panoptic, is_panoptic
-from .scene import FORMAT, VERSION
 
 VIDEO_SUFFIXES = {".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v", ".mts"}
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp")

@@ -18,7 +18,7 @@ from typing import Any, overload
 import numpy as np
 from jaxtyping import Float
 
-from ..files import existing
+from ..files.arrays import existing
 from .images import read_image, read_npy
 
 CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,flv,mxf,ogg"

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from ..files import existing, read_npz
+from ..files.arrays import existing, read_npz
 
 MAX_PIXELS = 64 * 2**20
 """Largest image that is decoded (64 megapixels, 8K x 8K)."""

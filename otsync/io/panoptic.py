@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from ..files import read_json
-from .scene import FORMAT, VERSION
+from ..files.arrays import read_json
+from .document import FORMAT, VERSION
 
 METAS = ("train_meta.json", "test_meta.json")
 
@@ -54,10 +54,12 @@ def _videos(meta: dict[str, Any], folder: Path, fps: float) -> list[dict[str, An
             "frames": _pattern([str(row[c]) for row in fn], folder / "ims", "ims"),
             "fps": fps,
             "camera": {
-                "K": k[0, c].tolist(), "w2c": (poses[0] if static else poses).tolist(),
-                "width": int(meta["w"]), "height": int(meta["h"]),
+                "K": k[0, c].tolist(),
+                "w2c": (poses[0] if static else poses).tolist(),
+                "width": int(meta["w"]),
+                "height": int(meta["h"]),
             },
-        }  # fmt: skip
+        }
         masks = [str(Path(row[c]).with_suffix(".png")) for row in fn]
         if (folder / "seg" / masks[0]).is_file():
             entry["masks"] = _pattern(masks, folder / "seg", "seg")

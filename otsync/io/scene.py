@@ -29,12 +29,12 @@ from typing import Any
 
 import numpy as np
 
-from ..files import read_json, write_json
+from ..files.arrays import read_json
 from ..types import Camera, Video
+from .document import FORMAT, VERSION
 from .frames import ArrayFrames, FrameRange, ImageFrames, LazyFrames, VideoFrames
 from .images import read_depth, read_image, read_labels, read_mask
 
-FORMAT, VERSION = "otsync.scene", 1
 MAX_VIDEOS, MAX_FILES = 1000, 200_000
 
 
@@ -104,11 +104,6 @@ def read_document(path: str | os.PathLike[str]) -> tuple[dict[str, Any], Path]:
     if document.get("version") != VERSION:
         raise ValueError(f"{path}: expected version {VERSION}; found {document.get('version')!r}. Write it anew.")
     return document, path.parent
-
-
-def write_document(path: str | os.PathLike[str], videos: Sequence[dict[str, Any]], frame: str = "world") -> None:
-    """Write a scene document, atomically."""
-    write_json(path, {"format": FORMAT, "version": VERSION, "frame": frame, "videos": list(videos)})
 
 
 def scene_from_document(document: dict[str, Any], root: Path, *, allow_outside: bool = False) -> Scene:

@@ -4,7 +4,7 @@ A prior is an object in a slot (a frozen dataclass, called with frames); its par
 make the key under which :class:`Cache` keeps the result.
 """
 
-from .cache import Cache
+from ..files.cache import Cache
 from .features import Daisy, LabHistogram
 from .flow import DISFlow
 from .masks import FlowResidual, GivenMasks, MedianBackground

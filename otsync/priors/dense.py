@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from ..compute.threads import MapLike
+from ..files.cache import Cache
+from ..files.digest import content_key
 from ..geometry import undistort
-from .cache import Cache, digest_of
-from .stereo import HullStereo, MapLike, Rig, Space
+from .stereo import HullStereo, Rig, Space
 from .working import WorkingFrames
 
 
@@ -54,7 +56,7 @@ class DenseStereo:
         keep = cache if cache is not None and key else Cache()
         space = Space.of(self.stereo, rig)
         # the box of the hull, and with it where voxels lie, depends on all moments
-        key = (*key, self, digest_of(rig.index))
+        key = (*key, self, content_key(rig.index))
         wanted: dict[int, list[tuple[int, int]]] = {}
         for v, chosen in enumerate(frames):
             for k in sorted(set(chosen)):

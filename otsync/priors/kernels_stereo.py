@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..jit import kernel
+from ..compute.jit import kernel
 
 _fast = {"contract", "reassoc", "nsz", "arcp"}
 

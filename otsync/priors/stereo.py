@@ -5,19 +5,19 @@ Needs a rig that is synchronised, or aligned already: the hull intersects masks 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from ..compute.threads import MapLike
+from ..files.cache import Cache
+from ..files.digest import content_key
 from ..geometry import common_target
 from ..types import Camera, Video
-from .cache import Cache, digest_of
 from .working import WorkingFrames
-
-MapLike = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +94,7 @@ class HullStereo:
         starts = range(0, len(rig.index), self.chunk)
         # without a key of the pixels nothing may be kept: the tracks alone do not say which images they came from
         keep = cache if key else Cache()
-        key = (*key, self, digest_of(rig.index, *uv))
+        key = (*key, self, content_key(rig.index, *uv))
 
         def part(first: int) -> dict[str, np.ndarray]:
             return keep.arrays("stereo", (*key, first), lambda: self._chunk(rig, space, uv, first))
@@ -146,9 +146,15 @@ class HullStereo:
         return [u for u in space.order[v] if u in here][: self.neighbours]
 
     def scores(
-        self, space: Space, hull: np.ndarray, images: dict[int, np.ndarray], near: Sequence[int], v: int, k: int,
+        self,
+        space: Space,
+        hull: np.ndarray,
+        images: dict[int, np.ndarray],
+        near: Sequence[int],
+        v: int,
+        k: int,
         points: Float[np.ndarray, "N 2"],
-    ) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, "N D"]]:  # fmt: skip
+    ) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, "N D"]]:
         """Depth at which each point's ray enters the hull, 0 never, and the correlations over the sweep behind it."""
         from .kernels_stereo import first_hit, sweep
 
@@ -162,9 +168,18 @@ class HullStereo:
         if len(near) < 2:
             return np.zeros(len(points)), np.full((len(points), len(depths)), -1.0)
         scores = sweep(
-            points, start, depths, images[v], np.stack([images[u] for u in near]), space.P[near], R, center, inverse_K,
-            self.patch, 4.0,
-        )  # fmt: skip
+            points,
+            start,
+            depths,
+            images[v],
+            np.stack([images[u] for u in near]),
+            space.P[near],
+            R,
+            center,
+            inverse_K,
+            self.patch,
+            4.0,
+        )
         return start, scores
 
     def choose(
@@ -249,9 +264,17 @@ class Space:
         masks = self.masks(rig, s, present, 1)
         coarse = self.masks(rig, s, present, round(block * stereo.voxel * 160))
         return carve(
-            masks, coarse, self.P[present], self.low, stereo.voxel * self.unit, self.dims, block, stereo.min_views,
-            stereo.misses, self.near,
-        )  # fmt: skip
+            masks,
+            coarse,
+            self.P[present],
+            self.low,
+            stereo.voxel * self.unit,
+            self.dims,
+            block,
+            stereo.min_views,
+            stereo.misses,
+            self.near,
+        )
 
     def image(self, rig: Rig, v: int, k: int) -> np.ndarray:
         import cv2

@@ -15,7 +15,8 @@ from .page import write_report
 
 if TYPE_CHECKING:
     from ..io.scene import Scene
-    from ..recordings import Synchronized
+    from ..recordings.routes import Synchronized
+
 
 THUMB = 120
 """Width of a thumbnail; the sheet of eight videos at four moments stays below 60 KB."""
@@ -30,9 +31,13 @@ def write_recording_report(
 ) -> None:
     """The report page with what the run did and what it looks like; still one file without a script."""
     write_report(
-        path, found.offsets, found.tracks if found.route != "epipolar" else None, truth=truth,
-        title="Synchronisation of a recording", extra=sections(scene, found),
-    )  # fmt: skip
+        path,
+        found.offsets,
+        found.tracks if found.route != "epipolar" else None,
+        truth=truth,
+        title="Synchronisation of a recording",
+        extra=sections(scene, found),
+    )
 
 
 def sections(scene: Scene, found: Synchronized) -> str:

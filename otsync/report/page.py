@@ -9,7 +9,7 @@ from html import escape
 
 import numpy as np
 
-from ..files import atomic_write
+from ..files.arrays import atomic_write
 from ..types import Alignment, Matches, Offsets, Status, TrackSet
 from . import figures
 
@@ -184,7 +184,7 @@ def _cost_map(
     origin = float(tracks[i].times[0] - tracks[j].times[0])
     if pair.cost is not None:
         return pair.cost, pair.path, origin
-    from ..align import DTW
+    from ..align.warping import DTW
 
     paper = DTW()(tracks[i], tracks[j], matches[key])
     return paper.cost, paper.path, origin

@@ -104,10 +104,18 @@ def thing(
     at, r = np.asarray(center, float), np.asarray(radii, float)
     area = capsule_area(at, at, r) * (2 if box else 1)
     return Parts(
-        object=np.array([object]), limb=np.array([0]), kind=np.array([kind]), figure=np.array([False]),
-        start=at[None], end=at[None], radii=r[None], box=np.array([box]),
-        rest_rotation=np.eye(3)[None], rest_position=np.zeros((1, 3)), weight=np.array([max(area, 0.08)]),
-    )  # fmt: skip
+        object=np.array([object]),
+        limb=np.array([0]),
+        kind=np.array([kind]),
+        figure=np.array([False]),
+        start=at[None],
+        end=at[None],
+        radii=r[None],
+        box=np.array([box]),
+        rest_rotation=np.eye(3)[None],
+        rest_position=np.zeros((1, 3)),
+        weight=np.array([max(area, 0.08)]),
+    )
 
 
 def euler(angles: Float[np.ndarray, "*B 3"]) -> Float[np.ndarray, "*B 3 3"]:
@@ -177,10 +185,18 @@ def human(object: int, size: float = 1.0) -> Parts:
     R, p = forward_kinematics(rest[None], np.array([[0.0, 0.0, PELVIS_HEIGHT * size]]), np.zeros(1), size)
     n = len(HUMAN)
     return Parts(
-        object=np.full(n, object), limb=np.arange(n), kind=np.array([limb.kind for limb in HUMAN]),
-        figure=np.ones(n, bool), start=start, end=end, radii=radii, box=np.zeros(n, bool),
-        rest_rotation=R[:, 0], rest_position=p[:, 0], weight=capsule_area(start, end, radii),
-    )  # fmt: skip
+        object=np.full(n, object),
+        limb=np.arange(n),
+        kind=np.array([limb.kind for limb in HUMAN]),
+        figure=np.ones(n, bool),
+        start=start,
+        end=end,
+        radii=radii,
+        box=np.zeros(n, bool),
+        rest_rotation=R[:, 0],
+        rest_position=p[:, 0],
+        weight=capsule_area(start, end, radii),
+    )
 
 
 def forward_kinematics(

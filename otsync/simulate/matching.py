@@ -61,9 +61,19 @@ def matching_world(
     made = []
     for v, count in enumerate((n, n if n_b is None else n_b)):
         obs = observe(
-            scene, rig.camera(scene, v, seed), int(count), np.arange(frames) / 30.0, 30.0, True, rate=1.0, offset=0.0,
-            features=model, seed=seed, video=v, dtype=np.float32,
-        )  # fmt: skip
+            scene,
+            rig.camera(scene, v, seed),
+            int(count),
+            np.arange(frames) / 30.0,
+            30.0,
+            True,
+            rate=1.0,
+            offset=0.0,
+            features=model,
+            seed=seed,
+            video=v,
+            dtype=np.float32,
+        )
         made.append(apply(obs, effects, seed, v))
     level = Preset("matching", effects, model, wrong=0.0, matches=n)
     a, b = (

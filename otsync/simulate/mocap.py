@@ -133,9 +133,14 @@ def _load(path: Path, skeleton: Path | None, unit: float | None, _version: tuple
     flips = np.cumprod(np.where(np.einsum("fjq,fjq->fj", quats[1:], quats[:-1]) < 0, -1.0, 1.0), axis=0)
     quats[1:] *= flips[..., None]
     return _Figure(
-        parts, joints, clip.parents, scale * clip.offsets, CubicSpline(seconds, quats), CubicSpline(seconds, root),
+        parts,
+        joints,
+        clip.parents,
+        scale * clip.offsets,
+        CubicSpline(seconds, quats),
+        CubicSpline(seconds, root),
         float(seconds[-1]),
-    )  # fmt: skip
+    )
 
 
 def _lowest_foot(clip: Clip, scale: float, turns: np.ndarray, root: np.ndarray) -> float:
@@ -163,10 +168,18 @@ def _limbs(clip: Clip, scale: float, R: np.ndarray, p: np.ndarray, floor: float)
     start, end = np.zeros((n, 3)), scale * clip.tips[joints]
     radii = np.repeat(radius[:, None], 3, 1)
     return joints, Parts(
-        object=np.zeros(n, int), limb=np.arange(n), kind=np.array([kinds[s] for s in sideless]),
-        figure=np.ones(n, bool), start=start, end=end, radii=radii, box=np.zeros(n, bool),
-        rest_rotation=R[joints], rest_position=p[joints] - [0, 0, floor], weight=capsule_area(start, end, radii),
-    )  # fmt: skip
+        object=np.zeros(n, int),
+        limb=np.arange(n),
+        kind=np.array([kinds[s] for s in sideless]),
+        figure=np.ones(n, bool),
+        start=start,
+        end=end,
+        radii=radii,
+        box=np.zeros(n, bool),
+        rest_rotation=R[joints],
+        rest_position=p[joints] - [0, 0, floor],
+        weight=capsule_area(start, end, radii),
+    )
 
 
 def _sideless(name: str) -> str:

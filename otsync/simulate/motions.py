@@ -8,17 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import erf
 
-from .body import (
-    CHEST,
-    FOREARM,
-    HAND,
-    LEFT,
-    PELVIS_HEIGHT,
-    SHIN,
-    THIGH,
-    UPPER_ARM,
-    forward_kinematics,
-)
+from .body import CHEST, FOREARM, HAND, LEFT, PELVIS_HEIGHT, SHIN, THIGH, UPPER_ARM, forward_kinematics
 
 TAU = 2 * np.pi
 

@@ -8,20 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from .body import (
-    CHEST,
-    FOREARM,
-    HAND,
-    LEFT,
-    N_KINDS,
-    SHIN,
-    THIGH,
-    UPPER_ARM,
-    Parts,
-    euler,
-    human,
-    thing,
-)
+from .body import CHEST, FOREARM, HAND, LEFT, N_KINDS, SHIN, THIGH, UPPER_ARM, Parts, euler, human, thing
 from .motions import TAU, Actor, Cycle, Gesture, Wander, event_times, posture, step, sway_scale
 
 Poses = tuple[np.ndarray, np.ndarray]
@@ -277,10 +264,14 @@ def _team(
     holder = np.cumsum(rng.integers(1, people, len(passes))) % people
     around = rng.uniform(0, TAU) + TAU * np.arange(people) / people
     ring = rng.uniform(0.7, 1.1, people)
-    return [
-        _player(rng, (ring[i] * np.cos(around[i]), ring[i] * np.sin(around[i])), reach, passes[holder == i], kick)
-        for i in range(people)
-    ], passes, holder  # fmt: skip
+    return (
+        [
+            _player(rng, (ring[i] * np.cos(around[i]), ring[i] * np.sin(around[i])), reach, passes[holder == i], kick)
+            for i in range(people)
+        ],
+        passes,
+        holder,
+    )
 
 
 def basketball(rng: np.random.Generator) -> Scene:

@@ -129,9 +129,16 @@ def simulate(
     made = []
     for v in counted(range(videos), "simulating", "video"):
         obs = observe(
-            scene, rig.camera(scene, v, seed), counts[v], *clocks[v], rate=given_rates[v], offset=seconds[v],
-            features=level.features, seed=seed, video=v,
-        )  # fmt: skip
+            scene,
+            rig.camera(scene, v, seed),
+            counts[v],
+            *clocks[v],
+            rate=given_rates[v],
+            offset=seconds[v],
+            features=level.features,
+            seed=seed,
+            video=v,
+        )
         made.append(apply(obs, used, seed, v))
     return [as_tracks(obs, f"video{v}", "world") for v, obs in enumerate(made)], as_truth(scene, made, level, seed)
 
@@ -169,9 +176,21 @@ def observe(
 
     described = None if features is None else features(surface, scene.parts, seed, video, dtype)
     return Observation(
-        xyz, np.ones(xyz.shape[:2], bool), described, surface, times, regular, fps, rate, offset, camera, IDENTITY,
-        scene_size(xyz), at, facing,
-    )  # fmt: skip
+        xyz,
+        np.ones(xyz.shape[:2], bool),
+        described,
+        surface,
+        times,
+        regular,
+        fps,
+        rate,
+        offset,
+        camera,
+        IDENTITY,
+        scene_size(xyz),
+        at,
+        facing,
+    )
 
 
 def apply(obs: Observation, effects: tuple[Effect, ...], seed: int, video: int) -> Observation:

@@ -1,6 +1,7 @@
 """The nouns: frozen dataclasses of arrays. Files freeze them, so they change only with a version."""
 
 from .camera import Camera, Video
+from .clock import Clock
 from .results import Alignment, Matches, Offsets, Stats
 from .status import Refused, Status, gravest, in_order
 from .tracks import TrackSet, check_same_world
@@ -8,6 +9,7 @@ from .tracks import TrackSet, check_same_world
 __all__ = [
     "Alignment",
     "Camera",
+    "Clock",
     "Matches",
     "Offsets",
     "Refused",

@@ -5,15 +5,16 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..files import read_json, write_json
-from .status import Status, in_order
+from ..files.arrays import read_json, write_json
+from .clock import Clock
+from .status import Status, gravest, in_order
 
 Stats = dict[str, float]
 
@@ -32,14 +33,13 @@ class Matches:
         pairs: (M,2) indices into a's and b's tracks; a track may appear in several pairs.
         score: (M,), larger is better; None: all equal.
         plan: the transport plan, dense (Na,Nb) or scipy.sparse, when the matcher has one.
-        status, flags: what the answer is worth.
+        flags: what there is to know about the answer, gravest first. ``status`` is the gravest, OK without any.
         stats: objective, iterations, seconds, marginal_error, mass, ...
     """
 
     pairs: Int[np.ndarray, "M 2"]
     score: Float[np.ndarray, " M"] | None = None
     plan: Any = None
-    status: Status = Status.OK
     flags: tuple[Status, ...] = ()
     stats: Stats = field(default_factory=dict)
 
@@ -61,6 +61,12 @@ class Matches:
             )
         object.__setattr__(self, "pairs", pairs.astype(np.int64))
         object.__setattr__(self, "score", score)
+        object.__setattr__(self, "flags", in_order(self.flags))
+
+    @property
+    def status(self) -> Status:
+        """The gravest flag; OK when there is none."""
+        return gravest(self.flags)
 
     def __len__(self) -> int:
         return len(self.pairs)
@@ -78,16 +84,16 @@ class Matches:
         """The ``n`` best by score, ties in the given order."""
         assert self.score is not None
         order = np.argsort(-self.score, kind="stable")[:n]
-        return Matches(self.pairs[order], self.score[order], self.plan, self.status, self.flags, self.stats)
+        return replace(self, pairs=self.pairs[order], score=self.score[order])
 
     def without_plan(self) -> Matches:
         """The same matches without the plan, which is as large as both videos' tracks multiplied."""
-        return Matches(self.pairs, self.score, None, self.status, self.flags, self.stats)
+        return replace(self, plan=None)
 
     def swapped(self) -> Matches:
         """The same matches with a and b exchanged."""
         plan = None if self.plan is None else self.plan.T
-        return Matches(self.pairs[:, ::-1], self.score, plan, self.status, self.flags, self.stats)
+        return replace(self, pairs=self.pairs[:, ::-1], plan=plan)
 
 
 _NO_PEAKS = np.zeros((0, 2))
@@ -106,6 +112,7 @@ class Alignment:
         path: (P,2) frame pairs of a warping path on the common clock.
         cost: frame-to-frame cost on the common clock, nan where no match is seen.
         fps: frames per second of the common clock: ``offset * fps`` is in frames.
+        flags: what there is to know about the answer, gravest first. ``status`` is the gravest, OK without any.
         stats: seconds, matches, evidence, ...
     """
 
@@ -117,9 +124,16 @@ class Alignment:
     path: Int[np.ndarray, "P 2"] | None = None
     cost: Float[np.ndarray, "Ta Tb"] | None = None
     fps: float = math.nan
-    status: Status = Status.OK
     flags: tuple[Status, ...] = ()
     stats: Stats = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "flags", in_order(self.flags))
+
+    @property
+    def status(self) -> Status:
+        """The gravest flag; OK when there is none."""
+        return gravest(self.flags)
 
     @property
     def frames(self) -> float:
@@ -140,7 +154,7 @@ class Offsets:
         component: (V,) index of the video whose clock ``seconds[v]`` refers to. All ``reference`` when the videos
             hang together; a disconnected group has a reference of its own.
         alignments: per pair (i, j) the pair's own answer. matches: what it was made from, without plans.
-        status, flags: per video. stats: of the whole.
+        flags: per video, gravest first; ``status`` has the gravest of each. stats: of the whole.
     """
 
     names: tuple[str, ...]
@@ -150,14 +164,49 @@ class Offsets:
     sigma: Float[np.ndarray, " V"]
     reference: int
     component: Int[np.ndarray, " V"]
-    status: tuple[Status, ...]
     flags: tuple[tuple[Status, ...], ...]
     alignments: Mapping[tuple[int, int], Alignment] = field(default_factory=dict)
     matches: Mapping[tuple[int, int], Matches] = field(default_factory=dict)
     stats: Stats = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "flags", tuple(in_order(flags) for flags in self.flags))
+
+    @classmethod
+    def known(
+        cls,
+        names: Sequence[str],
+        seconds: Float[np.ndarray, " V"],
+        fps: float,
+        rates: Float[np.ndarray, " V"] | None = None,
+    ) -> Offsets:
+        """Offsets that are known, not estimated: sigma 0, no flags; the first video is the reference, whatever it has.
+
+        For truths of simulated worlds, and for clocks that come from elsewhere.
+        """
+        n = len(names)
+        return cls(
+            names=tuple(names),
+            fps=np.full(n, float(fps)),
+            seconds=np.asarray(seconds, float),
+            rates=np.ones(n) if rates is None else np.asarray(rates, float),
+            sigma=np.zeros(n),
+            reference=0,
+            component=np.zeros(n, int),
+            flags=((),) * n,
+        )
+
     def __len__(self) -> int:
         return len(self.names)
+
+    @property
+    def status(self) -> tuple[Status, ...]:
+        """The gravest flag of each video; OK where there is none."""
+        return tuple(gravest(flags) for flags in self.flags)
+
+    def clock(self, v: int) -> Clock:
+        """The clock of video v against its reference's."""
+        return Clock(float(self.seconds[v]), float(self.rates[v]))
 
     @property
     def frames(self) -> Float[np.ndarray, " V"]:
@@ -270,8 +319,7 @@ class Offsets:
                 sigma=_float(p["sigma_seconds"], f"{what}: sigma_seconds", least=0),
                 hypotheses=_rows_of_two(p["hypotheses"], f"{what}: hypotheses"),
                 fps=_float(p["fps"], f"{what}: fps", above=0),
-                status=_status(p["status"], f"{what}: status"),
-                flags=_flags(p["flags"], f"{what}: flags"),
+                flags=_flags(p["flags"], p["status"], what),
                 stats={str(k): _float(x, f"{what}: stats, {k}") for k, x in p["stats"].items()},
             )
         reference = place(data["reference"], "reference")
@@ -310,8 +358,7 @@ class Offsets:
             sigma=column("sigma_seconds", least=0),
             reference=reference,
             component=component,
-            status=tuple(_status(video["status"], f"videos, {video['name']}: status") for video in videos),
-            flags=tuple(in_order(_flags(video["flags"], f"videos, {video['name']}: flags")) for video in videos),
+            flags=tuple(_flags(video["flags"], video["status"], f"videos, {video['name']}") for video in videos),
             alignments=alignments,
             stats={str(k): _float(x, f"stats, {k}") for k, x in data["stats"].items()},
         )
@@ -343,10 +390,16 @@ def _status(code: Any, what: str) -> Status:
         raise ValueError(f"{what}: {str(error).removeprefix('status: ').removesuffix('.')}") from None
 
 
-def _flags(codes: Any, what: str) -> tuple[Status, ...]:
+def _flags(codes: Any, status: Any, what: str) -> tuple[Status, ...]:
+    """The flags of these codes, the gravest of which the status must be."""
     if not isinstance(codes, list):
-        raise ValueError(f"{what}: expected a list of codes; found {str(codes)[:80]!r}")
-    return tuple(_status(code, what) for code in codes)
+        raise ValueError(f"{what}: flags: expected a list of codes; found {str(codes)[:80]!r}")
+    flags = in_order(_status(code, f"{what}: flags") for code in codes)
+    if _status(status, f"{what}: status") is not gravest(flags):
+        raise ValueError(
+            f"{what}: status: expected {gravest(flags).code!r}, the gravest of its flags; found {status!r}"
+        )
+    return flags
 
 
 def _rows_of_two(rows: Any, what: str) -> np.ndarray:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..files import MAX_BYTES, read_npz, write_npz
+from ..files.arrays import MAX_BYTES, read_npz, write_npz
 from .camera import Camera, clock, frame_times
 
 FORMAT, VERSION = "otsync.tracks", 1

@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from otsync.compute.threads import for_each, get_threads, ranges
 from recon.motion import pose_kernels
 from recon.motion import warp_kernels as kernels
 from recon.motion.binding import NODES, Binding
 from recon.motion.paths import Path
-from recon.raster.cpu.threads import for_each, get_threads, ranges
 
 LEAST_NODES, LEAST_GAUSSIANS, LEAST_PAIRS = 64, 1024, 256  # that are worth handing to another thread
 

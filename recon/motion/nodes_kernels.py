@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from recon.raster.cpu.threads import kernel
+from otsync.compute.jit import kernel
 
 
 @kernel()

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from recon.raster.cpu.quaternions import unit, unit_backward
-from recon.raster.cpu.threads import kernel
+from otsync.compute.jit import kernel
+from otsync.compute.quaternions import unit, unit_backward
 
 F64 = np.float64
 WINDOW = 4

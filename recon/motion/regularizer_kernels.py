@@ -10,14 +10,9 @@ import math
 
 import numpy as np
 
-from recon.motion.pose_kernels import (
-    lower_orientation,
-    lower_position,
-    orientation,
-    position,
-)
-from recon.raster.cpu.quaternions import outer, rotation, rotation_backward, turned, turned_back
-from recon.raster.cpu.threads import kernel
+from otsync.compute.jit import kernel
+from otsync.compute.quaternions import outer, rotation, rotation_backward, turned, turned_back
+from recon.motion.pose_kernels import lower_orientation, lower_position, orientation, position
 
 _kernel = kernel(fastmath={"contract", "nsz"})
 

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from recon.raster.cpu.quaternions import LEAST_NORM
+from otsync.compute.quaternions import LEAST_NORM
 
 
 def unit(quats: Tensor) -> Tensor:

@@ -20,9 +20,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from recon.motion.pose_kernels import along_time, lower_orientation, lower_position, orientation, position
-from recon.raster.cpu import simd
-from recon.raster.cpu.quaternions import (
+from otsync.compute import simd
+from otsync.compute.jit import kernel
+from otsync.compute.quaternions import (
     conjugate,
     dot4,
     outer,
@@ -34,8 +34,8 @@ from recon.raster.cpu.quaternions import (
     unit,
     unit_backward,
 )
-from recon.raster.cpu.simd import LANES
-from recon.raster.cpu.threads import kernel
+from otsync.compute.simd import LANES
+from recon.motion.pose_kernels import along_time, lower_orientation, lower_position, orientation, position
 
 F32, F64 = np.float32, np.float64
 ROW = 16
@@ -269,11 +269,17 @@ def lower(begin, end, curves, moment, slopes, pairs, dual, g_rows, g_knots, g_kn
             through = rotation_backward(
                 turn,
                 (
-                    G[0] - O[0], G[1] - O[1], G[2] - O[2],
-                    G[3] - O[3], G[4] - O[4], G[5] - O[5],
-                    G[6] - O[6], G[7] - O[7], G[8] - O[8],
+                    G[0] - O[0],
+                    G[1] - O[1],
+                    G[2] - O[2],
+                    G[3] - O[3],
+                    G[4] - O[4],
+                    G[5] - O[5],
+                    G[6] - O[6],
+                    G[7] - O[7],
+                    G[8] - O[8],
                 ),
-            )  # fmt: skip
+            )
             g_q = product(
                 (g_turn[0] + through[0], g_turn[1] + through[1], g_turn[2] + through[2], g_turn[3] + through[3]), q_rest
             )

@@ -93,7 +93,7 @@ def warmup() -> None:
 
 def set_threads(n: int) -> None:
     """Let the CPU back end use `n` threads, the caller's included; results do not depend on it, to the last bit."""
-    from recon.raster.cpu import threads
+    from otsync.compute import threads
 
     threads.set_threads(n)
 

@@ -29,8 +29,7 @@ from otsync import (
     match,
     refine,
 )
-
-from .case import FLAGGED, REFUSED, RIGHT, Case
+from tests.hard_cases.case import FLAGGED, REFUSED, RIGHT, Case
 
 MATCHERS = {
     "NearestNeighbor": NearestNeighbor(),

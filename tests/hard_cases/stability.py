@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from . import aligning, matching
-from .case import Case
+from tests.hard_cases import aligning, matching
+from tests.hard_cases.case import Case
 
 HEAD = """# Hard cases
 

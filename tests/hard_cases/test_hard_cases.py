@@ -11,11 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from otsync import TrackSet
-
-from . import aligning, matching
-from .case import REFUSED
-from .solvers import ALIGNERS, MATCHERS, REFINERS, assert_sane, outcome, run_align, run_match, watchdog
-from .stability import page
+from tests.hard_cases import aligning, matching
+from tests.hard_cases.case import REFUSED
+from tests.hard_cases.solvers import ALIGNERS, MATCHERS, REFINERS, assert_sane, outcome, run_align, run_match, watchdog
+from tests.hard_cases.stability import page
 
 SLOW = ("EntropicFGW",)
 ROWS = [

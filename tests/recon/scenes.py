@@ -112,11 +112,19 @@ def oracle(scene: Scene, **leaves: Tensor) -> tuple[Tensor, Tensor, Tensor]:
             if not (near <= z.float() <= far) or (s.quats[i] ** 2).sum() < 1e-24:
                 continue
             w, a, b, d = (s.quats[i] / s.quats[i].norm()).unbind()
-            rotation = torch.stack([
-                1 - 2 * (b * b + d * d), 2 * (a * b - w * d), 2 * (a * d + w * b),
-                2 * (a * b + w * d), 1 - 2 * (a * a + d * d), 2 * (b * d - w * a),
-                2 * (a * d - w * b), 2 * (b * d + w * a), 1 - 2 * (a * a + b * b),
-            ]).reshape(3, 3)  # fmt: skip
+            rotation = torch.stack(
+                [
+                    1 - 2 * (b * b + d * d),
+                    2 * (a * b - w * d),
+                    2 * (a * d + w * b),
+                    2 * (a * b + w * d),
+                    1 - 2 * (a * a + d * d),
+                    2 * (b * d - w * a),
+                    2 * (a * d - w * b),
+                    2 * (b * d + w * a),
+                    1 - 2 * (a * a + b * b),
+                ]
+            ).reshape(3, 3)
             axes = R @ rotation * s.scales[i]
             margin_x, margin_y = 0.15 * s.width / fx, 0.15 * s.height / fy
             tx = z * (x / z).clamp(-(cx / fx + margin_x), (s.width - cx) / fx + margin_x)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from functools import cache
 from pathlib import Path
 
-from recon.capture import write_capture
-from recon.simulate import Capture, synthetic
+from recon.simulate.capture import Capture, synthetic
+from recon.simulate.recording import write_capture
 
 SIZE = (96, 64)
 CAMERAS, FRAMES = 3, 14

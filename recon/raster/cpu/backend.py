@@ -14,10 +14,10 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from otsync.compute.simd import LANES
+from otsync.compute.threads import for_each, ranges
 from recon.raster.cpu import kernels, lists
 from recon.raster.cpu import project as projection
-from recon.raster.cpu.simd import LANES
-from recon.raster.cpu.threads import for_each, ranges
 from recon.raster.rendering import Settings, Splats
 
 GAUSSIANS_PER_PART = 1024  # of the projection: fixed, so that sums over parts do not depend on the threads

@@ -12,7 +12,9 @@ import math
 
 import numpy as np
 
-from recon.raster.cpu import simd
+from otsync.compute import simd
+from otsync.compute.jit import kernel
+from otsync.compute.simd import LANES
 from recon.raster.cpu.lists import (
     HALF_Y,
     MARGIN,
@@ -30,8 +32,6 @@ from recon.raster.cpu.lists import (
     TILE_WIDTH,
     VAR_X,
 )
-from recon.raster.cpu.simd import LANES
-from recon.raster.cpu.threads import kernel
 from recon.raster.rendering import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 
 F32, F64, I32 = np.float32, np.float64, np.int32

@@ -12,7 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from recon.raster.cpu.threads import for_each, kernel, ranges
+from otsync.compute.jit import kernel
+from otsync.compute.threads import for_each, ranges
 from recon.raster.rendering import ALPHA_MIN
 
 TILE_WIDTH, TILE_HEIGHT = 64, 16  # pixels: wide, because most of the work is per row of a splat in a tile

@@ -17,8 +17,8 @@ import math
 
 import numpy as np
 
-from recon.raster.cpu.quaternions import rotation, rotation_backward, turned, turned_back, unit_backward
-from recon.raster.cpu.threads import kernel
+from otsync.compute.jit import kernel
+from otsync.compute.quaternions import rotation, rotation_backward, turned, turned_back, unit_backward
 from recon.raster.projection import FRUSTUM_MARGIN, MAX_RADIUS
 from recon.raster.rendering import ALPHA_MIN, QUAT_NORM2_MIN, RADIUS_SIGMAS
 
@@ -228,10 +228,16 @@ def _add_outer(G, a, g):
     """G + a g^T, row by row."""
     r0, r1, r2 = _scaled(a[0], g), _scaled(a[1], g), _scaled(a[2], g)
     return (
-        G[0] + r0[0], G[1] + r0[1], G[2] + r0[2],
-        G[3] + r1[0], G[4] + r1[1], G[5] + r1[2],
-        G[6] + r2[0], G[7] + r2[1], G[8] + r2[2],
-    )  # fmt: skip
+        G[0] + r0[0],
+        G[1] + r0[1],
+        G[2] + r0[2],
+        G[3] + r1[0],
+        G[4] + r1[1],
+        G[5] + r1[2],
+        G[6] + r2[0],
+        G[7] + r2[1],
+        G[8] + r2[2],
+    )
 
 
 @_kernel

@@ -1,0 +1,272 @@
+"""Likelihood scan: how well every whole-frame shift explains the matched motion, and which peaks compete."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..clocks.common import CommonClock, common_clock, strongest
+from ..clocks.splines import TrackSplines
+from ..costs.linear import binary_scale, velocity
+from ..types import Alignment, Matches, Status, TrackSet, in_order
+from ..types.trust import Trust
+from .peaks import local_peaks, vertex
+
+MIN_OVERLAP = 24 / 30
+"""Seconds that two videos must share for an offset to be considered."""
+
+FAST, SLOW = 2 / 30, 5 / 30
+"""Half windows, s, over which velocities are regressed: swift motion, and motion above the jitter of a tracker."""
+
+BLOCK = 20 / 30
+"""Half the length, s, of the windows in which positions are compared: drifts of depth are slower than that."""
+
+MIN_FRAMES, MIN_WINDOW = 12 / 30, 10 / 30
+"""Seconds that a match must be seen in both videos to say anything, altogether and within a window."""
+
+APART = 4 / 30
+"""Seconds between peaks that count as different hypotheses."""
+
+
+COMMON_RATES = (4 / 5, 5 / 6, 24 / 25, 25 / 24, 6 / 5, 5 / 4)
+"""Clock ratios of the frame rates 24, 25 and 30, by which a container's fps may be wrong."""
+
+RATE_MATCHES = 40
+
+
+@dataclass(frozen=True)
+class LikelihoodScan:
+    """Log-likelihood ratio of "these two tracks show the same motion" against "unrelated", at every shift.
+
+    For match m, shift k and a signal of a and b over the n frames that both see (the mean over them removed)::
+
+        LLR = n/2 log((Var a + Var b + e²) / (Var(a - b) + e²)),   e = ½ sqrt(median_m min_k Var(a - b))
+
+    summed over velocities of ±2 and ±5 frames and, with weight ½, positions in windows of 40 frames, divided by the
+    number of matches. The logarithm lets a wrong match add about nothing instead of a veto; the factor n gives no
+    reward for a tiny overlap; a point at rest adds nothing; e makes the noise scale automatic, so no unit enters.
+    Constant errors (depth bias, another surface point) drop out of velocities and of demeaned windows.
+
+    Args:
+        max_lag: largest |offset| in seconds; None: whatever leaves ``min_overlap`` seconds in common.
+        min_overlap: seconds.
+        peaks: how many competing offsets to keep as ``hypotheses``.
+        limit: of more matches only so many are read, the best by score; time is proportional to them.
+        trust: limits behind the flags.
+    """
+
+    max_lag: float | None = None
+    min_overlap: float = MIN_OVERLAP
+    peaks: int = 5
+    limit: int = 500
+    trust: Trust = field(default_factory=Trust)
+
+    def __call__(self, a: TrackSet, b: TrackSet, matches: Matches) -> Alignment:
+        matches = strongest(matches, self.limit)
+        pair, scale = normalised(common_clock(a, b, matches))
+        lags = pair.lags(max(1, round(self.min_overlap * pair.fps)), self.max_lag)
+        if len(matches) == 0 or len(lags) == 0:
+            return unanswered(pair, matches)
+        curves = evidence(pair, lags)
+        score = curves.total
+        if not np.isfinite(score).any():
+            return unanswered(pair, matches)
+        tops = local_peaks(lags, score, round(APART * pair.fps), self.peaks)
+        offset = float(pair.seconds(vertex(lags, score, tops[0])))
+        stats = self._stats(pair, lags, curves, tops) | {"matches": float(len(matches))}
+        stats["other_rate"], stats["other_rate_gain"] = other_rate(a, b, pair, matches, scale, self.max_lag)
+        flags = self._flags(stats)
+        return Alignment(
+            offset,
+            hypotheses=np.array([[pair.seconds(vertex(lags, score, i)), score[i]] for i in tops]),
+            curve=np.stack([pair.origin + lags / pair.fps, score], 1),
+            fps=pair.fps,
+            flags=flags,
+            stats=stats,
+        )
+
+    def _stats(
+        self, pair: CommonClock, lags: Int[np.ndarray, " K"], curves: Curves, tops: list[int]
+    ) -> dict[str, float]:
+        """What the flags are decided by, kept for reports."""
+        score, best = curves.total, tops[0]
+        finite = np.flatnonzero(np.isfinite(score))
+        base = float(np.median(score[finite]))
+        rise = float(score[best] - base)
+        overlap = pair.overlap(lags)
+        # per common frame as well: a period later, exact repetition has the same rate of evidence over fewer frames
+        rivals = [max(r, r * overlap[best] / overlap[i]) for i in tops[1:] if (r := float(score[i] - base)) > 0]
+        second = max(rivals, default=0.0)
+        others = [int(np.argmax(c)) for c in (curves.slow, curves.windows)]
+        rate = np.where(np.isfinite(score), (score - min(base, 0.0)) / overlap, -np.inf)
+        return {
+            "evidence": rise,
+            "margin": (rise - second) / rise if rise > 0 else 0.0,
+            "disagreement": max(abs(int(lags[i] - lags[best])) for i in others) / pair.fps,
+            "alias": abs(int(lags[int(np.argmax(rate))] - lags[best])) / pair.fps,
+            "overlap": float(overlap[best]) / pair.fps,
+            "observed_matches": float(curves.observed[best]),
+            "motion": curves.motion[best],
+            "border": float(best - finite[0] <= 1 or finite[-1] - best <= 1),
+        }
+
+    def _flags(self, stats: dict[str, float]) -> tuple[Status, ...]:
+        t = self.trust
+        found = {
+            Status.WEAK: stats["evidence"] < t.evidence,
+            Status.AMBIGUOUS: stats["margin"] < t.margin,
+            Status.DISAGREE: stats["disagreement"] > t.disagreement + 1e-9,
+            Status.ALIAS: stats["alias"] > t.alias + 1e-9,
+            Status.SHORT_OVERLAP: stats["overlap"] < t.overlap - 1e-9,
+            Status.FEW_MATCHES: stats["observed_matches"] < t.matches,
+            Status.STATIC: stats["motion"] < t.motion,
+            Status.BORDER: stats["border"] > 0,
+            Status.RATE_MISMATCH: stats["other_rate_gain"] > t.rate_gain,
+        }
+        return in_order(flag for flag, raised in found.items() if raised)
+
+
+@dataclass(frozen=True, eq=False)
+class Curves:
+    """Scores over K lags, nats a match (-inf where too little is in common), and what else they were made with.
+
+    Args:
+        total: what is maximised. slow: of ±5-frame velocities. windows: of windowed positions.
+        observed: matches seen long enough at each lag.
+        motion: at each lag, the rms motion that both videos share, relative to the rms extent of the scene.
+    """
+
+    total: Float[np.ndarray, " K"]
+    slow: Float[np.ndarray, " K"]
+    windows: Float[np.ndarray, " K"]
+    observed: Float[np.ndarray, " K"]
+    motion: Float[np.ndarray, " K"]
+
+
+def evidence(pair: CommonClock, lags: Int[np.ndarray, " K"]) -> Curves:
+    """The scan's score and its parts at ``lags``."""
+    from . import kernels
+
+    def frames(seconds: float) -> int:
+        return max(1, round(seconds * pair.fps))
+
+    positions = Signal.of(pair.a), Signal.of(pair.b)
+    least = frames(MIN_FRAMES)
+    count, power, residual = statistics(*positions, lags, least)
+    floor = noise_floor(count, power, residual)
+    windows = np.zeros(len(lags))
+    kernels.windowed_evidence(
+        *positions[0].arrays, *positions[1].arrays, lags, frames(BLOCK), frames(MIN_WINDOW), floor, windows
+    )
+    observed = (count > 0).sum(0).astype(float)
+    windows = np.where(observed > 0, windows / len(pair.a), -np.inf)
+    fast, slow = (velocity_score(pair, lags, frames(half), least) for half in (FAST, SLOW))
+    shared = 0.5 * (count * (power - residual)).sum(0) / np.maximum(count.sum(0), 1)
+    extent = 0.5 * (positions[0].extent + positions[1].extent)
+    return Curves(
+        total=fast + slow + windows,
+        slow=slow,
+        windows=windows,
+        observed=observed,
+        motion=np.sqrt(np.maximum(shared, 0)) / extent if extent > 0 else np.zeros(len(lags)),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Signal:
+    """One video's matched tracks in the kernels' form: (M,3,T) zero where unseen, (M,T) seen, (M,T) |x|²."""
+
+    arrays: tuple[np.ndarray, np.ndarray, np.ndarray]
+    extent: float
+
+    @classmethod
+    def of(cls, x: Float[np.ndarray, "M T 3"]) -> Signal:
+        """After subtracting each track's own mean, which only serves the numerics."""
+        seen = np.isfinite(x[..., 0])
+        count = np.maximum(seen.sum(1), 1)[:, None]
+        filled = np.where(seen[..., None], x, 0.0)
+        mean = filled.sum(1) / count
+        y = np.where(seen[..., None], x - mean[:, None], 0.0)
+        there = mean[seen.any(1)]
+        extent = float(np.sqrt(((there - there.mean(0)) ** 2).sum(1).mean())) if len(there) else 0.0
+        spread = np.ascontiguousarray(y.transpose(0, 2, 1))
+        return cls((spread, seen.astype(float), (spread**2).sum(1)), extent)
+
+
+def statistics(
+    a: Signal, b: Signal, lags: Int[np.ndarray, " K"], least: int
+) -> tuple[Float[np.ndarray, "M K"], Float[np.ndarray, "M K"], Float[np.ndarray, "M K"]]:
+    """Frames in common, Var a + Var b and Var(a - b) of every match at every lag."""
+    from . import kernels
+
+    out = tuple(np.zeros((len(a.arrays[0]), len(lags))) for _ in range(3))
+    kernels.lag_statistics(*a.arrays, *b.arrays, lags, least, *out)
+    return out  # type: ignore[return-value]
+
+
+def noise_floor(count: np.ndarray, power: np.ndarray, residual: np.ndarray) -> float:
+    """e²: a quarter of the typical match's least residual variance; above rounding of the signal's own variance."""
+    known = (count > 0).any(1)
+    if not known.any():
+        return 1.0
+    least = np.where(count > 0, residual, np.inf).min(1)[known]
+    largest = power.max(1)[known]
+    floor = max(0.25 * float(np.median(least)), 1e-12 * float(np.median(largest)), 1e-24 * float(largest.max()))
+    return floor or 1.0
+
+
+def velocity_score(pair: CommonClock, lags: Int[np.ndarray, " K"], half: int, least: int) -> Float[np.ndarray, " K"]:
+    """Mean LLR of the velocities over ±``half`` frames."""
+    a, b = Signal.of(velocity(pair.a, half)), Signal.of(velocity(pair.b, half))
+    count, power, residual = statistics(a, b, lags, least)
+    floor = noise_floor(count, power, residual)
+    score = 0.5 * (count * np.log((power + floor) / (residual + floor))).sum(0) / len(pair.a)
+    return np.where((count > 0).any(0), score, -np.inf)
+
+
+def other_rate(
+    a: TrackSet, b: TrackSet, pair: CommonClock, matches: Matches, scale: float, max_lag: float | None
+) -> tuple[float, float]:
+    """Which of :data:`COMMON_RATES` suits the slow velocities best, and how many times better than the declared clocks.
+
+    A warning, not an answer: read from a few dozen matches only, as every pair pays for it.
+    """
+    some = np.unique(np.linspace(0, len(matches) - 1, RATE_MATCHES).astype(int))
+    half, least = max(1, round(SLOW * pair.fps)), max(1, round(MIN_FRAMES * pair.fps))
+
+    def rise(p: CommonClock) -> float:
+        k = p.lags(max(1, round(MIN_OVERLAP * pair.fps)), max_lag)
+        if not len(k):
+            return 0.0
+        score = velocity_score(p, k, half, least)
+        finite = score[np.isfinite(score)]
+        return float(finite.max() - np.median(finite)) if len(finite) else 0.0
+
+    declared = CommonClock(pair.a[some], pair.b[some], pair.fps, pair.origin)
+    curves = TrackSplines(b.times, b.take(matches.pairs[some, 1]).positions() / scale)
+    rises = {}
+    for rate in COMMON_RATES:
+        n = int(np.floor((b.times[-1] - b.times[0]) * rate * pair.fps + 1e-6)) + 1
+        t = b.times[0] + np.arange(n) / (rate * pair.fps)
+        other = CommonClock(declared.a, curves.sample(t), pair.fps, float(a.times[0] - rate * b.times[0]))
+        rises[rate] = rise(other)
+    best = max(rises, key=rises.__getitem__)
+    now = rise(declared)
+    return best, rises[best] / now if now > 0 else 0.0
+
+
+def unanswered(
+    pair: CommonClock, matches: Matches, cost: np.ndarray | None = None, why: Status = Status.NO_OVERLAP
+) -> Alignment:
+    """The answer when no lag leaves matched samples to compare, or they tell nothing."""
+    flags = (Status.FEW_MATCHES if len(matches) == 0 else why,)
+    stats = {"matches": float(len(matches))}
+    return Alignment(float("nan"), cost=cost, fps=pair.fps, flags=flags, stats=stats)
+
+
+def normalised(pair: CommonClock) -> tuple[CommonClock, float]:
+    """The same in units of a power of two near its size, and that unit: squares neither overflow nor vanish."""
+    scale = max(binary_scale(pair.a), binary_scale(pair.b))
+    return CommonClock(pair.a / scale, pair.b / scale, pair.fps, pair.origin), scale

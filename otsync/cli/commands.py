@@ -1,0 +1,23 @@
+"""The commands of ``otsync``: our own, and those that other packages bring (entry points in ``otsync.commands``)."""
+
+from __future__ import annotations
+
+from ..plugins import entries, registered
+from .shell import Load, from_places
+
+OWN = {
+    "demo": "otsync.cli.simulate:Demo",
+    "simulate": "otsync.cli.simulate:Simulate",
+    "match": "otsync.cli.match:Match",
+    "init": "otsync.cli.recordings:Init",
+    "check": "otsync.cli.recordings:Check",
+    "sync": "otsync.cli.sync:Sync",
+    "bench": "otsync.cli.bench:Bench",
+}
+
+
+def commands() -> dict[str, Load]:
+    """What loads each command, by name. Reconstruction's ``run`` comes from :mod:`recon`, as any package's could."""
+    installed = {name: point.load for name, point in entries("commands").items()}
+    added = {name: (lambda thing=thing: thing) for name, thing in registered("commands").items()}
+    return from_places(OWN) | installed | added

@@ -1,0 +1,48 @@
+"""``otsync match``."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from ..match import MATCHERS, match
+from ..types import TrackSet
+from .slots import slot
+from .tables import refusal
+
+
+@dataclass
+class Match:
+    """Match the tracks of two videos.
+
+    Example: otsync match a.npz b.npz --out matches.csv matcher:partial-fgw --matcher.mass 0.65
+    """
+
+    a: tyro.conf.Positional[Path]
+    b: tyro.conf.Positional[Path]
+    out: Path | None = None
+    """CSV file for the pairs (index in a, index in b, score)."""
+    budget: float | None = None
+    """Seconds: takes the most accurate matcher that is predicted to fit."""
+    matcher: slot("matchers", MATCHERS, optional=True) = None
+    """Default: by size, fused Gromov-Wasserstein below 200 tracks and its anchored form above."""
+
+    def run(self) -> int:
+        a, b = TrackSet.load(self.a), TrackSet.load(self.b)
+        if sys.stderr.isatty():  # one solve has no steps to count
+            print(f"matching {len(a)} x {len(b)} tracks ...", file=sys.stderr)
+        found = match(a, b, self.matcher, budget=self.budget, throw=False)
+        print(f"{len(found)} matches between {len(a)} and {len(b)} tracks")
+        print("  ".join(f"{name} {value:.6g}" for name, value in found.stats.items()))
+        if self.out is not None:
+            from ..files.arrays import atomic_write
+
+            assert found.score is not None
+            with atomic_write(self.out, "w") as stream:
+                stream.write("a,b,score\n")
+                stream.writelines(f"{i},{j},{s:.9g}\n" for (i, j), s in zip(found.pairs, found.score, strict=True))
+            print(f"wrote {self.out}")
+        return refusal("match", found.status, found.flags)

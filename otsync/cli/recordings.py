@@ -1,0 +1,132 @@
+"""Commands on recordings: ``otsync init``, ``otsync check``, and ``otsync sync`` on a scene instead of track sets."""
+
+from __future__ import annotations
+
+import os
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+
+@dataclass
+class Init:
+    """Write scene.json for a folder of recordings, naming what is missing.
+
+    Example: otsync init recording/
+    """
+
+    folder: tyro.conf.Positional[Path]
+    """Panoptic layout, video files, or one folder of images per camera."""
+    out: Path | None = None
+    """Where to write; default: scene.json in the folder."""
+    fps: float | None = None
+    """Frames per second of image folders, which carry no clock."""
+    force: bool = False
+    """Replace an existing scene.json."""
+
+    def run(self) -> int:
+        from ..files.arrays import write_json
+        from ..io import describe_folder
+
+        out = self.out or self.folder / "scene.json"
+        if out.exists() and not self.force:
+            raise ValueError(f"{out}: exists already. Pass --force to replace it, or --out for another place.")
+        if out.parent.resolve() != self.folder.resolve():
+            print(f"note: paths in {out} are relative to {self.folder}; keep it there to use it", file=sys.stderr)
+        document = describe_folder(self.folder, fps=self.fps)
+        write_json(out, document)
+        print(f"wrote {out}: {len(document['videos'])} videos")
+        for note in document.get("notes", ()):
+            print(f"note: {note}")
+        for item in document.get("missing", ()):
+            print(f"missing: {item}", file=sys.stderr)
+        return 1 if document.get("missing") else 0
+
+
+@dataclass
+class Check:
+    """Look for what commonly goes wrong in a recording: poses, intrinsics, clocks, files, depth units.
+
+    Example: otsync check recording/
+    """
+
+    scene: tyro.conf.Positional[Path]
+    """A scene.json, or a folder that holds one, or a folder in Panoptic layout."""
+    every_frame: bool = True
+    """Decode every image; off: the first, the middle and the last."""
+    allow_outside: bool = False
+    """Let the scene name files outside its folder."""
+
+    def run(self) -> int:
+        from ..recordings.check import check_scene
+
+        findings = check_scene(self.scene, every_frame=self.every_frame, allow_outside=self.allow_outside)
+        for finding in findings:
+            print(f"{finding.severity}: {finding.video or 'scene'}: {finding.what} {finding.remedy}")
+        errors = sum(f.severity == "error" for f in findings)
+        print(f"{errors} errors, {len(findings) - errors} warnings")
+        return 1 if errors else 0
+
+
+@dataclass(frozen=True)
+class RecordingOptions:
+    """How ``otsync sync`` treats a recording."""
+
+    route: Literal["auto", "tracks", "epipolar", "stereo"] = "auto"
+    """tracks needs depth, stereo a static rig of five and more, epipolar nothing but calibration; auto decides."""
+    cameras: tuple[str, ...] = ()
+    """Names of the videos to use; default: all."""
+    cache: Path | None = None
+    """Folder where stages are kept; default: stages in --out."""
+    allow_outside: bool = False
+    """Let the scene name files outside its folder."""
+    workers: int = 0
+    """Threads; 0: one per core."""
+
+
+def sync_recording(
+    path: Path, out: Path, options: RecordingOptions, *, reference: str | None = None, truth: Path | None = None
+) -> int:
+    """``otsync sync SCENE``: offsets.json, run.json and report.html in ``out``. Exit code 1 when an answer is flagged."""
+    from ..files.arrays import write_json
+    from ..files.cache import Cache
+    from ..io import open_scene
+    from ..recordings.routes import synchronize_scene
+    from ..report.frames import write_recording_report
+    from .tables import table, true_offsets
+
+    scene = open_scene(path, allow_outside=options.allow_outside)
+    if options.cameras:
+        scene = scene.take(options.cameras)
+    chosen = 0
+    if reference is not None:
+        if reference not in scene.names:
+            raise ValueError(f"--reference: expected one of {', '.join(scene.names)}; found {reference!r}.")
+        chosen = scene.names.index(reference)
+    known = None if truth is None else true_offsets(truth, scene.names)
+    if known is not None:
+        known = known - known[chosen]
+    for note in scene.notes:
+        print(f"note: {note}", file=sys.stderr)
+    with ThreadPoolExecutor(options.workers or os.cpu_count() or 1) as pool:
+        found = synchronize_scene(
+            scene,
+            route=options.route,
+            reference=chosen,
+            cache=Cache(options.cache or out / "stages"),
+            map=pool.map,
+            tell=lambda text: print(text, file=sys.stderr, flush=True),
+        )
+    print(table(found.offsets, known))
+    found.offsets.save(out / "offsets.json")
+    write_json(out / "run.json", {"route": found.route, "why": list(found.why), "seconds": found.seconds})
+    write_recording_report(out / "report.html", scene, found, truth=None if known is None else list(known))
+    print(f"route {found.route}; wrote {out / 'offsets.json'}, {out / 'run.json'} and {out / 'report.html'}")
+    for name, flags in zip(found.offsets.names, found.offsets.flags, strict=True):
+        for flag in flags:
+            print(f"{name}: {flag.code}: {flag}", file=sys.stderr)
+    return 0 if found.offsets.ok else 1

@@ -1,0 +1,143 @@
+"""What the commands ``otsync`` and ``recon`` share: options into an object that runs, errors into exit codes."""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import tyro
+
+from .. import __version__, plugins, progress
+
+EXTRAS = {
+    "torch": "recon",
+    "plyfile": "recon",
+    "av": "video",
+    "cv2": "video",
+    "PIL": "video",
+    "gsplat": "cuda",
+    "ott": "rivals",
+    "jax": "rivals",
+}
+"""The extra of otsync (pyproject.toml) that brings a package, by the name that it is imported by."""
+
+SHARED = """
+Options of every command: --plugin FILE.py loads your own matchers, readers, losses, ... (also: OTSYNC_PLUGINS);
+-v tells more, --quiet tells nothing but results and errors; --version. Shell completion:
+--tyro-print-completion bash|zsh|tcsh.
+"""
+
+Load = Callable[[], Callable[..., Any]]
+"""Gives a command's dataclass when it is asked for."""
+
+
+def from_places(places: Mapping[str, str]) -> dict[str, Load]:
+    """What loads each of some commands, from where it is ("module:Name"): one runs without loading the others."""
+
+    def load(place: str) -> Callable[..., Any]:
+        module, _, name = place.partition(":")
+        return getattr(importlib.import_module(module), name)
+
+    return {name: partial(load, place) for name, place in places.items()}
+
+
+def missing_package(error: ModuleNotFoundError) -> str:
+    """Which package is not there, and what to install."""
+    if not error.name:
+        return f"needs a package that is not installed: {error}"
+    package = error.name.partition(".")[0]
+    extra = EXTRAS.get(package)
+    what = "otsync" if extra is None else f"'otsync[{extra}]'"
+    return f"needs {error.name}. Install it: pip install {what}."
+
+
+def run_command(
+    prog: str,
+    commands: Callable[[], Mapping[str, Load]],
+    args: Sequence[str] | None,
+    *,
+    description: str,
+    refused: tuple[type[Exception], ...],
+    interrupted: str,
+) -> int:
+    """Run the subcommand that ``args`` (default: the process's) name; the exit code.
+
+    Args:
+        commands: gives what loads each command, by name: a dataclass with a ``run`` method that returns the exit code.
+            Asked after plugins are loaded; only the command that runs is loaded, so that its rivals cost no start-up time.
+        refused: errors that mean an answer is not to be trusted: exit code 1. Bad arguments or files (ValueError,
+            OSError, a package that is not installed) give 2, an interrupt 130.
+        interrupted: what an interrupted run leaves behind, in words.
+    """
+    try:
+        rest = shared_options(list(sys.argv[1:] if args is None else args))
+        if rest is None:
+            print(f"{prog} {__version__}")
+            return 0
+        command = parsed(prog, commands(), rest, description + SHARED)
+        return command.run()
+    except refused as error:
+        code, said = 1, str(error)
+    except ModuleNotFoundError as error:
+        code, said = 2, missing_package(error)
+    except (ValueError, OSError) as error:
+        code, said = 2, str(error)
+    except KeyboardInterrupt:
+        code, said = 130, f"interrupted; {interrupted}"
+    print(f"{prog}: {said}", file=sys.stderr)
+    return code
+
+
+def parsed(prog: str, commands: Mapping[str, Load], args: list[str], description: str) -> Any:
+    """The command that the arguments name, with its options set; help and mistakes end the process as usual."""
+    chosen = args[0] if args else ""
+    if chosen in commands:  # the others stay unloaded
+        return tyro.cli(commands[chosen](), prog=f"{prog} {chosen}", args=args[1:])
+    return tyro.extras.subcommand_cli_from_dict(
+        {name: load() for name, load in commands.items()},
+        prog=prog,
+        description=description,
+        args=args,
+        config=(tyro.conf.AvoidSubcommands,) if not args else (),
+    )
+
+
+def shared_options(args: list[str]) -> list[str] | None:
+    """Heed the options that every command takes, and give back the rest; None when the version is asked for.
+
+    They may stand anywhere before a ``--``. ValueError for both of --verbose and --quiet, and for plugins that do not load.
+    """
+    if args == ["--version"]:
+        return None
+    rest: list[str] = []
+    files: list[str] = []
+    wanted = {"-v": False, "--quiet": False}
+    while args:
+        arg = args.pop(0)
+        if arg in ("-v", "--verbose"):
+            wanted["-v"] = True
+        elif arg in ("-q", "--quiet"):
+            wanted["--quiet"] = True
+        elif arg == "--plugin" or arg.startswith("--plugin="):
+            value = arg.partition("=")[2] or (args.pop(0) if args else "")
+            if not value:
+                raise ValueError("--plugin: expected a Python file; found nothing.")
+            files.append(value)
+        elif arg == "--":
+            rest += [arg, *args]
+            break
+        else:
+            rest.append(arg)
+    if all(wanted.values()):
+        raise ValueError("-v, --quiet: expected one of them; found both.")
+    progress.be_quiet(wanted["--quiet"])
+    if wanted["-v"]:
+        logging.basicConfig(stream=sys.stderr, format="%(name)s: %(message)s")
+    for name in ("otsync", "recon"):
+        logging.getLogger(name).setLevel(logging.DEBUG if wanted["-v"] else logging.NOTSET)
+    plugins.load_files(files)
+    return rest

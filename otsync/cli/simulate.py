@@ -1,0 +1,85 @@
+"""``otsync demo`` and ``otsync simulate``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from ..sync.verb import unique_names
+from ..types import Offsets
+from .tables import report, with_progress
+
+Motion = Literal["boxes", "juggle", "softball", "tennis", "basketball", "football", "static"]
+Preset = Literal["clean", "mid", "hard", "brutal"]
+
+
+@dataclass
+class Demo:
+    """Simulate a small unsynchronised world, match, synchronise, and show what came out.
+
+    Example: otsync demo --motion tennis --videos 4 --out demo
+    """
+
+    out: Path = Path("demo")
+    """Folder for offsets.json and report.html."""
+    motion: Motion = "softball"
+    preset: Preset = "mid"
+    videos: int = 4
+    seed: int = 1
+
+    def run(self) -> int:
+        from ..simulate import simulate
+
+        self.out.mkdir(parents=True, exist_ok=True)
+        tracks, truth = simulate(self.motion, preset=self.preset, videos=self.videos, seed=self.seed)
+        print(
+            f"{self.videos} videos of a simulated scene ({self.motion}, {self.preset}), filmed without a common clock."
+        )
+        offsets = with_progress(tracks, "matching and synchronising")
+        return report(offsets, tracks, truth.offsets, self.out, f"{self.motion}, {self.preset}: {self.videos} videos")
+
+
+@dataclass
+class Simulate:
+    """Write the tracks of several unsynchronised videos of one simulated scene, and the truth.
+
+    Example: otsync simulate world --motion juggle --preset mid --videos 6 --seed 3
+    """
+
+    out: tyro.conf.Positional[Path]
+    """Folder for one .npz per video and truth.json (in the format of offsets.json)."""
+    motion: str = "softball"
+    """boxes, juggle, softball, tennis, basketball, football, static, or mocap:FILE (BVH, or AMC beside its ASF)."""
+    preset: Preset = "mid"
+    videos: int = 4
+    frames: int = 150
+    fps: float = 30.0
+    max_offset: float = 30.0
+    """Largest offset, in frames."""
+    seed: int = 0
+
+    def run(self) -> int:
+        from ..simulate import simulate
+
+        tracks, truth = simulate(
+            self.motion,
+            preset=self.preset,
+            videos=self.videos,
+            frames=self.frames,
+            fps=self.fps,
+            max_offset=self.max_offset,
+            seed=self.seed,
+        )
+        stale = sorted({p.name for p in self.out.glob("*.npz")} - {f"{t.name}.npz" for t in tracks})
+        if stale:
+            raise ValueError(
+                f"{self.out}: expected a folder without track sets of another world; it holds {stale[0]}. Choose another."
+            )
+        for t in tracks:
+            t.save(self.out / f"{t.name}.npz")
+        Offsets.known(unique_names(tracks), truth.offsets, self.fps, truth.rates).save(self.out / "truth.json")
+        print(f"{self.out}: {', '.join(t.name + '.npz' for t in tracks)}, truth.json")
+        return 0

@@ -1,0 +1,87 @@
+"""``otsync sync``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from ..align import ALIGNERS, LikelihoodScan
+from ..match import MATCHERS
+from ..refine import REFINERS, SplineRefine
+from ..sync.graph import Graph
+from ..sync.verb import unique_names
+from ..types import TrackSet
+from .recordings import RecordingOptions, sync_recording
+from .slots import slot
+from .tables import report, true_offsets, with_progress
+
+
+@dataclass
+class Sync:
+    """Synchronise a recording (scene.json or its folder), or videos from their track sets.
+
+    Example: otsync sync world/*.npz --out result
+
+    A recording: otsync sync recording/ --out result
+
+    The paper's method: otsync sync world/*.npz --rematch 0 --graph.extra 0 matcher:fused-gromov-wasserstein aligner:dtw
+    refiner:unrefined
+
+    A recording's route brings its own matcher, aligner and refiner; --recording.route chooses another.
+    """
+
+    tracks: tyro.conf.Positional[tuple[Path, ...]]
+    """A scene.json or a folder with one (also in Panoptic layout); or track sets (.npz written by otsync), one per
+    video, in one world frame."""
+    out: Path = Path("sync")
+    """Folder for offsets.json and report.html, and the stages of a recording, from which a killed run continues."""
+    reference: str | None = None
+    """Name of the reference video, or "auto" for the one with the surest pairs; default: the first."""
+    truth: Path | None = None
+    """truth.json of a simulated world: adds errors to the table."""
+    rate: Literal["fixed", "fit"] = "fixed"
+    """Frame rates as declared, or fitted on long clips and kept where significant."""
+    rematch: int = 1
+    """How often trusted pairs are matched again at the synchronised times."""
+    workers: int = 1
+    """Processes that pairs are spread over; results do not depend on it."""
+    graph: Graph = field(default_factory=Graph)
+    matcher: slot("matchers", MATCHERS, optional=True) = None
+    """Default: by size, fused Gromov-Wasserstein below 200 tracks and its anchored form above."""
+    aligner: slot("aligners", ALIGNERS) = field(default_factory=LikelihoodScan)
+    """From matches to the offset of a pair, to the frame."""
+    refiner: slot("refiners", REFINERS) = field(default_factory=SplineRefine)
+    """From the frame to a fraction of it."""
+    recording: RecordingOptions = field(default_factory=RecordingOptions)
+
+    def run(self) -> int:
+        if len(self.tracks) == 1 and self.tracks[0].suffix != ".npz":
+            return sync_recording(self.tracks[0], self.out, self.recording, reference=self.reference, truth=self.truth)
+        if len(self.tracks) < 2:
+            raise ValueError(f"tracks: expected at least two .npz files; found {len(self.tracks)}.")
+        tracks = [TrackSet.load(path) for path in self.tracks]
+        names = unique_names(tracks)
+        reference: int | str = 0
+        if self.reference is not None:
+            if self.reference not in (*names, "auto"):
+                raise ValueError(f"--reference: expected auto or one of {', '.join(names)}; found {self.reference!r}.")
+            reference = "auto" if self.reference == "auto" else names.index(self.reference)
+        known = None if self.truth is None else true_offsets(self.truth, names)
+        self.out.mkdir(parents=True, exist_ok=True)  # before the work, not after it
+        offsets = with_progress(
+            tracks,
+            "synchronising",
+            self.workers,
+            reference=reference,
+            matcher=self.matcher,
+            aligner=self.aligner,
+            refiner=self.refiner,
+            graph=self.graph,
+            rematch=self.rematch,
+            rate=self.rate,
+        )
+        truth = None if known is None else known - known[offsets.component]
+        return report(offsets, tracks, truth, self.out, "Synchronisation report")

@@ -1,0 +1,88 @@
+"""Tables and messages that commands print."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..progress import counted
+from ..sync.verb import synchronize
+from ..types import Offsets, Status, TrackSet
+
+if TYPE_CHECKING:
+    import numpy as np
+
+
+def true_offsets(path: Path, names: tuple[str, ...]) -> np.ndarray:
+    """True offsets of the named videos; ValueError names what the file lacks."""
+    import numpy as np
+
+    known = Offsets.load(path)
+    missing = [name for name in names if name not in known.names]
+    if missing:
+        raise ValueError(f"{path}: expected offsets of {', '.join(names)}; {', '.join(missing)} are not in it.")
+    return np.array([known.seconds[known.names.index(name)] for name in names])
+
+
+def with_progress(tracks: list[TrackSet], what: str, workers: int = 1, **options: Any) -> Offsets:
+    """:func:`otsync.synchronize` on some processes, with a progress bar on a terminal."""
+    from concurrent.futures import ProcessPoolExecutor
+    from multiprocessing import get_context
+
+    if workers < 1:
+        raise ValueError(f"--workers: expected at least 1; found {workers}.")
+
+    def progress(run: Callable[..., Iterable[Any]]) -> Callable[..., Iterable[Any]]:
+        def mapped(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterable[Any]:
+            items = list(items)
+            return counted(run(function, items), what, "pair", len(items))
+
+        return mapped
+
+    if workers == 1:
+        return synchronize(tracks, map=progress(map), **options)
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        return synchronize(tracks, map=progress(pool.map), **options)
+
+
+def report(offsets: Offsets, tracks: list[TrackSet], truth: Any, out: Path, title: str) -> int:
+    """Print the table, write offsets.json and report.html; exit code 1 when an answer was refused."""
+    from ..report import write_report
+
+    print(table(offsets, truth))
+    offsets.save(out / "offsets.json")
+    write_report(out / "report.html", offsets, tracks, truth=truth, title=title)
+    print(f"wrote {out / 'offsets.json'} and {out / 'report.html'}")
+    doubtful = [n for n, s in zip(offsets.names, offsets.status, strict=True) if not s.ok]
+    for name, flags in zip(offsets.names, offsets.flags, strict=True):
+        for flag in flags:
+            print(f"{name}: {flag.code}: {flag}", file=sys.stderr)
+    return 1 if doubtful else 0
+
+
+def table(offsets: Offsets, truth: Any = None) -> str:
+    """The answer as text, in frames of the reference."""
+    import numpy as np
+
+    fps = offsets.fps[offsets.component]
+    true = np.full(len(offsets), np.nan) if truth is None else np.asarray(truth) * fps
+    width = max(5, *map(len, offsets.names))
+    lines = [
+        f"{'video':{width}}  {'offset':>9} {'sigma':>8} {'true':>9} {'error':>8}  status   (frames of the reference)"
+    ]
+    for v, name in enumerate(offsets.names):
+        values = (offsets.frames[v], offsets.sigma[v] * fps[v], true[v], offsets.frames[v] - true[v])
+        cells = [f"{x:{w}.3f}" if np.isfinite(x) else "–".rjust(w) for x, w in zip(values, (9, 8, 9, 8), strict=True)]
+        status = "reference" if v == offsets.reference else offsets.status[v].code
+        lines.append(f"{name:{width}}  {' '.join(cells)}  {status}")
+    return "\n".join(lines)
+
+
+def refusal(verb: str, status: Status, flags: tuple[Status, ...]) -> int:
+    if status.ok:
+        return 0
+    for flag in flags or (status,):
+        print(f"{verb} refused: {flag.code}: {flag}", file=sys.stderr)
+    return 1

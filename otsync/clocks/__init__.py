@@ -1,0 +1,1 @@
+"""Continuous time: two videos on one clock, splines through tracks, rolling shutters undone."""

@@ -1,0 +1,100 @@
+"""Two videos' matched tracks on one uniform clock, the form in which aligners read them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from ..geometry import seen_pixels
+from ..types import Matches, TrackSet
+from .splines import TrackSplines
+
+SAME_FPS = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class CommonClock:
+    """Matched tracks, sample i of ``a`` and j of ``b`` showing the same moment when i - j = k, the lag.
+
+    Args:
+        a: (M,Ta,3), b: (M,Tb,3): positions in world units, nan where unobserved.
+        fps: of both. origin: the offset in seconds that lag 0 means.
+    """
+
+    a: Float[np.ndarray, "M Ta 3"]
+    b: Float[np.ndarray, "M Tb 3"]
+    fps: float
+    origin: float
+
+    def seconds(self, lag: Float[np.ndarray, " K"] | float) -> Float[np.ndarray, " K"] | float:
+        """offset(a, b) of a lag in frames."""
+        return self.origin + lag / self.fps
+
+    def lag(self, seconds: float) -> float:
+        return (seconds - self.origin) * self.fps
+
+    def lags(self, min_overlap: int, max_lag: float | None) -> np.ndarray:
+        """All integer lags that leave ``min_overlap`` frames in common, within ±``max_lag`` seconds of offset."""
+        k = np.arange(-(self.b.shape[1] - min_overlap), self.a.shape[1] - min_overlap + 1)
+        return k if max_lag is None else k[np.abs(self.origin + k / self.fps) <= max_lag + 1e-9]
+
+    def overlap(self, lags: np.ndarray) -> np.ndarray:
+        """Frames in common at each lag."""
+        return np.minimum(self.a.shape[1], self.b.shape[1] + lags) - np.maximum(0, lags)
+
+
+def common_clock(a: TrackSet, b: TrackSet, matches: Matches) -> CommonClock:
+    """Bring matched tracks on the slower of the two clocks.
+
+    Samples of a uniform clock of that rate are taken as they are; others (another fps, timestamps) come from the
+    track's spline, which never bridges a gap.
+    """
+    i, j = matches.pairs.T
+    fps = min(nominal_fps(a), nominal_fps(b))
+    return CommonClock(_on_grid(a.take(i), fps), _on_grid(b.take(j), fps), fps, float(a.times[0] - b.times[0]))
+
+
+def strongest(matches: Matches, limit: int) -> Matches:
+    """At most ``limit`` matches, the best by score in their given order; ties are drawn by a fixed shuffle."""
+    if len(matches) <= limit:
+        return matches
+    assert matches.score is not None
+    shuffled = np.random.default_rng(0).permutation(len(matches))
+    chosen = np.sort(shuffled[np.argsort(-matches.score[shuffled], kind="stable")[:limit]])
+    return Matches(matches.pairs[chosen], matches.score[chosen])
+
+
+def nominal_fps(tracks: TrackSet) -> float:
+    """Frames per second as declared, else from the timestamps' median step."""
+    assert tracks.fps is not None or tracks.n_frames == 1
+    return tracks.fps or 30.0
+
+
+def is_uniform(tracks: TrackSet) -> bool:
+    """Whether the frames lie on an even grid of the nominal rate, to a thousandth of a frame."""
+    t = tracks.timestamps
+    if t is None:
+        return True
+    grid = t[0] + np.arange(len(t)) / nominal_fps(tracks)
+    return bool(np.abs(t - grid).max() * nominal_fps(tracks) < 1e-3)
+
+
+def _on_grid(tracks: TrackSet, fps: float) -> Float[np.ndarray, "M T 3"]:
+    if is_uniform(tracks) and abs(nominal_fps(tracks) / fps - 1) <= SAME_FPS:
+        return tracks.positions()
+    times = tracks.times
+    grid = times[0] + np.arange(int(np.floor((times[-1] - times[0]) * fps + 1e-6)) + 1) / fps
+    return TrackSplines(times, tracks.positions()).sample(grid)
+
+
+def on_clock(tracks: TrackSet, fps: float) -> Float[np.ndarray, "N T 2"]:
+    """Pixels on an even clock of ``fps``; nan where unseen. Splines answer for other clocks and never bridge gaps."""
+    uv = seen_pixels(tracks)
+    if is_uniform(tracks) and abs(nominal_fps(tracks) / fps - 1) <= SAME_FPS:
+        return uv
+    times = tracks.times
+    grid = times[0] + np.arange(int(np.floor((times[-1] - times[0]) * fps + 1e-6)) + 1) / fps
+    flat = np.concatenate([uv, np.where(np.isfinite(uv[..., :1]), 0.0, np.nan)], 2)
+    return TrackSplines(times, flat).sample(grid)[..., :2]

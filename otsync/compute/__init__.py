@@ -1,0 +1,1 @@
+"""What is compiled: how (jit), on which threads, SIMD lanes, and quaternions inside kernels."""

@@ -1,0 +1,60 @@
+"""The one way a kernel is compiled. Importing this module imports numba; algorithms import their kernels when they run."""
+
+from __future__ import annotations
+
+import functools
+import logging
+import pathlib
+from collections.abc import Callable
+from typing import Any
+
+import numba
+
+log = logging.getLogger("otsync")
+
+_uncached_announced = False
+
+
+def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """numba.njit for kernels: no GIL, division by zero gives infinity, compiled code cached on disk where possible.
+
+    Numba looks for a writable folder: beside the source, else the user's cache folder, so that a read-only installation
+    is compiled once per user. Where neither can be written (a container without a home), it is compiled per process.
+    """
+    settings = {"nogil": True, "error_model": "numpy", **options}
+
+    def compile_lazily(function: Callable[..., Any]) -> Any:
+        global _uncached_announced
+        try:
+            dispatcher = numba.njit(cache=True, **settings)(function)
+            _tie_to_sources(dispatcher)
+            return dispatcher
+        except RuntimeError:  # "cannot cache function: no locator available"
+            if not _uncached_announced:
+                _uncached_announced = True
+                log.warning(
+                    "no writable folder for compiled code: it is compiled again in every process. Set NUMBA_CACHE_DIR "
+                    "to a folder of your own."
+                )
+            return numba.njit(**settings)(function)
+
+    return compile_lazily
+
+
+_folder = pathlib.Path(__file__).parent
+
+
+@functools.cache
+def _stamps(folder: pathlib.Path) -> tuple[tuple[str, int, int], ...]:
+    return tuple((p.name, p.stat().st_mtime_ns, p.stat().st_size) for p in sorted(folder.glob("*.py")))
+
+
+def _tie_to_sources(dispatcher: Any) -> None:
+    """Make the cached code of one kernel stale when any file of this folder, or of its own, changes.
+
+    Numba compares the kernel's own file only, but kernels compile in the constants and functions of the others.
+    """
+    file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
+    if file is not None and hasattr(file, "_source_stamp"):
+        own = pathlib.Path(dispatcher.py_func.__code__.co_filename).parent
+        file._source_stamp = (file._source_stamp, _stamps(_folder), _stamps(own))

@@ -1,0 +1,105 @@
+"""Compiled distances between tracks."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..compute.jit import kernel
+
+
+@kernel(fastmath={"contract", "reassoc", "nsz"})
+def max_distance_block(a, b, wa, wb, gaps, i0, i1, j0, j1, out):
+    """D_track of rows i0:i1 of ``a`` against columns j0:j1 of ``b``.
+
+    a (3,T,N), b (3,T,M): positions, 0 where unseen; wa (T,N), wb (T,M): 1 seen, 0 not, read only when ``gaps``.
+    out (N,M): the largest distance over co-visible frames, nan where there is none.
+    """
+    T = a.shape[1]
+    n, m = i1 - i0, j1 - j0
+    best = np.zeros((n, m), a.dtype)
+    met = np.zeros((n, m), a.dtype)
+    for t in range(T):
+        x, y, z = b[0, t, j0:j1], b[1, t, j0:j1], b[2, t, j0:j1]
+        w = wb[t, j0:j1]
+        for i in range(n):
+            px, py, pz = a[0, t, i0 + i], a[1, t, i0 + i], a[2, t, i0 + i]
+            row = best[i]
+            if gaps:
+                if wa[t, i0 + i] == 0:
+                    continue
+                seen = met[i]
+                for j in range(m):
+                    dx, dy, dz = px - x[j], py - y[j], pz - z[j]
+                    row[j] = max(row[j], w[j] * (dx * dx + dy * dy + dz * dz))
+                    seen[j] = max(seen[j], w[j])
+            else:
+                for j in range(m):
+                    dx, dy, dz = px - x[j], py - y[j], pz - z[j]
+                    row[j] = max(row[j], dx * dx + dy * dy + dz * dz)
+    for i in range(n):
+        for j in range(m):
+            out[i0 + i, j0 + j] = np.nan if gaps and met[i, j] == 0 else np.sqrt(best[i, j])
+
+
+@kernel()
+def _trimmed(values, n, share):
+    """Mean of the smallest ``share`` of the first ``n`` values."""
+    ordered = np.sort(values[:n])
+    m = max(1, int(np.ceil(share * n)))
+    return ordered[:m].mean()
+
+
+@kernel()
+def curve_distances(A, B, pairs_a, pairs_b, share):
+    """A (Na,S,3), B (Nb,R,3), nan unseen: trimmed mean distance to the nearest sample, both ways averaged; (P,)."""
+    S, R = A.shape[1], B.shape[1]
+    out = np.full(len(pairs_a), np.nan)
+    to_b, to_a = np.empty(S), np.empty(R)
+    for p in range(len(pairs_a)):
+        i, j = pairs_a[p], pairs_b[p]
+        for r in range(R):
+            to_a[r] = np.inf
+        n = 0
+        for s in range(S):
+            if np.isnan(A[i, s, 0]):
+                continue
+            best = np.inf
+            for r in range(R):
+                if np.isnan(B[j, r, 0]):
+                    continue
+                d = (A[i, s, 0] - B[j, r, 0]) ** 2 + (A[i, s, 1] - B[j, r, 1]) ** 2 + (A[i, s, 2] - B[j, r, 2]) ** 2
+                if d < best:
+                    best = d
+                if d < to_a[r]:
+                    to_a[r] = d
+            if best < np.inf:
+                to_b[n] = np.sqrt(best)
+                n += 1
+        m = 0
+        for r in range(R):
+            if to_a[r] < np.inf:
+                to_a[m] = np.sqrt(to_a[r])
+                m += 1
+        if n and m:
+            out[p] = 0.5 * (_trimmed(to_b, n, share) + _trimmed(to_a, m, share))
+    return out
+
+
+@kernel()
+def synchronous_distances(A, B, pairs_a, pairs_b, at, least):
+    """Mean distance of A[i,t] and B[j,at[t]] (at -1: none) over frames that both see; nan below ``least`` of them."""
+    out = np.full(len(pairs_a), np.nan)
+    for p in range(len(pairs_a)):
+        i, j = pairs_a[p], pairs_b[p]
+        total, n = 0.0, 0
+        for t in range(A.shape[1]):
+            u = at[t]
+            if u < 0 or np.isnan(A[i, t, 0]) or np.isnan(B[j, u, 0]):
+                continue
+            total += np.sqrt(
+                (A[i, t, 0] - B[j, u, 0]) ** 2 + (A[i, t, 1] - B[j, u, 1]) ** 2 + (A[i, t, 2] - B[j, u, 2]) ** 2
+            )
+            n += 1
+        if n >= least:
+            out[p] = total / n
+    return out

@@ -1,0 +1,163 @@
+"""The depth-free offset below the frame: Gauss-Newton on epipolar residuals of continuous tracks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ..clocks.common import nominal_fps, on_clock
+from ..clocks.splines import TrackSplines
+from ..geometry import fundamentals, seen_pixels
+from ..types import Alignment, Matches, Status, TrackSet, in_order
+from ..types.trust import Trust
+from .scan import EpipolarScan, unit_of
+
+MATCHES = 200
+"""Most candidate pairs that are fitted."""
+
+LEAST_SIGMA = 0.03 / 30
+
+
+@dataclass(frozen=True)
+class EpipolarRefine:
+    """Continuous offset that flattens the epipolar residuals of the candidates which the scan's offset supports.
+
+    Candidates are weighed at the start (their share of their track's mixture), then
+    ``R = H [e(x_a(t), x_b(t - δ))]`` is minimised over δ by robust Gauss-Newton, H removing the mean over
+    ±``windows[0]`` seconds: a candidate need not be the same physical point, it must only move like it. b's tracks are
+    splines, never bridged over gaps.
+
+    Args:
+        windows: half windows of detrending, s: the answer's, and those whose answers tell its spread. reach: largest step from the start, s; beyond it the start stays, MOVED.
+    """
+
+    windows: tuple[float, ...] = (20 / 30, 10 / 30, 40 / 30)
+    reach: float = 2 / 30
+    iterations: int = 12
+    scan: EpipolarScan = field(default_factory=EpipolarScan)
+    trust: Trust = field(default_factory=lambda: Trust(evidence=1.0))
+
+    needs_xyz = False
+
+    def __call__(self, a: TrackSet, b: TrackSet, matches: Matches, alignment: Alignment) -> Alignment:
+        if not np.isfinite(alignment.offset) or len(matches) == 0:
+            return alignment
+        fps = min(nominal_fps(a), nominal_fps(b))
+        problem = _Problem.of(self, a, b, matches, alignment.offset, fps)
+        if problem is None:
+            flags = in_order((*alignment.flags, Status.NO_OVERLAP))
+            return replace(alignment, flags=flags)
+        offset, sigma = problem.solve(alignment.offset, self.windows[0], self.iterations, self.reach)
+        others = [problem.solve(offset, w, 4, self.reach)[0] for w in self.windows[1:] if np.isfinite(offset)]
+        spread = max((abs(o - offset) for o in others if np.isfinite(o)), default=0.0)
+        sigma = float(np.hypot(sigma, spread))
+        raised = list(alignment.flags)
+        if not np.isfinite(offset) or abs(offset - alignment.offset) > self.reach:
+            offset, sigma = alignment.offset, 0.5 / fps
+            raised.append(Status.MOVED)
+        stats = alignment.stats | {
+            "moved": abs(offset - alignment.offset),
+            "spread": spread,
+            "fitted_matches": float(len(problem.weight)),
+        }
+        ordered = in_order(raised)
+        return replace(
+            alignment,
+            offset=float(offset),
+            sigma=float(np.hypot(sigma, LEAST_SIGMA)),
+            flags=ordered,
+            stats=stats,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """Supported candidates over a's even clock."""
+
+    xa: Float[np.ndarray, "M T 2"]
+    splines: TrackSplines
+    times: Float[np.ndarray, " T"]
+    F: Float[np.ndarray, "Fa Fb 3 3"]
+    b_start: float
+    fps: float
+    weight: Float[np.ndarray, " M"]
+
+    @classmethod
+    def of(
+        cls, refine: EpipolarRefine, a: TrackSet, b: TrackSet, matches: Matches, offset: float, fps: float
+    ) -> _Problem | None:
+        assert a.camera is not None and b.camera is not None
+        xa, xb = on_clock(a, fps), on_clock(b, fps)
+        F = fundamentals(a.camera, b.camera)
+        lag = round((offset - float(a.times[0] - b.times[0])) * fps)
+        share = refine.scan.support(xa, xb, F, matches.pairs, lag, fps, unit_of(a, b))
+        best = np.argsort(-share, kind="stable")[:MATCHES]
+        best = best[share[best] > 0.05]
+        if len(best) < 3:
+            return None
+        i, j = matches.pairs[best].T
+        used, where = np.unique(j, return_inverse=True)
+        uv = seen_pixels(b)[used]
+        flat = np.concatenate([uv, np.where(np.isfinite(uv[..., :1]), 0.0, np.nan)], 2)
+        splines = TrackSplines(b.times, flat).take(where)
+        times = a.times[0] + np.arange(xa.shape[1]) / fps
+        return cls(xa[i], splines, times, F, float(b.times[0]), fps, share[best])
+
+    def residual(self, offset: float) -> Float[np.ndarray, "M T"]:
+        """Sampson distances in pixels, nan where either is unseen."""
+        t = self.times - offset
+        xb = self.splines.sample(t)[..., :2]
+        frames_a = np.arange(len(self.times)) if self.F.shape[0] > 1 else np.zeros(len(t), int)
+        index = np.clip(np.round((t - self.b_start) * self.fps).astype(int), 0, self.F.shape[1] - 1)
+        F = self.F[np.minimum(frames_a, self.F.shape[0] - 1), index]
+        one = np.ones((*xb.shape[:2], 1))
+        ha, hb = np.concatenate([self.xa, one], 2), np.concatenate([xb, one], 2)
+        la, lb = np.einsum("tij,mtj->mti", F, ha), np.einsum("tij,mti->mtj", F, hb)
+        norm = np.sqrt(la[..., 0] ** 2 + la[..., 1] ** 2 + lb[..., 0] ** 2 + lb[..., 1] ** 2)
+        return (hb * la).sum(2) / np.maximum(norm, 1e-300)
+
+    def solve(self, offset: float, window: float, iterations: int, reach: float) -> tuple[float, float]:
+        """Offset and one sigma (clustered by match and by second), s; nan when nothing overlaps."""
+        start, step, half = offset, 0.5 / self.fps, max(3, round(window * self.fps))
+        sigma = float("nan")
+        for _ in range(iterations):
+            e = self.residual(offset)
+            J = (self.residual(offset + step) - self.residual(offset - step)) / (2 * step)
+            known = np.isfinite(e) & np.isfinite(J)
+            R, J = detrended(e, known, half), detrended(J, known, half)
+            enough = known.sum(1) >= 12
+            known &= enough[:, None]
+            if not known.any():
+                return float("nan"), float("nan")
+            scale = 1.4826 * float(np.median(np.abs(R[known]))) + 1e-9
+            rms = np.sqrt((R**2 * known).sum(1) / np.maximum(known.sum(1), 1))
+            level = 1.5 * float(np.median(rms[enough])) + 1e-9
+            w = known / (1 + (R / (2 * scale)) ** 2) * (self.weight / (1 + (rms / level) ** 2) ** 2)[:, None]
+            curvature = float((w * J * J).sum())
+            if curvature <= 0:
+                return float("nan"), float("nan")
+            pull = w * J * R
+            move = -float(pull.sum()) / curvature
+            by_match = pull.sum(1)
+            blocks = np.add.reduceat(pull.sum(0), np.arange(0, pull.shape[1], max(1, round(self.fps))))
+            sigma = float(np.sqrt((by_match**2).sum() + (blocks**2).sum()) / curvature)
+            offset += float(np.clip(move, -step, step))
+            if abs(move) < 1e-4 / self.fps or abs(offset - start) > reach:
+                break
+        return offset, sigma
+
+
+def detrended(x: Float[np.ndarray, "M T"], known: Bool[np.ndarray, "M T"], half: int) -> Float[np.ndarray, "M T"]:
+    """``x`` minus its masked moving mean over ±``half`` frames; 0 where not known."""
+    filled = np.where(known, x, 0.0)
+    T = x.shape[1]
+    low, high = np.maximum(np.arange(T) - half, 0), np.minimum(np.arange(T) + half + 1, T)
+
+    def windowed(values: np.ndarray) -> np.ndarray:
+        total = np.concatenate([np.zeros((len(values), 1)), np.cumsum(values, 1)], 1)
+        return total[:, high] - total[:, low]
+
+    mean = windowed(filled) / np.maximum(windowed(known.astype(float)), 1)
+    return np.where(known, x - mean, 0.0)

@@ -1,0 +1,116 @@
+"""Matching once more when the clocks are known: position and motion at the same moments join the features."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..clocks.splines import TrackSplines
+from ..costs.linear import Cosine, Cost, binary_scale, total_cost
+from ..types import Matches, Status, TrackSet
+
+MOMENTS = 48
+"""Synchronous moments that distances are averaged over."""
+
+LEAST_MOMENTS = 6
+
+FEATURE, PLACE, MOTION = 0.25, 1 / 3, 1 / 9
+"""What counts as one unit: of feature distance; of distance and of distance in motion, as shares of the scene's extent.
+
+(.15 m and .05 m for a person, whose rms extent is about .45 m.)
+"""
+
+FARTHEST = 3.0
+"""Units at which the distance of place is cut off."""
+
+
+@dataclass(frozen=True)
+class SynchronousMatching:
+    """Mutual nearest neighbours in features, place and motion at synchronised times: a matcher for one pair of videos.
+
+    The cost of two tracks is the sum of their feature distance, the mean (each moment cut off at three units) of their
+    distance at the same moments, and the rms of that distance after removing its mean, each in units of its own scale.
+    Place counts only when both sets declare one world frame. Pairs hardly ever seen together are not matched.
+
+    Args:
+        offset, rate: t_a = rate * t_b + offset, from :func:`otsync.align`.
+        costs: the linear terms of features, as of any matcher.
+        limit: of larger sets only so many tracks take part, those seen longest: the cost is a dense matrix.
+    """
+
+    offset: float
+    rate: float = 1.0
+    costs: tuple[Cost, ...] = (Cosine(),)
+    limit: int = 2000
+
+    def __call__(self, a: TrackSet, b: TrackSet) -> Matches:
+        own_a, own_b = longest_seen(a, self.limit), longest_seen(b, self.limit)
+        cost = self.cost(a.take(own_a), b.take(own_b))
+        if not np.isfinite(cost).any():
+            return Matches(np.zeros((0, 2), int), flags=(Status.NO_OVERLAP,))
+        best_b, best_a = cost.argmin(1), cost.argmin(0)
+        i = np.flatnonzero((best_a[best_b] == np.arange(len(own_a))) & np.isfinite(cost.min(1)))
+        value = cost[i, best_b[i]]
+        order = np.argsort(value, kind="stable")
+        flags = () if len(i) else (Status.NO_MATCH,)
+        return Matches(
+            np.stack([own_a[i], own_b[best_b[i]]], 1)[order],
+            -value[order],
+            flags=flags,
+            stats={"objective": float(value.sum()), "mass": len(i) / max(min(len(a), len(b)), 1)},
+        )
+
+    def cost(self, a: TrackSet, b: TrackSet) -> Float[np.ndarray, "Na Nb"]:
+        """In units; infinite where two tracks are not seen together at enough moments."""
+        place, motion = self.distances(a, b)
+        features = total_cost(self.costs, a, b) / FEATURE if a.features is not None and b.features is not None else 0.0
+        both = a.frame is not None and a.frame == b.frame
+        cost = features + motion / MOTION + (place / PLACE if both else 0.0)
+        return np.where(np.isfinite(motion), cost, np.inf)
+
+    def distances(self, a: TrackSet, b: TrackSet) -> tuple[Float[np.ndarray, "Na Nb"], Float[np.ndarray, "Na Nb"]]:
+        """Truncated mean distance and rms demeaned distance at common moments, in extents of the scene; nan: unseen."""
+        from ..compute.threads import for_each, ranges
+        from .kernels import synchronous_distances
+
+        first = max(a.times[0], self.rate * b.times[0] + self.offset)
+        last = min(a.times[-1], self.rate * b.times[-1] + self.offset)
+        shape = len(a), len(b)
+        place, motion = np.full(shape, np.nan), np.full(shape, np.nan)
+        if last <= first:
+            return place, motion
+        t = np.linspace(first, last, MOMENTS)
+        xa, xb = a.positions(), b.positions()
+        scale = max(binary_scale(xa), binary_scale(xb))
+        at_a = TrackSplines(a.times, xa / scale).sample(t)
+        at_b = TrackSplines(b.times, xb / scale).sample((t - self.offset) / self.rate)
+        extent = 0.5 * (rms_extent(at_a) + rms_extent(at_b))
+        if not extent > 0:
+            return place, motion
+        wa, wb = np.isfinite(at_a[..., 0]), np.isfinite(at_b[..., 0])
+        fa = np.where(wa[..., None], at_a, 0.0) / extent
+        fb = np.where(wb[..., None], at_b, 0.0) / extent
+
+        def work(*rows: int) -> None:
+            synchronous_distances(fa, wa, fb, wb, FARTHEST * PLACE, LEAST_MOMENTS, *rows, place, motion)
+
+        for_each(work, ranges(len(a), 64))
+        return place, motion
+
+
+def longest_seen(tracks: TrackSet, limit: int) -> Int[np.ndarray, " n"]:
+    """At most ``limit`` tracks, those with the most observed samples, in their order."""
+    return np.sort(np.argsort(-tracks.seen.sum(1), kind="stable")[:limit])
+
+
+def rms_extent(x: Float[np.ndarray, "N S 3"]) -> float:
+    """Rms distance of the tracks' mean positions from their centre; 0 when nothing is seen."""
+    seen = np.isfinite(x[..., 0])
+    there = seen.any(1)
+    if not there.any():
+        return 0.0
+    filled = np.where(seen[..., None], x, 0.0)[there]
+    mean = filled.sum(1) / seen[there].sum(1)[:, None]
+    return float(np.sqrt(((mean - np.median(mean, 0)) ** 2).sum(1).mean()))

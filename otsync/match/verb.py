@@ -1,0 +1,80 @@
+"""``match(a, b, matcher)``: correspondences between the tracks of two videos (paper, Sec. 3.3), and the slot of matchers."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Protocol
+
+from ..clocks.shutter import at_frame_times
+from ..types import Matches, Refused, TrackSet
+from ..types.checks import positive
+from .dense import FusedGromovWasserstein, NearestNeighbor, OptimalTransport, PartialFGW, log
+from .frontier import ANCHORED_FROM, fitting
+from .vouch import vouch
+
+
+class Matcher(Protocol):
+    """The ``matcher`` slot."""
+
+    def __call__(self, a: TrackSet, b: TrackSet) -> Matches: ...
+
+
+def match(
+    a: TrackSet, b: TrackSet, matcher: Matcher | None = None, *, budget: float | None = None, throw: bool = True
+) -> Matches:
+    """Correspondences between the tracks of two videos.
+
+    Args:
+        a, b: track sets; they need no common frame, clock or size.
+        matcher: the algorithm; default: :func:`matcher_for` their sizes.
+        budget: seconds; takes the most accurate matcher that is predicted to fit, and tells the log which.
+        throw: raise :class:`otsync.Refused` when the answer is flagged, instead of returning it.
+
+    Example:
+        >>> from otsync import match, FusedGromovWasserstein
+        >>> matches = match(a, b, FusedGromovWasserstein(alpha=0.222))  # doctest: +SKIP
+        >>> best = matches.best(100)                                    # doctest: +SKIP
+    """
+    a.check("a", xyz=False)
+    b.check("b", xyz=False)
+    a, b = at_frame_times(a), at_frame_times(b)
+    if matcher is not None and budget is not None:
+        raise ValueError("matcher, budget: expected one of them; found both. A budget chooses the matcher.")
+    matcher = matcher or matcher_for(len(a), len(b), budget)
+    if budget is not None:
+        log.info("match: %s fits %g s for %d x %d tracks", matcher, budget, len(a), len(b))
+    started = time.perf_counter()
+    found = matcher(a, b)
+    found.check("matcher", len(a), len(b))
+    found = vouch(found, a, b, getattr(matcher, "costs", ()))
+    seconds = found.stats.get("seconds", time.perf_counter() - started)
+    found = replace(found, stats=found.stats | {"seconds": seconds})
+    if throw and not found.status.ok:
+        raise Refused("match", found)
+    return found
+
+
+def matcher_for(n_a: int, n_b: int, budget: float | None = None) -> Matcher:
+    """The matcher for so many tracks: the most accurate one, or the most accurate that fits ``budget`` seconds.
+
+    Without a budget the paper's :class:`FusedGromovWasserstein` up to 200 tracks and :class:`AnchoredFGW` above, where
+    it is both faster and more precise than any dense solver. Seconds are those of one thread of the machine that the
+    benchmark was measured on (:mod:`otsync.frontier`).
+    """
+    from .anchored import AnchoredFGW
+
+    known: dict[str, Callable[[], Matcher]] = {
+        "NearestNeighbor": NearestNeighbor,
+        "OptimalTransport": OptimalTransport,
+        "FusedGromovWasserstein": FusedGromovWasserstein,
+        "PartialFGW": PartialFGW,
+        "AnchoredFGW, small": lambda: AnchoredFGW(anchors=100, cells=500, restarts=1),
+        "AnchoredFGW": AnchoredFGW,
+    }
+    n = max(n_a, n_b)
+    if budget is None:
+        return AnchoredFGW() if min(n_a, n_b) >= ANCHORED_FROM else FusedGromovWasserstein()
+    positive("budget", budget)
+    return known[fitting(n, budget)]()

@@ -1,0 +1,150 @@
+"""What others add: algorithms, readers, exporters, losses, effects, commands, from installed packages or from a file.
+
+Three ways to add a thing to a group of :data:`GROUPS`:
+
+* one of otsync's own: one file, and one line in its folder's ``__init__``;
+* an installed package: an entry point in the group ``otsync.matchers`` (or another of :data:`GROUPS`);
+* a single file: ``@register("matchers")`` over the class, and ``otsync --plugin my_matcher.py ...`` or
+  ``OTSYNC_PLUGINS=my_matcher.py`` (several: separated as in PATH) in the environment.
+
+The help of the commands, the benchmarks and the catalogue of hard cases then list it beside our own.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import re
+import sys
+from collections.abc import Callable, Iterable
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Any, TypeVar
+
+T = TypeVar("T")
+
+GROUPS: dict[str, str] = {
+    "matchers": "callables (a, b) -> Matches",
+    "aligners": "callables (a, b, matches) -> Alignment",
+    "refiners": "callables (a, b, matches, alignment) -> Alignment",
+    "maskers": "what moves in a video: callables (WorkingFrames) -> masks",
+    "trackers": "point tracks of a video",
+    "describers": "features of point tracks",
+    "readers": "layouts of recordings: objects with claims(folder) and describe(folder)",
+    "exporters": "formats of a reconstruction: objects with write(scene, out, ...)",
+    "losses": "what a fit of the 4D scene minimises",
+    "effects": "what a camera does to the light",
+    "commands": "commands of the shell: dataclasses with run() -> exit code",
+    "benchmarks": "modules with run(out, gate=..., rebase=...)",
+}
+
+ENVIRONMENT = "OTSYNC_PLUGINS"
+
+_registered: dict[str, dict[str, Any]] = {group: {} for group in GROUPS}
+_files: dict[Path, None] = {}
+
+
+def register(group: str, name: str | None = None) -> Callable[[T], T]:
+    """Decorator: add a class, function or object to a group, for this process.
+
+    Args:
+        group: one of :data:`GROUPS`.
+        name: as the shell spells it; default: the class's name, ``MyMatcher`` becoming ``my-matcher``.
+
+    Example:
+        >>> from otsync.plugins import register
+        >>> @register("matchers")                     # doctest: +SKIP
+        ... class Mine: ...
+    """
+    _check(group)
+
+    def add(thing: T) -> T:
+        _registered[group][name or short_name(thing)] = thing
+        return thing
+
+    return add
+
+
+def load_files(paths: Iterable[str | os.PathLike[str]]) -> None:
+    """Import files that register things. ValueError names a file that is not there or does not import.
+
+    The file's folder joins ``sys.path``, so that worker processes find the file too.
+    """
+    for path in map(Path, paths):
+        path = path.resolve()
+        if path in _files:
+            continue
+        if path.suffix != ".py" or not path.is_file():
+            raise ValueError(f"{path}: expected a Python file that registers something; found none.")
+        if path.stem in sys.modules:
+            raise ValueError(f"{path}: a module named {path.stem!r} is loaded already. Rename the file.")
+        sys.path.append(str(path.parent))
+        try:
+            importlib.import_module(path.stem)
+        except Exception as error:
+            sys.path.remove(str(path.parent))
+            sys.modules.pop(path.stem, None)
+            raise ValueError(f"{path}: does not import: {type(error).__name__}: {error}") from error
+        _files[path] = None
+
+
+def load_environment() -> None:
+    """Import the files that ``OTSYNC_PLUGINS`` names."""
+    load_files(filter(None, os.environ.get(ENVIRONMENT, "").split(os.pathsep)))
+
+
+def forget(*things: Any) -> None:
+    """Take registered things out again: for tests and notebooks."""
+    for group in _registered.values():
+        for name in [n for n, thing in group.items() if thing in things]:
+            del group[name]
+
+
+def available(group: str, own: Iterable[Any] = ()) -> dict[str, Any]:
+    """Everything in a group by its short name: ``own`` first, then installed packages', then registered ones.
+
+    ValueError names two things of one name, and an entry point that does not import.
+    """
+    _check(group)
+    found = {short_name(thing): thing for thing in own}
+    others = [(point.name, _load(point)) for point in entries(group).values()]
+    for name, thing in [*others, *registered(group).items()]:
+        if name in found and found[name] is not thing:
+            raise ValueError(f"{group}: two things are named {name!r}: {found[name]!r} and {thing!r}. Rename one.")
+        found[name] = thing
+    return found
+
+
+def registered(group: str) -> dict[str, Any]:
+    """What this process registered in a group, by short name; files of the environment included."""
+    _check(group)
+    load_environment()
+    return dict(_registered[group])
+
+
+def entries(group: str) -> dict[str, EntryPoint]:
+    """Entry points of installed packages in a group, not loaded."""
+    return {point.name: point for point in sorted(entry_points(group=f"otsync.{group}"), key=lambda p: p.name)}
+
+
+def short_name(thing: Any) -> str:
+    """How the shell spells a thing: its ``name`` where it has one, else its class's or function's, with hyphens."""
+    given = getattr(thing, "name", None)
+    if isinstance(given, str) and given:
+        return given
+    name = getattr(thing, "__name__", None) or type(thing).__name__
+    name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "-", name)
+    return name.replace("_", "-").lower()
+
+
+def _load(point: EntryPoint) -> Any:
+    try:
+        return point.load()
+    except Exception as error:
+        where = f"{point.name} = {point.value} of {point.dist.name if point.dist else 'an installed package'}"
+        raise ValueError(f"entry point {where}: does not import: {type(error).__name__}: {error}") from error
+
+
+def _check(group: str) -> None:
+    if group not in _registered:
+        raise ValueError(f"group: expected one of {', '.join(GROUPS)}; found {group!r}.")

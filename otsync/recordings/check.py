@@ -1,0 +1,286 @@
+"""``otsync check``: what commonly goes wrong in a recording, found before hours are spent on it, each with its remedy."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from ..clocks.shutter import LONGEST
+from ..geometry import common_target
+from ..io.frames import VideoFrames
+from ..io.scene import Paths, Scene, camera_from, read_document, scene_from_document, video_frames
+from ..types import Camera, Video
+
+MIRRORED = np.diag([1.0, -1.0, -1.0, 1.0])
+"""From OpenGL's axes (x right, y up, z back) to OpenCV's."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One observation: ``severity`` error or warning, the video it is about ("" for the scene), and what to do."""
+
+    severity: Literal["error", "warning"]
+    video: str
+    what: str
+    remedy: str
+
+
+def check_scene(
+    path: str | os.PathLike[str], *, every_frame: bool = True, allow_outside: bool = False
+) -> list[Finding]:
+    """Findings about the scene behind ``path``, errors first.
+
+    Args:
+        every_frame: decode every image; else the first, the middle and the last of each video.
+    """
+    try:
+        document, root = read_document(path)
+        entries = document.get("videos")
+        if not isinstance(entries, list) or not all(isinstance(e, dict) for e in entries) or not entries:
+            raise ValueError(f"{path}: expected a list of videos.")
+    except (ValueError, OSError) as error:
+        return [Finding("error", "", str(error), "Mend the file, or write it anew with otsync init.")]
+    found: list[Finding] = []
+    for item in document.get("missing") or ():
+        found.append(Finding("error", "", f"still missing: {item}.", "Fill it in, then delete 'missing'."))
+    if len(entries) < 2:
+        found.append(Finding("error", "", "one video only.", "Add at least a second one."))
+    for n, entry in enumerate(entries):
+        name = str(entry.get("name", f"video{n}"))
+        pose = list(_pose(entry, name))
+        found += pose
+        if pose:
+            continue
+        try:
+            one = scene_from_document({**document, "videos": [entry], "missing": []}, root, allow_outside=allow_outside)
+        except (ValueError, OSError) as error:
+            found.append(Finding("error", name, str(error), ""))
+            continue
+        found += _intrinsics(one.videos[0])
+        found += _files(one, every_frame)
+        found += _clock(entry, one.videos[0], Paths(root, allow_outside))
+    cameras = _cameras(entries)
+    found += _common_volume(cameras)
+    found += _depth_units(document, root, cameras, allow_outside)
+    return sorted(found, key=lambda f: f.severity)
+
+
+def _pose(entry: dict[str, Any], name: str) -> Iterable[Finding]:
+    """det(R) and orthonormality, before the strict constructor refuses them with fewer words."""
+    camera = entry.get("camera")
+    try:
+        w2c: np.ndarray = np.asarray((camera or {})["w2c"], np.float64)
+        if w2c.shape[-2:] != (4, 4) or w2c.ndim not in (2, 3) or not np.isfinite(w2c).all():
+            raise ValueError(f"expected finite 4x4 matrices; found shape {w2c.shape}")
+    except (TypeError, KeyError, ValueError) as error:
+        yield Finding("error", name, f"camera.w2c is missing or unsound ({error}).", "Add world-to-camera matrices.")
+        return
+    R = w2c[..., :3, :3]
+    scale = np.cbrt(np.abs(np.linalg.det(R)))
+    if (np.linalg.det(R) < 0).any():
+        yield Finding(
+            "error",
+            name,
+            "camera.w2c has det(R) = -1: a mirrored frame.",
+            "It is perhaps camera-to-world with OpenGL axes, or with one axis flipped: negate columns 1 and 2 of c2w "
+            "(OpenGL), or undo the flip, then invert to get w2c.",
+        )
+    elif not np.allclose(R @ np.swapaxes(R, -1, -2), np.eye(3), atol=1e-3):
+        yield Finding(
+            "error",
+            name,
+            f"camera.w2c holds no rotation (its scale is about {float(np.median(scale)):.4g}).",
+            "Take scale and shear out of the upper 3x3.",
+        )
+    if not np.allclose(w2c[..., 3, :], [0, 0, 0, 1], atol=1e-6):
+        yield Finding(
+            "error",
+            name,
+            "the last row of camera.w2c is not 0 0 0 1.",
+            "Perhaps the matrix is transposed: transpose it.",
+        )
+
+
+def _intrinsics(video: Video) -> Iterable[Finding]:
+    K, w, h = video.camera.K, video.camera.width, video.camera.height
+    if not (0.25 * w < K[0, 2] < 0.75 * w and 0.25 * h < K[1, 2] < 0.75 * h):
+        yield Finding(
+            "error",
+            video.name,
+            f"the principal point ({K[0, 2]:.0f}, {K[1, 2]:.0f}) is far from the middle of {w} x {h} pixels.",
+            "K probably belongs to another resolution: scale its first two rows by the ratio of the widths.",
+        )
+    if not 0.2 * w < K[0, 0] < 20 * w:
+        yield Finding(
+            "warning",
+            video.name,
+            f"a focal length of {K[0, 0]:.4g} pixels is odd for a width of {w}.",
+            "Check the unit (pixels, not millimetres) and the resolution of K.",
+        )
+    if not 0.8 < K[0, 0] / K[1, 1] < 1.25:
+        yield Finding(
+            "warning", video.name, f"focal lengths {K[0, 0]:.4g} and {K[1, 1]:.4g} differ a lot.", "Check K's rows."
+        )
+
+
+def _files(scene: Scene, every_frame: bool) -> Iterable[Finding]:
+    """Frames, masks, labels and depth that do not decode, and sizes that disagree with the camera."""
+    video = scene.videos[0]
+    n = len(video.frames)
+    if n < 48:
+        yield Finding("warning", video.name, f"{n} frames are few.", "Use clips of two seconds and more.")
+    picks = range(n) if every_frame else sorted({0, n // 2, n - 1})
+    labels = scene.labels[0] if scene.labels else None
+    kinds = (("frame", video.frames), ("mask", scene.masks[0]), ("depth map", video.depth), ("label image", labels))
+    for what, sequence in kinds:
+        if sequence is None:
+            continue
+        bad, size = [], None
+        for k in picks:
+            try:
+                size = sequence[k].shape[:2]
+                if what == "frame" and size != (video.camera.height, video.camera.width):
+                    raise ValueError(
+                        f"{what} {k} has {size[1]} x {size[0]} pixels where the camera says {video.camera.width} x "
+                        f"{video.camera.height}; correct width and height (and K)"
+                    )
+            except (ValueError, OSError) as error:
+                bad.append(str(error))
+        if bad:
+            yield Finding(
+                "error",
+                video.name,
+                f"{len(bad)} of {len(picks)} {what}s cannot be used; the first: {bad[0]}",
+                "Copy those files again, or leave the frames out with 'range'.",
+            )
+
+
+def _clock(entry: dict[str, Any], video: Video, paths: Paths) -> Iterable[Finding]:
+    """Declared fps against timestamps, and against the container's; a readout longer than a frame."""
+    if entry.get("timestamps") is not None and entry.get("fps") is not None and len(video.frames) > 1:
+        told, seen = float(entry["fps"]), 1.0 / float(np.median(np.diff(video.times)))
+        if abs(told / seen - 1) > 0.005:
+            yield Finding(
+                "error",
+                video.name,
+                f"fps says {told:.4g}, timestamps say {seen:.4g}.",
+                "Timestamps win: delete fps, or correct the timestamps' unit (seconds).",
+            )
+    if "file" in entry and entry.get("fps") is not None:
+        frames, _, _ = video_frames(entry, paths)
+        if isinstance(frames, VideoFrames) and len(frames) > 1:
+            seen = 1.0 / float(np.median(np.diff(frames.timestamps)))
+            if abs(float(entry["fps"]) / seen - 1) > 0.005:
+                yield Finding(
+                    "warning",
+                    video.name,
+                    f"fps says {entry['fps']}, the container says {seen:.5g}.",
+                    "Delete fps to use the container's timestamps, unless you know that it lies (slow motion).",
+                )
+    steps = np.diff(video.times)
+    readout = video.camera.readout
+    if readout is not None and len(steps) and readout > LONGEST * np.median(steps):
+        yield Finding(
+            "error",
+            video.name,
+            f"camera.readout is {readout:g} s; a frame lasts {float(np.median(steps)):.4g} s.",
+            "Give the seconds from the first to the last row (phones: 0.005 to 0.03), or leave it out.",
+        )
+    if len(steps) and steps.max() > 1.9 * np.median(steps):
+        yield Finding(
+            "warning",
+            video.name,
+            f"{int((steps > 1.9 * np.median(steps)).sum())} gaps in the timestamps.",
+            "Frames were dropped; nothing to do unless they are many.",
+        )
+
+
+def _cameras(entries: Sequence[dict[str, Any]]) -> dict[str, Camera]:
+    out = {}
+    for n, entry in enumerate(entries):
+        try:
+            out[str(entry.get("name", f"video{n}"))] = camera_from(entry.get("camera"))
+        except (ValueError, TypeError, KeyError, OverflowError):
+            continue  # told by the video's own checks
+    return out
+
+
+def _common_volume(cameras: dict[str, Camera]) -> Iterable[Finding]:
+    """Whether the cameras look at one place; and if not, which reading of their poses would make them."""
+    if len(cameras) < 2:
+        return
+    astray = _looking_away(list(cameras.values()))
+    if not astray.any():
+        return
+    names = [n for n, a in zip(cameras, astray, strict=True) if a]
+    readings = {
+        "They look like camera-to-world matrices: invert them.": lambda m: np.linalg.inv(m),
+        "They look like world-to-camera with OpenGL axes: negate rows 1 and 2.": lambda m: MIRRORED @ m,
+        "They look like camera-to-world with OpenGL axes: negate columns 1 and 2, then invert.": lambda m: (
+            np.linalg.inv(m @ MIRRORED)
+        ),
+    }
+    for remedy, read in readings.items():
+        again = [Camera(c.K, read(c.w2c), c.width, c.height) for c in cameras.values()]
+        if not _looking_away(again).any():
+            yield Finding("error", "", "the cameras do not look at a common volume.", remedy)
+            return
+    few = len(names) <= len(cameras) / 3
+    yield Finding(
+        "warning" if few else "error",
+        ", ".join(names) if few else "",
+        "does not see the place that the others look at." if few else "the cameras do not look at a common volume.",
+        "Check the poses: w2c maps world to camera, OpenCV axes (x right, y down, z forward), one world for all.",
+    )
+
+
+def _looking_away(cameras: list[Camera]) -> np.ndarray:
+    """Which cameras have the point nearest to all optical axes behind them or far outside their image."""
+    target = common_target(cameras)
+    away = []
+    for camera in cameras:
+        w2c = np.atleast_3d(camera.w2c.T).T[0] if camera.w2c.ndim == 3 else camera.w2c
+        local = w2c[:3, :3] @ target + w2c[:3, 3]
+        u = camera.K @ local
+        z = local[2]
+        inside = z > 1e-6 and -0.5 < u[0] / z / camera.width < 1.5 and -0.5 < u[1] / z / camera.height < 1.5
+        away.append(not inside)
+    return np.array(away)
+
+
+def _depth_units(
+    document: dict[str, Any], root: Path, cameras: dict[str, Camera], allow_outside: bool
+) -> Iterable[Finding]:
+    """Depth in other units than the poses: its median against the distance to where the cameras look."""
+    if len(cameras) < 2:
+        return
+    target = common_target(list(cameras.values()))
+    for n, entry in enumerate(document["videos"]):
+        name = str(entry.get("name", f"video{n}"))
+        if entry.get("depth") is None or name not in cameras:
+            continue
+        try:
+            one = scene_from_document({**document, "videos": [entry], "missing": []}, root, allow_outside=allow_outside)
+            video = one.videos[0]
+            assert video.depth is not None
+            depth = np.asarray(video.depth[len(video.depth) // 2])
+        except (ValueError, OSError):
+            continue  # told by the files' own check
+        if not (depth > 0).any():
+            yield Finding("warning", name, "the middle depth map is empty.", "0 means unknown: check the files.")
+            continue
+        expected = float(np.linalg.norm(np.atleast_2d(cameras[name].center)[0] - target))
+        ratio = float(np.median(depth[depth > 0])) / max(expected, 1e-12)
+        if not 0.2 < ratio < 5:
+            power = 10.0 ** -round(float(np.log10(ratio)))
+            yield Finding(
+                "error",
+                name,
+                f"depth is {ratio:.3g} times the distance to where the cameras look.",
+                f"It is probably in another unit than the poses: try depth.scale times {power:g}.",
+            )

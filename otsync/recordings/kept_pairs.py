@@ -1,0 +1,105 @@
+"""Pairs of videos kept on disk: a map-like callable for ``synchronize`` that remembers every pair's answer."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ..compute.threads import MapLike
+from ..files.cache import Cache
+from ..sync.pairs import Job
+from ..sync.verdict import Answer
+from ..types import Alignment, Matches, Status, TrackSet
+
+log = logging.getLogger("otsync")
+
+
+@dataclass(frozen=True)
+class KeptPairs:
+    """``map`` for :func:`otsync.synchronize` that looks in ``cache`` before it computes a pair.
+
+    The key is the content of both track sets and the algorithms with their parameters. Other work passes through.
+    """
+
+    cache: Cache
+    map: MapLike = map
+
+    def __call__(self, function: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
+        def kept(item: Any) -> Any:
+            if self.cache.root is None or not isinstance(item, Job) or item.matches is not None:
+                return function(item)
+            key = (_without_name(item.a), _without_name(item.b), item.matcher, item.aligner, item.refiner)
+            try:
+                self.cache.path("pair", key)
+            except ValueError as error:  # an algorithm whose content cannot be read would be mistaken for another
+                log.info("pair %s is not kept: %s", item.pair, error)
+                return function(item)
+            arrays = self.cache.arrays("pair", key, lambda: pack(function(item)))
+            try:
+                return unpack(item.pair, arrays)
+            except (KeyError, ValueError, TypeError) as error:
+                log.warning("pair %s: what was kept does not read (%s); computing it again", item.pair, error)
+                return function(item)
+
+        return list(self.map(kept, items))
+
+
+def _without_name(tracks: TrackSet) -> TrackSet:
+    """The same tracks without the name, on which no answer depends."""
+    return replace(tracks, name="")
+
+
+def pack(answer: Answer) -> dict[str, np.ndarray]:
+    """An answer as plain arrays; plans are not kept."""
+    matches = answer.matches
+    told = {
+        "matches": _words(matches),
+        "scanned": _words(answer.scanned) | _numbers(answer.scanned),
+        "refined": _words(answer.refined) | _numbers(answer.refined),
+    }
+    out = {"told": np.array(json.dumps(told)), "pairs": matches.pairs, "score": np.asarray(matches.score, float)}
+    for name, found in (("scanned", answer.scanned), ("refined", answer.refined)):
+        out[f"{name}_hypotheses"] = np.asarray(found.hypotheses, float)
+        if found.curve is not None:
+            out[f"{name}_curve"] = np.asarray(found.curve, float)
+    return out
+
+
+def unpack(pair: tuple[int, int], arrays: dict[str, np.ndarray]) -> Answer:
+    """What :func:`pack` kept."""
+    told = json.loads(str(arrays["told"]))
+
+    def words(of: dict[str, Any]) -> dict[str, Any]:
+        return {
+            "flags": tuple(Status.from_code(f) for f in of["flags"]),
+            "stats": dict(of["stats"]),
+        }
+
+    def alignment(name: str) -> Alignment:
+        of = told[name]
+        return Alignment(
+            of["offset"],
+            of["rate"],
+            of["sigma"],
+            arrays[f"{name}_hypotheses"],
+            arrays.get(f"{name}_curve"),
+            fps=of["fps"],
+            **words(of),
+        )
+
+    matches = Matches(arrays["pairs"], arrays["score"], **words(told["matches"]))
+    return Answer(pair, matches, alignment("scanned"), alignment("refined"))
+
+
+def _words(found: Matches | Alignment) -> dict[str, Any]:
+    stats = {k: float(v) for k, v in found.stats.items()}
+    return {"flags": [f.code for f in found.flags], "stats": stats}
+
+
+def _numbers(found: Alignment) -> dict[str, float]:
+    return {k: float(getattr(found, k)) for k in ("offset", "rate", "sigma", "fps")}

@@ -1,0 +1,39 @@
+"""Compiled loop that keeps chosen tracks apart."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..compute.jit import kernel
+
+
+@kernel()
+def keep_apart(uv, apart, count):
+    """Greedy choice in the given order: skip a track that stays within ``apart`` of a kept one over >= 5 frames.
+
+    uv (N,T,2), nan unseen. Returns the kept indices.
+    """
+    N, T = uv.shape[0], uv.shape[1]
+    kept = np.empty(min(count, N), np.int64)
+    n = 0
+    for i in range(N):
+        alone = True
+        for q in range(n):
+            j = kept[q]
+            met, furthest, total = 0, 0.0, 0.0
+            for t in range(T):
+                if np.isnan(uv[i, t, 0]) or np.isnan(uv[j, t, 0]):
+                    continue
+                d = np.sqrt((uv[i, t, 0] - uv[j, t, 0]) ** 2 + (uv[i, t, 1] - uv[j, t, 1]) ** 2)
+                met += 1
+                total += d
+                furthest = max(furthest, d)
+            if met >= 5 and (furthest < apart or total < 0.8 * apart * met):
+                alone = False
+                break
+        if alone:
+            kept[n] = i
+            n += 1
+            if n == count:
+                break
+    return kept[:n]

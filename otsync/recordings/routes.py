@@ -1,0 +1,368 @@
+"""From a scene of recordings to offsets: which route, in which stages, each kept on disk so that a run continues.
+
+Routes::
+
+    tracks    depth is given          tracks -> lift -> match, scan, refine -> graph
+    epipolar  cameras only            tracks -> epipolar scan -> graph
+    stereo    a static rig            the epipolar route, then hull and stereo at its offsets, then the tracks route
+
+Rolling shutters of declared readout are undone once on every route: pixels where pairs are compared
+(:func:`otsync.synchronize`), positions after lifting (:class:`otsync.lift.Lift`), which needs the images' own pixels. Hull
+and stereo compare rows of several cameras as if they were of one moment: what moves gets a depth that mixes moments up
+to half the sum of both readouts apart.
+
+Measured on basketball, 8 cameras of 120 frames of 640 x 360, two cores: the epipolar route 45 s cold, 3 s warm, 0.42 GB
+at most; the stereo route 25 s more, 0.79 GB. Longer clips take about 30 kB a frame and video for masks, and as much as
+the 4000 longest tracks of a video take (32 kB a frame) while it is tracked.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from ..align.likelihood import LikelihoodScan
+from ..align.verb import Aligner
+from ..clocks.shutter import check_within_a_frame
+from ..compute.threads import MapLike
+from ..costs.linear import Cosine, Labels
+from ..costs.positions import CurveDistance
+from ..epipolar.refine import EpipolarRefine
+from ..epipolar.scan import EpipolarScan
+from ..files.cache import Cache
+from ..files.digest import content_key
+from ..geometry import seen_pixels
+from ..io.scene import Scene
+from ..match.candidates import Candidates
+from ..match.verb import Matcher
+from ..priors.stereo import HullStereo, Rig
+from ..progress import Stopwatch, Tell
+from ..refine.splines import SplineRefine
+from ..refine.verb import Refiner
+from ..sync.graph import Graph
+from ..sync.verb import synchronize
+from ..types import Offsets, Status, TrackSet, Video
+from .kept_pairs import KeptPairs
+from .lift import Lift, depth_at
+from .tracking import Selection, Tracking, pixel_tracks, track_labels
+
+Route = Literal["auto", "tracks", "epipolar", "stereo"]
+
+COLOUR = 3.0
+"""Weight of the colour histograms beside the curve distance: what separates limbs that run close together."""
+
+LABELS = 3.0
+"""Weight of given labels: a track of another thing costs as much as the largest distance in space."""
+
+
+@dataclass(frozen=True)
+class Stages:
+    """The objects in the slots of every stage."""
+
+    tracking: Tracking = field(default_factory=Tracking)
+    selection: Selection = field(default_factory=Selection)
+    stereo: HullStereo = field(default_factory=HullStereo)
+    lift: Lift = field(default_factory=Lift)
+    graph: Graph = field(default_factory=Graph)
+    epipolar_matcher: Matcher = field(default_factory=lambda: Candidates(20, None))
+    epipolar_aligner: Aligner = field(default_factory=EpipolarScan)
+    epipolar_refiner: Refiner = field(default_factory=EpipolarRefine)
+    matcher: Matcher = field(
+        default_factory=lambda: Candidates(2, 200, (Cosine(weight=COLOUR, center=False), CurveDistance()))
+    )
+    aligner: Aligner = field(default_factory=LikelihoodScan)
+    refiner: Refiner = field(default_factory=SplineRefine)
+
+
+@dataclass(frozen=True, eq=False)
+class Synchronized:
+    """What a run came to.
+
+    Args:
+        offsets: the answer. tracks: what it was made from.
+        route, why: which way was taken, and the reasons in words.
+        first: offsets of the epipolar route where the stereo route went on from them.
+        seconds: wall time per stage.
+    """
+
+    offsets: Offsets
+    tracks: tuple[TrackSet, ...]
+    route: str
+    why: tuple[str, ...]
+    first: Offsets | None = None
+    seconds: dict[str, float] = field(default_factory=dict)
+
+
+def synchronize_scene(
+    scene: Scene,
+    *,
+    route: Route = "auto",
+    reference: int = 0,
+    stages: Stages | None = None,
+    cache: Cache | None = None,
+    map: MapLike = map,
+    tell: Tell = lambda text: None,
+) -> Synchronized:
+    """Put the videos of a scene on one clock.
+
+    Args:
+        route: "auto" decides by what is there; naming one overrides it. ValueError says what a named route lacks.
+        cache: where stages are kept; a run that was killed continues from what is there, with the same result.
+        map: any map-like callable; two threads use two cores.
+        tell: receives one line per stage.
+    """
+    for video in scene.videos:
+        check_within_a_frame(video.camera.readout, video.times, f"camera.readout of {video.name!r}")
+    stages, cache = with_labels(stages or Stages(), scene), cache or Cache()
+    chosen, why = choose_route(scene, route, stages)
+    for line in why:
+        tell(line)
+    clock = Stopwatch(tell)
+    raw = track_all(scene, stages, cache, map, tell)
+    clock.lap("tracks")
+    if chosen == "tracks":
+        lifted = lift_given(scene, raw, stages, cache, map)
+        clock.lap("lift")
+        offsets = pairs_in_space(lifted, reference, stages, cache, map)
+        clock.lap("synchronise")
+        return Synchronized(without_times(offsets), tuple(lifted), chosen, why, None, clock.seconds)
+    flat = [select(video, r, stages, scene.frame) for video, r in zip(scene.videos, raw, strict=True)]
+    first = without_times(pairs_in_pixels(flat, reference, stages, cache, map))
+    clock.lap("epipolar")
+    if chosen == "epipolar":
+        return Synchronized(first, tuple(flat), chosen, why, None, clock.seconds)
+    doubt = _too_doubtful(first, stages)
+    if doubt:
+        why = (*why, doubt)
+        tell(doubt)
+        return Synchronized(first, tuple(flat), "epipolar", why, None, clock.seconds)
+    depth = stereo_depth(scene, flat, first, stages, cache, map)
+    lifted = [stages.lift(t, z) for t, z in zip(flat, depth, strict=True)]
+    clock.lap("stereo")
+    bare = [t.name for t in lifted if len(t) == 0]
+    if bare:
+        line = f"stereo found no depth for {', '.join(bare)}: the epipolar answer stands"
+        tell(line)
+        return Synchronized(first, tuple(flat), "epipolar", (*why, line), None, clock.seconds)
+    offsets = without_times(pairs_in_space(lifted, reference, stages, cache, map))
+    clock.lap("synchronise")
+    if _flagged(offsets) > _flagged(first):
+        line = "the lifted tracks leave more doubt than the pixels did: the epipolar answer stands"
+        tell(line)
+        return Synchronized(first, tuple(flat), "epipolar", (*why, line), None, clock.seconds)
+    return Synchronized(offsets, tuple(lifted), chosen, why, first, clock.seconds)
+
+
+def with_labels(stages: Stages, scene: Scene) -> Stages:
+    """The stages with the cost of labels in both matchers, when every video of the scene has labels."""
+    if not scene.labels or any(labels is None for labels in scene.labels):
+        return stages
+
+    def told(matcher: Matcher) -> Matcher:
+        costs = getattr(matcher, "costs", None)
+        if costs is None or any(isinstance(c, Labels) for c in costs):
+            return matcher
+        return replace(matcher, costs=(*costs, Labels(weight=LABELS)))  # type: ignore[type-var]
+
+    return replace(stages, epipolar_matcher=told(stages.epipolar_matcher), matcher=told(stages.matcher))
+
+
+def choose_route(scene: Scene, route: Route, stages: Stages) -> tuple[str, tuple[str, ...]]:
+    """The route and the reasons for it, in words. ValueError when the named one is not possible."""
+    if len(scene.videos) < 2:
+        raise ValueError(f"scene: expected at least two videos; found {len(scene.videos)}.")
+    if route not in ("auto", "tracks", "epipolar", "stereo"):
+        raise ValueError(f"route: expected auto, tracks, epipolar or stereo; found {route!r}.")
+    flat = [v.name for v in scene.videos if v.depth is None]
+    lacks = {
+        "tracks": f"depth is missing for {', '.join(flat)}" if flat else "",
+        "stereo": lacks_stereo(scene, stages),
+        "epipolar": "",
+    }
+    if route != "auto":
+        if lacks[route]:
+            raise ValueError(f"route {route}: {lacks[route]}. Add what is missing, or choose another route.")
+        return route, (f"route {route}: as asked",)
+    for name, reason in (
+        ("tracks", "every video has depth"),
+        ("stereo", f"no depth, {len(scene.videos)} static cameras: epipolar scan, then visual hull and stereo"),
+        ("epipolar", "no depth: offsets from pixels and calibration alone"),
+    ):
+        if not lacks[name]:
+            others = tuple(f"not {n}: {text}" for n, text in lacks.items() if text)
+            return name, (f"route {name}: {reason}", *others)
+    raise AssertionError("the epipolar route needs nothing")
+
+
+def lacks_stereo(scene: Scene, stages: Stages) -> str:
+    """What hull and stereo need and the scene has not; empty when nothing is missing."""
+    moving = [v.name for v in scene.videos if v.camera.w2c.ndim == 3]
+    if moving:
+        return f"cameras move: {', '.join(moving)}"
+    if len(scene.videos) < stages.stereo.min_views:
+        return f"{len(scene.videos)} videos are fewer than the {stages.stereo.min_views} that a visual hull needs"
+    return ""
+
+
+def track_all(
+    scene: Scene, stages: Stages, cache: Cache, map: MapLike, tell: Tell = lambda text: None
+) -> list[dict[str, np.ndarray]]:
+    """Masks, point tracks, descriptors and, where given, labels of every video.
+
+    ValueError names the first frame that does not read.
+    """
+    started, done = time.perf_counter(), []
+
+    def one(item: tuple[Video, Any, Any]) -> dict[str, np.ndarray]:
+        video, masks, labels = item
+        found = stages.tracking(video, masks, cache)
+        if labels is not None:
+            size, uv = (video.camera.width, video.camera.height), found["uv"]
+            key = (_digest(labels), size, content_key(uv))
+            found |= cache.arrays("labels", key, lambda: {"labels": track_labels(labels, uv, size)})
+        done.append(video.name)
+        spent = time.perf_counter() - started
+        tell(f"tracks {len(done)}/{len(scene.videos)}: {video.name}, {len(found['uv'])} tracks, {spent:.1f} s")
+        return found
+
+    labels = scene.labels or (None,) * len(scene.videos)
+    return list(map(one, list(zip(scene.videos, scene.masks, labels, strict=True))))
+
+
+def select(video: Video, raw: dict[str, np.ndarray], stages: Stages, frame: str) -> TrackSet:
+    """The tracks of one video that are worth keeping, in undistorted pixels."""
+    keep = stages.selection(raw["uv"], video.camera.width, video.fps or 30.0)
+    if len(keep) == 0:
+        raise ValueError(
+            f"video {video.name}: expected moving foreground to track; found no track that lives and moves enough. "
+            "Check the masks, choose a part of the clip with motion, or leave this video out."
+        )
+    tracks = pixel_tracks(
+        raw["uv"][keep],
+        raw["features"][keep],
+        video.camera,
+        fps=video.fps,
+        timestamps=video.timestamps,
+        name=video.name,
+        frame=frame,
+    )
+    return replace(tracks, labels=raw["labels"][keep]) if "labels" in raw else tracks
+
+
+def pairs_in_pixels(
+    tracks: Sequence[TrackSet], reference: int, stages: Stages, cache: Cache, map: MapLike = map
+) -> Offsets:
+    """The depth-free answer: epipolar scan of every pair, then the graph."""
+    return synchronize(
+        tracks,
+        reference=reference,
+        matcher=stages.epipolar_matcher,
+        aligner=stages.epipolar_aligner,
+        refiner=stages.epipolar_refiner,
+        graph=stages.graph,
+        rematch=0,
+        map=KeptPairs(cache, map),
+    )
+
+
+def pairs_in_space(
+    tracks: Sequence[TrackSet], reference: int, stages: Stages, cache: Cache, map: MapLike = map
+) -> Offsets:
+    """The answer from lifted tracks: curve distance, likelihood scan, spline fit, matched again, then the graph."""
+    return synchronize(
+        tracks,
+        reference=reference,
+        matcher=stages.matcher,
+        aligner=stages.aligner,
+        refiner=stages.refiner,
+        graph=stages.graph,
+        map=KeptPairs(cache, map),
+    )
+
+
+def lift_given(
+    scene: Scene, raw: Sequence[dict[str, np.ndarray]], stages: Stages, cache: Cache, map: MapLike = map
+) -> list[TrackSet]:
+    """Tracks lifted by the depth maps that came with the recording, then chosen by their life in space."""
+
+    def one(item: tuple[Video, dict[str, np.ndarray]]) -> TrackSet:
+        video, found = item
+        rich = replace(stages.selection, count=3 * stages.selection.count, apart=0.5 * stages.selection.apart)
+        keep = rich(found["uv"], video.camera.width, video.fps or 30.0)
+        uv = found["uv"][keep]
+        flat = select(video, found, replace(stages, selection=rich), scene.frame)
+        key = (stages.tracking.key(video, None), _digest(video.depth), content_key(uv))
+        depth = cache.arrays("depth", key, lambda: {"z": depth_at(video.depth or [], flat, uv)})["z"]
+        lifted = stages.lift(flat, depth)
+        chosen = lifted.take(stages.selection(seen_pixels(lifted), video.camera.width, video.fps or 30.0))
+        if len(chosen) == 0:
+            raise ValueError(
+                f"video {video.name}: expected depth where things move; no track could be lifted. Check the depth "
+                "maps' scale and holes (otsync check), or use --route epipolar."
+            )
+        return chosen
+
+    return list(map(one, list(zip(scene.videos, raw, strict=True))))
+
+
+def stereo_depth(
+    scene: Scene, tracks: Sequence[TrackSet], offsets: Offsets, stages: Stages, cache: Cache, map: MapLike = map
+) -> list[np.ndarray]:
+    """Depth of every track sample by hull and stereo over the videos whose clocks ``offsets`` knows."""
+    pairs = list(zip(scene.videos, scene.masks, strict=True))
+    masks = list(map(lambda item: stages.tracking.masks(item[0], item[1], cache), pairs))
+    rig, key = rig_at(scene, masks, offsets, range(len(scene.videos)), stages)
+    return stages.stereo(rig, [seen_pixels(t) for t in tracks], cache, key, map)
+
+
+def rig_at(
+    scene: Scene, masks: Sequence[Sequence[np.ndarray]], offsets: Offsets, chosen: Sequence[int], stages: Stages
+) -> tuple[Rig, tuple[Any, ...]]:
+    """The chosen videos on one clock, for stereo; and a key of everything that it sees of them."""
+    videos = [scene.videos[v] for v in chosen]
+    # rounding keeps the key the same over the last bits of a solution
+    seconds, rates = np.round(offsets.seconds[list(chosen)], 6), offsets.rates[list(chosen)]
+    rig = Rig.at(videos, [masks[v] for v in chosen], seconds, stages.tracking.width, rates)
+    pixels = [stages.tracking.key(scene.videos[v], scene.masks[v]) for v in chosen]
+    poses = [
+        (c.K.tobytes(), c.w2c.tobytes(), None if c.distortion is None else c.distortion.tobytes()) for c in rig.cameras
+    ]
+    return rig, (*pixels, stages.tracking.masker, stages.tracking.width, content_key(*poses))
+
+
+def without_times(offsets: Offsets) -> Offsets:
+    """The same without wall times among the statistics: a run that was killed and continued writes the same file."""
+
+    def clean(stats: dict[str, float]) -> dict[str, float]:
+        return {k: v for k, v in stats.items() if not k.endswith("seconds")}
+
+    alignments = {pair: replace(a, stats=clean(a.stats)) for pair, a in offsets.alignments.items()}
+    return replace(offsets, alignments=alignments, stats=clean(offsets.stats))
+
+
+def _flagged(offsets: Offsets) -> int:
+    return sum(not s.ok for s in offsets.status)
+
+
+def _too_doubtful(first: Offsets, stages: Stages) -> str:
+    """Why depth cannot be built at these offsets; empty when it can."""
+    apart = [
+        n
+        for n, s, c in zip(first.names, first.seconds, first.component, strict=True)
+        if not np.isfinite(s) or c != first.reference
+    ]
+    if apart:
+        return f"no stereo: {', '.join(apart)} could not be put on the common clock"
+    doubtful = [n for n, s in zip(first.names, first.status, strict=True) if s is not Status.OK]
+    if len(doubtful) > len(first) / 2:
+        return f"no stereo: the epipolar offsets of {', '.join(doubtful)} are doubtful"
+    return ""
+
+
+def _digest(frames: Any) -> str:
+    digest = getattr(frames, "digest", None)
+    return digest() if digest is not None else content_key(*[None if f is None else np.asarray(f) for f in frames])

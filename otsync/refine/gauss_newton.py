@@ -1,0 +1,280 @@
+"""Robust Gauss-Newton on the clock of a pair: two sets of spline curves, one offset, optionally one rate.
+
+Everything is symmetric in the two videos: residuals are read at the frames of both, so that exchanging them flips the
+sign of the offset and changes nothing else.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..clocks.splines import TrackSplines
+from ..types import Clock
+
+ROBUST = 2.0
+"""Samples beyond this many noise scales count for less (Cauchy)."""
+
+OUTLYING = 1.5
+"""Matches whose rms residual is beyond this many typical ones count for less, with the fourth power."""
+
+MIN_FRAMES = 20 / 30
+"""Seconds that a match must be seen in both videos."""
+
+LONGEST_STEP = 1.5 / 30
+"""Seconds by which one iteration may move the offset."""
+
+LONGEST_RATE_STEP = 0.01
+
+CONVERGED = 1e-4 / 30
+"""Seconds; a smaller step ends the iteration."""
+
+CLUSTER = 1.0
+"""Seconds of the blocks within which errors are taken as dependent."""
+
+GROUPS = 10
+"""Neighbourhoods into which matches are put: the errors of tracks on one limb are not independent."""
+
+MOST_LEVERAGE = 0.9
+"""Share of the information that one cluster may be said to hold."""
+
+
+@dataclass(frozen=True, eq=False)
+class Side:
+    """One video's frames against the other's curves.
+
+    Args:
+        own: curves of the video whose frames are looked at; at: their values there, (M,T,3).
+        other: curves of the other video.
+        lo, hi: (T,) the frames within the detrending window of each frame, lo inclusive, hi exclusive.
+        forward: whether these are a's frames.
+    """
+
+    own: TrackSplines
+    at: Float[np.ndarray, "M T 3"]
+    other: TrackSplines
+    lo: Int[np.ndarray, " T"]
+    hi: Int[np.ndarray, " T"]
+    forward: bool
+
+    @classmethod
+    def of(cls, own: TrackSplines, other: TrackSplines, window: float, forward: bool) -> Side:
+        t = own.times
+        slack = 1e-6 * own.frame
+        lo = np.searchsorted(t, t - window - slack)
+        hi = np.searchsorted(t, t + window + slack, side="right")
+        return cls(own, own.value(t), other, lo, hi, forward)
+
+    def there(self, clock: Clock) -> Float[np.ndarray, " T"]:
+        """The moments of the other video that this one's frames show."""
+        return clock.own(self.own.times) if self.forward else clock.world(self.own.times)
+
+    def time_b(self, clock: Clock) -> Float[np.ndarray, " T"]:
+        """Seconds of b's clock at these frames."""
+        return self.there(clock) if self.forward else self.own.times
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Where the iteration ended.
+
+    Args:
+        clock: the answer. covariance: (P,P) of offset (and rate), jackknifed over matches or over time, the larger.
+        weights: (M,) of the matches. iterations: done.
+        blur: rms residual over rms speed, s: how far off a single sample of a typical match tells the time.
+    """
+
+    clock: Clock
+    covariance: Float[np.ndarray, "P P"]
+    weights: Float[np.ndarray, " M"]
+    iterations: int
+    blur: float
+
+    @property
+    def effective_matches(self) -> float:
+        """(Σw)² / Σw²."""
+        return float(self.weights.sum() ** 2 / max((self.weights**2).sum(), 1e-300))
+
+
+def fit_clock(
+    a: TrackSplines, b: TrackSplines, start: Clock, window: float, *, fit_rate: bool = False, iterations: int = 25
+) -> Fit | None:
+    """Minimise robustly the detrended differences of matched curves over the offset (and rate).
+
+    Args:
+        a, b: curves of the matched tracks, m-th to m-th. start: where to begin; its rate stays unless ``fit_rate``.
+        window: s; the mean residual within ± this much of time is removed, as drifts of depth are slower.
+
+    Returns None when no match is seen long enough in both.
+    """
+    sides = Side.of(a, b, window, True), Side.of(b, a, window, False)
+    clock = start
+    centre = _centre(a, b, start)
+    n = 0
+    while True:
+        n += 1
+        system = _linearise(sides, clock, centre, fit_rate)
+        if system is None:
+            return None
+        step = system.step()
+        shift = float(np.clip(step[0], -LONGEST_STEP, LONGEST_STEP))
+        turn = float(np.clip(step[1], -LONGEST_RATE_STEP, LONGEST_RATE_STEP)) if fit_rate else 0.0
+        rate = clock.rate + turn
+        clock = Clock(clock.offset + shift - turn * centre, rate)
+        if n >= iterations or (abs(shift) < CONVERGED and abs(turn) < CONVERGED / 30 and n > 3):
+            break
+    covariance = system.covariance()
+    if fit_rate:
+        # from the offset at the centre of the overlap to that at b's time zero
+        move = np.array([[1.0, -centre], [0.0, 1.0]])
+        covariance = move @ covariance @ move.T
+    return Fit(clock, covariance, system.match_weights, n, system.blur)
+
+
+def _centre(a: TrackSplines, b: TrackSplines, clock: Clock) -> float:
+    """Middle of the common time on b's clock."""
+    ends = clock.own(a.times[[0, -1]])
+    return 0.5 * float(max(ends[0], b.times[0]) + min(ends[1], b.times[-1]))
+
+
+@dataclass(frozen=True, eq=False)
+class System:
+    """Weighted normal equations, by match and by block of time.
+
+    Args:
+        H, g: (P,P), (P,) the whole. by_match: (G,P,P), (G,P) and by_time: (B,P,P), (B,P) its parts.
+        match_weights: (M,). blur: see :class:`Fit`.
+    """
+
+    H: Float[np.ndarray, "P P"]
+    g: Float[np.ndarray, " P"]
+    by_match: tuple[np.ndarray, np.ndarray]
+    by_time: tuple[np.ndarray, np.ndarray]
+    match_weights: Float[np.ndarray, " M"]
+    blur: float
+
+    def step(self) -> Float[np.ndarray, " P"]:
+        return -np.linalg.solve(_regular(self.H), self.g)
+
+    def covariance(self) -> Float[np.ndarray, "P P"]:
+        """The larger of two jackknives, over groups of matches and over blocks of time (Bell and McCaffrey 2002).
+
+        Leaving a cluster out moves the answer by (H - H_c)⁻¹ g_c: a block that holds most of the motion, a single
+        swing, cannot pass for many independent ones.
+        """
+        found = []
+        for Hc, gc in (self.by_match, self.by_time):
+            leverage = np.einsum("pq,cqp->c", np.linalg.inv(_regular(self.H)), Hc) / len(self.H)
+            shrink = np.minimum(1.0, MOST_LEVERAGE / np.maximum(leverage, 1e-12))
+            rest = self.H - shrink[:, None, None] * Hc
+            moved = np.linalg.solve(rest + (1e-12 * np.trace(self.H) + 1e-300) * np.eye(len(self.H)), gc[..., None])[
+                ..., 0
+            ]
+            found.append(moved.T @ moved)
+        return max(found, key=lambda c: float(c[0, 0]))
+
+
+def _regular(H: np.ndarray) -> np.ndarray:
+    return H + np.diag(1e-12 * np.diag(H) + 1e-300)
+
+
+def _linearise(sides: tuple[Side, Side], clock: Clock, centre: float, fit_rate: bool) -> System | None:
+    """Residuals, robust weights and normal equations at ``clock``."""
+    from . import kernels
+
+    P = 2 if fit_rate else 1
+    M = len(sides[0].at)
+    parts = []
+    for side in sides:
+        T = len(side.own.times)
+        there, t_b = side.there(clock), side.time_b(clock)
+        ok = side.own.support(side.own.times) & side.other.support(there)
+        first, value, slope = side.other.basis(there)
+        # d(other curve's argument)/d offset: t_b = (t_a - offset) / rate from a's frames, t_a = rate t_b + offset from b's
+        sign = 1 / clock.rate if side.forward else -1.0
+        rr, g, h = np.empty((M, T)), np.empty((P, M, T)), np.empty((P, P, M, T))
+        least = MIN_FRAMES / side.own.frame
+        kernels.shift_residuals(
+            side.at,
+            side.other.by_track,
+            side.other.mean,
+            first,
+            value,
+            sign * slope,
+            t_b - centre,
+            ok,
+            side.lo,
+            side.hi,
+            least - 1e-6,
+            rr,
+            g,
+            h,
+        )
+        used = ok & (ok.sum(1) >= least - 1e-6)[:, None]
+        parts.append((rr, g, h, used))
+    seen = sum(p[3].sum(1) for p in parts)
+    if not seen.any():
+        return None
+    size = [np.sqrt(rr) for rr, _, _, _ in parts]
+    noise = 1.4826 / 1.5 * float(np.median(np.concatenate([s[p[3]] for s, p in zip(size, parts, strict=True)])))
+    rms = np.sqrt(sum(p[0].sum(1) for p in parts) / np.maximum(seen, 1))
+    typical = float(np.median(rms[seen > 0]))
+    weight = np.where(seen > 0, 1 / (1 + (rms / max(OUTLYING * typical, 1e-300)) ** 2) ** 2, 0.0)
+    start = max(sides[0].own.times[0], float(clock.world(sides[1].own.times[0])))
+    H_match, g_match = np.zeros((M, P, P)), np.zeros((M, P))
+    blocks = []
+    for side, (_, g, h, used), s in zip(sides, parts, size, strict=True):
+        w = np.where(used, weight[:, None] / (1 + (s / max(ROBUST * noise, 1e-300)) ** 2), 0.0)
+        H_match += np.einsum("pqmt,mt->mpq", h, w)
+        g_match += np.einsum("pmt,mt->mp", g, w)
+        t_a = side.own.times if side.forward else clock.world(side.own.times)
+        block = np.maximum(np.floor((t_a - start) / CLUSTER + 1e-9), 0).astype(np.int64)
+        blocks.append((block, np.einsum("pqmt,mt->tpq", h, w), np.einsum("pmt,mt->tp", g, w)))
+    count = max(int(b.max(initial=0)) for b, _, _ in blocks) + 1
+    H_time, g_time = np.zeros((count, P, P)), np.zeros((count, P))
+    for block, by_frame_H, by_frame_g in blocks:
+        np.add.at(H_time, block, by_frame_H)
+        np.add.at(g_time, block, by_frame_g)
+    H_group, g_group = np.zeros((GROUPS, P, P)), np.zeros((GROUPS, P))
+    group = neighbours(sides[0].own.mean + sides[1].own.mean, GROUPS)
+    np.add.at(H_group, group, H_match)
+    np.add.at(g_group, group, g_match)
+    noise_power, speed = (
+        sum(float(weight @ x.sum(1)) for x in xs) for xs in ((p[0] for p in parts), (p[2][0, 0] for p in parts))
+    )
+    blur = np.sqrt(noise_power / speed) if speed > 0 else np.inf
+    return System(H_match.sum(0), g_match.sum(0), (H_group, g_group), (H_time, g_time), weight, float(blur))
+
+
+def neighbours(x: Float[np.ndarray, "M 3"], groups: int) -> Int[np.ndarray, " M"]:
+    """Group of each point: nearest of ``groups`` points far from each other (farthest-point sampling from the middle)."""
+    distance = np.linalg.norm(x - np.median(x, 0), axis=1)
+    nearest = np.zeros(len(x), np.int64)
+    closest = np.full(len(x), np.inf)
+    for k in range(min(groups, len(x))):
+        seed = int(np.argmin(distance) if k == 0 else np.argmax(closest))
+        d = np.linalg.norm(x - x[seed], axis=1)
+        nearest[d < closest] = k
+        closest = np.minimum(closest, d)
+    return nearest
+
+
+def velocity_correlation(a: TrackSplines, b: TrackSplines, fit: Fit, window: float) -> float:
+    """Correlation of matched velocities, differences over ± ``window`` s, pooled with the fit's weights."""
+    clock = fit.clock
+    t = a.times[a.support(a.times).any(0)]
+    lo, hi = a.sample(t - window), a.sample(t + window)
+    LO, HI = b.sample(clock.own(t - window)), b.sample(clock.own(t + window))
+    u, v = hi - lo, HI - LO
+    known = np.isfinite(u[..., 0]) & np.isfinite(v[..., 0])
+    u, v = np.where(known[..., None], u, 0), np.where(known[..., None], v, 0)
+    uv, uu, vv = (float(fit.weights @ (x * y).sum((1, 2))) for x, y in ((u, v), (u, u), (v, v)))
+    return uv / np.sqrt(uu * vv) if uu > 0 and vv > 0 else 0.0
+
+
+def overlap_seconds(a: TrackSplines, b: TrackSplines, clock: Clock) -> float:
+    """Seconds of a's clock that both videos cover, one frame included."""
+    ends = clock.world(b.times[[0, -1]])
+    return max(0.0, float(min(a.times[-1], ends[1]) - max(a.times[0], ends[0])) + max(a.frame, b.frame))

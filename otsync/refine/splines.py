@@ -1,0 +1,140 @@
+"""Sub-frame offsets in continuous time: ``refine(a, b, matches, alignment, refiner)``.
+
+A refiner is an object in a slot: any callable ``refiner(a, b, matches, alignment) -> Alignment``.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+
+from ..clocks.common import nominal_fps, strongest
+from ..clocks.splines import SMOOTHING, TrackSplines
+from ..costs.linear import binary_scale
+from ..types import Alignment, Clock, Matches, Status, TrackSet, in_order
+from ..types.trust import Trust
+from .gauss_newton import Fit, fit_clock, overlap_seconds, velocity_correlation
+
+LEAST_SIGMA = 0.012 / 30
+"""Seconds; no sigma is reported below this."""
+
+COMMON_ERRORS = 4.0
+"""Seconds; blur²/COMMON_ERRORS joins sigma: errors that whole videos share (drifting depth, limbs, smoothing) grow with
+the square of the noise, and neither residuals nor other windows show them."""
+
+LONG = 600 / 30
+"""Seconds of overlap from which a rate can be told from an offset."""
+
+VELOCITY = 5 / 30
+"""Half window, s, of the velocities whose correlation judges the fit."""
+
+
+@dataclass(frozen=True)
+class SplineRefine:
+    """Offset of two sets of continuous curves by robust Gauss-Newton, with an honest sigma.
+
+    Tracks become penalised cubic splines that never answer within a gap. The residual of a match is the difference of
+    its two curves minus its mean over ±``windows[0]`` seconds, read at the frames of both videos, so that constant and
+    slowly drifting errors drop out and exchanging a and b flips the sign to rounding. Samples and whole matches that
+    fit badly lose weight. Sigma adds the scatter over neighbourhoods of matches or blocks of one second, the ``spread``
+    of the answers with the other windows (the largest difference, so its square counts half), and what blur predicts:
+    errors of the model that no residual shows.
+
+    Args:
+        windows: half windows of detrending in seconds: the answer's, and those that it is compared with.
+        smoothing: of the splines, see :class:`otsync.splines.TrackSplines`.
+        rate: ``fixed`` takes the clocks as declared; ``fit`` frees the rate for overlaps of 20 s and more and keeps it
+            when it is significant. With ``fixed`` a significant rate on such clips raises RATE_MISMATCH.
+        limit: of more matches only so many are used, the best by score.
+        trust: limits behind the flags.
+    """
+
+    windows: tuple[float, ...] = (14 / 30, 10 / 30, 28 / 30)
+    smoothing: float = SMOOTHING
+    rate: Literal["fixed", "fit"] = "fixed"
+    limit: int = 500
+    trust: Trust = field(default_factory=Trust)
+
+    def __call__(self, a: TrackSet, b: TrackSet, matches: Matches, alignment: Alignment) -> Alignment:
+        if not math.isfinite(alignment.offset):
+            return alignment
+        matches = strongest(matches, self.limit)
+        curves = self.splines(a, b, matches)
+        start = Clock(alignment.offset, alignment.rate)
+        fit = fit_clock(*curves, start, self.windows[0])
+        if fit is None:
+            flags = in_order((*alignment.flags, Status.NO_OVERLAP))
+            return replace(alignment, flags=flags)
+        fit, rate_flag, rate_stats = self._rate(curves, fit)
+        others = [fit_clock(*curves, fit.clock, w, iterations=10) for w in self.windows[1:]]
+        spread = max((self._apart(o, fit, curves) for o in others), default=0.0)
+        fps = min(nominal_fps(a), nominal_fps(b))
+        variance = float(fit.covariance[0, 0])
+        stats = (
+            alignment.stats
+            | rate_stats
+            | {
+                "matches": float(len(matches)),
+                "effective_matches": fit.effective_matches,
+                "moved": abs(fit.clock.offset - alignment.offset),
+                "spread": spread,
+                "blur": fit.blur,
+                "correlation": velocity_correlation(*curves, fit, VELOCITY),
+                "overlap": overlap_seconds(*curves, fit.clock),
+                "iterations": float(fit.iterations),
+            }
+        )
+        flags = in_order((*alignment.flags, *self._flags(stats), *rate_flag))
+        return replace(
+            alignment,
+            offset=fit.clock.offset,
+            rate=fit.clock.rate,
+            sigma=math.sqrt(variance + spread**2 / 2 + (fit.blur**2 / COMMON_ERRORS) ** 2 + LEAST_SIGMA**2),
+            fps=fps,
+            flags=flags,
+            stats=stats,
+        )
+
+    def splines(self, a: TrackSet, b: TrackSet, matches: Matches) -> tuple[TrackSplines, TrackSplines]:
+        """Curves of the matched tracks, in units of a power of two near their size; repeated tracks are fitted once."""
+        xa, xb = a.positions(), b.positions()
+        scale = max(binary_scale(xa), binary_scale(xb))
+        curves = []
+        for tracks, x, column in ((a, xa, 0), (b, xb, 1)):
+            used, index = np.unique(matches.pairs[:, column], return_inverse=True)
+            curves.append(TrackSplines(tracks.times, x[used] / scale, smoothing=self.smoothing).take(index))
+        return curves[0], curves[1]
+
+    def _apart(self, other: Fit | None, fit: Fit, curves: tuple[TrackSplines, TrackSplines]) -> float:
+        """Seconds between two answers; a window without an answer counts as a frame."""
+        return curves[0].frame if other is None else abs(other.clock.offset - fit.clock.offset)
+
+    def _rate(
+        self, curves: tuple[TrackSplines, TrackSplines], fit: Fit
+    ) -> tuple[Fit, tuple[Status, ...], dict[str, float]]:
+        """The fit with a free rate where that is significant, or a warning that it would be."""
+        if overlap_seconds(*curves, fit.clock) < LONG - 1e-9:
+            return fit, (), {}
+        free = fit_clock(*curves, fit.clock, self.windows[0], fit_rate=True)
+        if free is None:
+            return fit, (), {}
+        sigma = math.sqrt(float(free.covariance[1, 1]))
+        stats = {"fitted_rate": free.clock.rate, "rate_sigma": sigma}
+        if abs(free.clock.rate - fit.clock.rate) <= self.trust.rate_sigmas * sigma:
+            return fit, (), stats
+        return (free, (), stats) if self.rate == "fit" else (fit, (Status.RATE_MISMATCH,), stats)
+
+    def _flags(self, stats: dict[str, float]) -> tuple[Status, ...]:
+        t = self.trust
+        found = {
+            Status.WEAK: stats["blur"] > t.blur,
+            Status.MOVED: stats["moved"] > t.moved,
+            Status.SPREAD: stats["spread"] > t.spread,
+            Status.SHORT_OVERLAP: stats["overlap"] < t.overlap - 1e-9,
+            Status.FEW_MATCHES: stats["effective_matches"] < t.matches,
+            Status.POOR_FIT: stats["correlation"] < t.correlation,
+        }
+        return tuple(flag for flag, raised in found.items() if raised)

@@ -1,0 +1,87 @@
+"""Offsets of all videos from their pairs: ``synchronize(tracks)`` (paper, Sec. 3.4, whose star becomes a graph)."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from ..align.verb import Aligner, align
+from ..match.verb import Matcher, match
+from ..refine.splines import SplineRefine
+from ..refine.verb import Refiner, refine
+from ..types import Alignment, Matches, Status, TrackSet
+from .graph import Pair
+from .verdict import Answer
+
+log = logging.getLogger("otsync")
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """What one pair needs, self-contained so that any executor can carry it."""
+
+    pair: Pair
+    a: TrackSet
+    b: TrackSet
+    matcher: Matcher | None
+    aligner: Aligner | None
+    refiner: Refiner
+    matches: Matches | None
+
+
+def run(job: Job) -> Answer:
+    """Match, align and refine one pair. An exception becomes the status FAILED, told in the log."""
+    matches = Matches(np.zeros((0, 2), int), flags=(Status.FAILED,))
+    try:
+        found = job.matches if job.matches is not None else match(job.a, job.b, job.matcher, throw=False)
+        matches = found.without_plan()
+        if not matches.status.ok:
+            failed = Alignment(float("nan"), flags=matches.flags, stats=matches.stats)
+            return Answer(job.pair, matches, failed, failed)
+        scanned = align(job.a, job.b, matches, job.aligner, throw=False)
+        refined = scanned
+        if np.isfinite(scanned.offset):
+            refined = refine(job.a, job.b, matches, scanned, job.refiner, throw=False)
+        return Answer(job.pair, matches, scanned, refined)
+    except Exception as error:
+        log.warning("pair %s: %s: %s", job.pair, type(error).__name__, error)
+        failed = Alignment(float("nan"), flags=(Status.FAILED,))
+        return Answer(job.pair, matches, failed, failed)
+
+
+@dataclass(frozen=True, eq=False)
+class Refit:
+    """A pair to be refined anew from elsewhere."""
+
+    a: TrackSet
+    b: TrackSet
+    matches: Matches
+    start: Alignment
+    refiner: Refiner
+
+    @classmethod
+    def of(cls, answer: Answer, offset: float, rate: float, tracks: Sequence[TrackSet], refiner: Refiner) -> Refit:
+        i, j = answer.pair
+        start = dataclasses.replace(answer.scanned, offset=offset, rate=rate, stats=dict(answer.scanned.stats))
+        return cls(tracks[i], tracks[j], answer.matches, start, with_rate(refiner, "fixed"))
+
+
+def run_refit(job: Refit) -> Alignment:
+    try:
+        return refine(job.a, job.b, job.matches, job.start, job.refiner, throw=False)
+    except Exception as error:
+        log.warning("refitting: %s: %s", type(error).__name__, error)
+        return Alignment(float("nan"), flags=(Status.FAILED,))
+
+
+def with_rate(refiner: Refiner | None, rate: Literal["fixed", "fit"]) -> Refiner:
+    """The refiner (or the default) told how to treat rates, where it can be told."""
+    refiner = SplineRefine() if refiner is None else refiner
+    if dataclasses.is_dataclass(refiner) and hasattr(refiner, "rate"):
+        return dataclasses.replace(refiner, rate=rate)
+    return refiner

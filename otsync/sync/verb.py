@@ -1,0 +1,173 @@
+"""``synchronize(tracks)``: the clocks of many videos from their pairs (paper, Sec. 3.4; its star becomes a graph)."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Mapping, Sequence
+from typing import Literal
+
+import numpy as np
+
+from ..align.verb import Aligner
+from ..clocks.shutter import at_frame_times
+from ..compute.threads import MapLike
+from ..costs.linear import Cosine
+from ..match.synchronous import SynchronousMatching
+from ..match.verb import Matcher
+from ..refine.verb import Refiner
+from ..types import Alignment, Matches, Offsets, TrackSet
+from ..types.trust import Trust
+from .graph import Graph, Pair
+from .pairs import Job, Refit, run, run_refit, with_rate
+from .verdict import Answer, Settled, settle
+
+
+def synchronize(
+    tracks: Sequence[TrackSet],
+    *,
+    reference: int | Literal["auto"] = 0,
+    matcher: Matcher | None = None,
+    aligner: Aligner | None = None,
+    refiner: Refiner | None = None,
+    matches: Mapping[Pair, Matches] | None = None,
+    graph: Graph | None = None,
+    rematch: int = 1,
+    rate: Literal["fixed", "fit"] = "fixed",
+    map: MapLike = map,
+) -> Offsets:
+    """Put every video on the reference's clock.
+
+    Pairs of videos are matched, aligned and refined; a robust solution over the graph of pairs gives the offsets, and
+    pairs that contradict it are fitted anew from where it puts them. Videos that no sound pair links to the reference
+    form components with references of their own.
+
+    Args:
+        tracks: one set per video, all in one world frame. Rolling shutters of declared ``readout`` are undone here.
+        reference: index of the video whose clock is the world's; "auto" takes the one with the surest pairs.
+        matcher, aligner, refiner: the algorithms of each stage; None takes the default, :class:`Unrefined` as refiner
+            leaves the aligner's answers as they are.
+        matches: ``{(i, j): Matches}`` of your own; those pairs skip matching and no others are tried.
+        graph: which pairs are compared and how they are combined; default :class:`Graph`. ``Graph(extra=0)`` is the
+            paper's star.
+        rematch: how often pairs whose first answer is trusted are matched again with positions at the synchronised
+            times (more than once adds nothing); matches of your own are left alone.
+        rate: "fixed" takes frame rates as declared; "fit" frees them for pairs that overlap by 20 s and more, and
+            keeps what is significant.
+        map: any map-like callable: the builtin, an executor's, dask's. Results do not depend on it.
+
+    A pair that fails gets a status and nan; the others live. Wrong input raises ValueError before any work.
+    """
+    chosen = check_tracks(tracks, reference, xyz=getattr(aligner, "needs_xyz", True))
+    costs = (Cosine(),) if matcher is None else getattr(matcher, "costs", ())
+    if matches is None and any(isinstance(cost, Cosine) for cost in costs):
+        for v, t in enumerate(tracks):
+            t.check(f"tracks[{v}]", xyz=False, features=True)
+    if rate not in ("fixed", "fit"):
+        raise ValueError(f"rate: expected 'fixed' or 'fit'; found {rate!r}.")
+    started = time.perf_counter()
+    tracks = [at_frame_times(t) for t in tracks]
+    graph = graph or Graph()
+    refiner = with_rate(refiner, rate)
+    centre = most_seen(tracks) if chosen is None else chosen
+    pairs = given_pairs(matches, tracks) if matches is not None else graph.pairs(len(tracks), centre)
+    jobs = [
+        Job(pair, tracks[pair[0]], tracks[pair[1]], matcher, aligner, refiner, matches[pair] if matches else None)
+        for pair in pairs
+    ]
+    trust = getattr(refiner, "trust", None) or Trust()
+
+    def refit(tasks: list[tuple[Answer, float, float]]) -> list[Alignment]:
+        return list(map(run_refit, [Refit.of(*task, tracks, refiner) for task in tasks])) if tasks else []
+
+    def settled(answers: Sequence[Answer]) -> Settled:
+        return settle(len(tracks), answers, chosen, centre, graph, trust, refit)
+
+    found = settled(list(map(run, jobs)))
+    for _ in range(rematch if matches is None else 0):
+        again = rematching(jobs, found)
+        if not again:
+            break
+        fresh = {answer.pair: answer for answer in map(run, again)}
+        found = settled([fresh.get(a.pair, a) for a in found.answers])
+    return to_offsets(tracks, found, time.perf_counter() - started)
+
+
+def rematching(jobs: list[Job], found: Settled) -> list[Job]:
+    """The pairs between trusted videos of one component, to be matched at their synchronised times."""
+    again = []
+    for job in jobs:
+        i, j = job.pair
+        if found.flags[i] or found.flags[j] or found.component[i] != found.component[j]:
+            continue
+        # t_a = (r_b t_b + x_b - x_a) / r_a
+        offset, rate = (found.x[j] - found.x[i]) / found.rates[i], found.rates[j] / found.rates[i]
+        at = getattr(job.matcher, "at", None)  # a matcher may know better how to match at known times
+        costs = getattr(job.matcher, "costs", (Cosine(),))
+        matcher = at(float(offset), float(rate)) if at else SynchronousMatching(float(offset), float(rate), costs)
+        again.append(dataclasses.replace(job, matcher=matcher))
+    return again
+
+
+def to_offsets(tracks: Sequence[TrackSet], found: Settled, seconds: float) -> Offsets:
+    return Offsets(
+        names=unique_names(tracks),
+        fps=np.array([t.fps for t in tracks], float),
+        seconds=found.x,
+        rates=found.rates,
+        sigma=found.sigma,
+        reference=found.reference,
+        component=found.component,
+        flags=found.flags,
+        alignments={a.pair: a.refined for a in found.answers},
+        matches={a.pair: a.matches for a in found.answers},
+        stats=found.stats | {"seconds": seconds},
+    )
+
+
+def check_tracks(tracks: Sequence[TrackSet], reference: int | Literal["auto"], *, xyz: bool = True) -> int | None:
+    """ValueError unless there are at least two sound track sets; the reference's index, None when it is to be chosen."""
+    if isinstance(tracks, TrackSet) or len(tracks) < 2:
+        raise ValueError("tracks: expected a sequence of at least two track sets, one per video; found fewer.")
+    chosen = None
+    if reference != "auto":
+        if isinstance(reference, str) or not -len(tracks) <= reference < len(tracks):
+            raise ValueError(
+                f"reference: expected an index of the {len(tracks)} videos, or 'auto'; found {reference!r}."
+            )
+        chosen = reference % len(tracks)
+    for v, t in enumerate(tracks):
+        t.check(f"tracks[{v}]", xyz=xyz)
+    frames = {t.frame for t in tracks if t.frame is not None}
+    if len(frames) > 1:
+        raise ValueError(f"tracks: expected one world frame; found {sorted(frames)}. Bring the positions into one.")
+    return chosen
+
+
+def most_seen(tracks: Sequence[TrackSet]) -> int:
+    """The video with the most observed samples; the first on ties."""
+    return int(np.argmax([t.seen.sum() for t in tracks]))
+
+
+def given_pairs(matches: Mapping[Pair, Matches], tracks: Sequence[TrackSet]) -> list[Pair]:
+    """Sorted pairs that the caller brought matches for; ValueError when they do not fit the tracks."""
+    for (i, j), found in matches.items():
+        if not (0 <= i < len(tracks) and 0 <= j < len(tracks)) or i == j:
+            raise ValueError(f"matches: expected pairs of two of the {len(tracks)} videos; found {(i, j)}.")
+        if (j, i) in matches:
+            raise ValueError(f"matches: expected each pair once; found both {(i, j)} and {(j, i)}.")
+        found.check(f"matches[{(i, j)}]", len(tracks[i]), len(tracks[j]))
+    return sorted(matches)
+
+
+def unique_names(tracks: Sequence[TrackSet]) -> tuple[str, ...]:
+    """The videos' names; ``video3`` for a nameless one, ``name~2`` for a repeated one."""
+    names: list[str] = []
+    for v, t in enumerate(tracks):
+        name = base = t.name or f"video{v}"
+        n = 1
+        while name in names:
+            n += 1
+            name = f"{base}~{n}"
+        names.append(name)
+    return tuple(names)

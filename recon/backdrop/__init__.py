@@ -1,0 +1,1 @@
+"""What stands still: pictures of it, seeds for it, and its own fit."""

@@ -1,0 +1,195 @@
+"""``recon render``, ``recon eval`` and ``recon export``."""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import tyro
+
+from otsync.progress import counted
+from recon.cli.common import opened, tell
+from recon.cli.tables import view_table
+from recon.result.export import Format
+
+if TYPE_CHECKING:
+    pass
+
+
+@dataclass
+class Render:
+    """Render a finished reconstruction: a camera that filmed it, or one that circles around it.
+
+    Example: recon render result --camera 0 --out camera0.mp4
+
+    Around the scene: recon render result --path orbit --frames 120 --out orbit.mp4
+
+    A frozen moment from all sides: recon render result --path orbit --times 1.25 --frames 90 --out frozen.mp4
+
+    Single images: recon render result --camera 5 --times 0.5 0.52 --out images
+    """
+
+    result: tyro.conf.Positional[Path]
+    """Folder that recon fit or otsync run wrote."""
+    camera: str | None = None
+    """Name of a video: from its place, with its colours."""
+    path: Literal["orbit"] | None = None
+    """A camera that moves: around the scene, or to and fro where the scene was filmed from one side."""
+    times: tuple[float, ...] = ()
+    """World seconds; default: the whole span at --fps."""
+    frames: int | None = None
+    """Frames of a path: time runs through the span, or stands still at the one moment of --times."""
+    turns: float = 1.0
+    """How often the path goes around."""
+    fps: float | None = None
+    """Frames per second; default: the reference's."""
+    width: int | None = None
+    """Pixels; default: the working size of the fit."""
+    out: Path = Path("render.mp4")
+    """A video (.mp4, .mov, .mkv), or a folder for PNG frames."""
+
+    def run(self) -> int:
+        from recon.result.export import MAX_FRAMES, check_times, frame_times
+        from recon.result.folder import load_result
+        from recon.result.images import rendered, stretched
+        from recon.result.video import check_target, write_images
+
+        if (self.camera is None) == (self.path is None):
+            raise ValueError("--camera, --path: expected one of them: the name of a video, or orbit.")
+        if self.frames is not None and (self.path is None or len(self.times) > 1):
+            raise ValueError("--frames: expected with --path, and with at most one moment in --times.")
+        if self.frames is not None and not 1 <= self.frames <= MAX_FRAMES:
+            raise ValueError(f"--frames: expected 1 to {MAX_FRAMES}; found {self.frames}.")
+        if self.fps is not None and not 0 < self.fps <= 1000:
+            raise ValueError(f"--fps: expected frames per second above 0, at most 1000; found {self.fps:g}.")
+        check_target(self.out)
+        result = load_result(self.result)
+        fps = 1.0 / result.scene.frame_step if self.fps is None else self.fps
+        times = list(self.times) or frame_times(result.scene, fps).tolist()
+        if self.frames is not None:
+            times = times * self.frames if len(self.times) == 1 else stretched(result.scene.span, self.frames)
+        check_times(result.scene, times)
+        images = rendered(result, times, self.camera, turns=self.turns, width=self.width)
+        count = write_images(counted(images, "rendering", "image", len(times)), self.out, fps)
+        print(f"wrote {count} images to {self.out}")
+        return 0
+
+
+@dataclass
+class Eval:
+    """Hold a finished reconstruction against cameras that it has not seen.
+
+    Example: recon eval result recording/ --held-out 0
+
+    With LPIPS, from weights that you have: recon eval result recording/ --lpips-weights alexnet.pth
+    """
+
+    result: tyro.conf.Positional[Path]
+    """Folder that recon fit or otsync run wrote."""
+    scene: tyro.conf.Positional[Path]
+    """The recording it was made from."""
+    held_out: tuple[str, ...] = ()
+    """Names of videos to compare with; default: those that were held out. Trained ones are allowed, and marked."""
+    offsets: Path | None = None
+    """offsets.json that tells the clocks of held-out videos; default: found on the frozen scene."""
+    truth: Path | None = None
+    """True offsets: adds the offset errors of the reconstruction."""
+    views: int = 50
+    """Frames of every camera that are compared."""
+    lpips_weights: Path | None = None
+    """torchvision's weights of AlexNet; without them LPIPS is left out."""
+    out: Path | None = None
+    """Where to write the figures; default: eval.json in the result."""
+    allow_outside: bool = False
+    """Let the scene name files outside its folder."""
+
+    def run(self) -> int:
+        from otsync.files.arrays import write_json
+        from otsync.files.cache import Cache
+        from otsync.progress import Progress
+        from otsync.types import Offsets
+        from recon.pipeline.verb import evaluate, offset_figures, true_seconds
+        from recon.result.folder import load_result, metrics_of
+
+        if self.views < 1:
+            raise ValueError(f"--views: expected at least 1; found {self.views}.")
+        result = load_result(self.result)
+        scene = opened(self.scene, self.allow_outside)
+        given = None if self.offsets is None else Offsets.load(self.offsets)
+        names = self.held_out or tuple(v.name for v in result.videos if v.held_out)
+        if not names:
+            raise ValueError("--held-out: expected names of videos; none was held out of this fit.")
+        with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+            views, reason = evaluate(
+                result,
+                scene,
+                names,
+                given,
+                most=self.views,
+                lpips_weights=self.lpips_weights,
+                cache=Cache(self.result / "stages"),
+                map=pool.map,
+                progress=Progress(tell),
+            )
+        print(view_table(views, reason))
+        document = metrics_of(views, {}, reason)
+        if self.truth is not None:
+            error = offset_figures(result.offsets, true_seconds(Offsets.load(self.truth), result.offsets))
+            if error["mean_frames"] is None:
+                print("offset error: none, for there is one video only")
+            else:
+                print(f"offset error: mean {error['mean_frames']:.3f}, max {error['max_frames']:.3f} frames")
+            document["offset_error"] = error
+        out = self.out or self.result / "eval.json"
+        write_json(out, document)
+        print(f"wrote {out}")
+        return 0
+
+
+@dataclass
+class Export:
+    """Write a finished reconstruction for other tools.
+
+    Example: recon export result --format ply --at 1.25 --out moment.ply
+
+    Every frame: recon export result --format ply-sequence --out sequence
+
+    Dense trajectories: recon export result --format tracks --out tracks.npz
+    """
+
+    result: tyro.conf.Positional[Path]
+    """Folder that recon fit or otsync run wrote."""
+    format: Format = "ply"
+    """ply and splat hold a moment, ply-sequence every frame; checkpoint is the whole scene, tracks an otsync track set."""
+    at: float | None = None
+    """World second of the moment; default: the middle."""
+    fps: float | None = None
+    """Frames per second of a sequence or of tracks; default: the reference's."""
+    out: Path | None = None
+    """File or folder; default: named by the format, in the result."""
+
+    def run(self) -> int:
+        from recon.result.export import export, frame_times
+        from recon.result.folder import load_result
+
+        result = load_result(self.result)
+        single = self.format in ("ply", "splat")
+        if self.at is not None and not single:
+            raise ValueError(f"--at: expected with ply or splat; found {self.format}, which holds all times.")
+        low, high = result.scene.span
+        middle = 0.5 * (low + high) if self.at is None else self.at
+        times = [middle] if single else frame_times(result.scene, self.fps).tolist()
+        names = {
+            "ply": "scene.ply",
+            "splat": "scene.splat",
+            "ply-sequence": "sequence",
+            "checkpoint": "scene4d.npz",
+            "tracks": "tracks.npz",
+        }
+        out = self.out or self.result / names[self.format]
+        export(result.scene, self.format, out, times, result.frame)
+        print(f"wrote {out}")
+        return 0

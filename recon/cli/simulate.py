@@ -1,0 +1,72 @@
+"""``recon simulate``."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+
+@dataclass
+class Simulate:
+    """Film a small simulated scene with unsynchronised cameras, and write it as a recording with its truth.
+
+    Example: recon simulate world --cameras 5 --seed 3
+    """
+
+    out: tyro.conf.Positional[Path]
+    """Folder for scene.json, images, masks, depth, tracks and truth.json."""
+    cameras: int = 5
+    held_out: int = 1
+    """Cameras between the others, for evaluation: they film at true world time."""
+    frames: int = 24
+    width: int = 160
+    height: int = 96
+    max_offset: float = 1.0
+    """Largest offset, in frames."""
+    gain: float = 0.0
+    """Cameras differ in exposure and white balance: standard deviation of the logarithm. 0, like all below: absent."""
+    noise: float = 0.0
+    """White noise beyond the usual 1 %, in 0..1."""
+    exposure: float = 0.0
+    """Seconds that shutters are open: motion blur."""
+    readout: float = 0.0
+    """Seconds from the first to the last row: rolling shutter, which scene.json then declares."""
+    sheen: float = 0.0
+    """Strength of a lamp that what moves reflects, in 0..1: colours depend on the view."""
+    seed: int = 0
+
+    def run(self) -> int:
+        from recon.simulate.capture import synthetic
+        from recon.simulate.effects import Blur, Exposure, MoreNoise, Rolling, Sheen
+        from recon.simulate.recording import write_capture
+
+        wanted = (
+            (Sheen, self.sheen),
+            (Blur, self.exposure),
+            (Rolling, self.readout),
+            (Exposure, self.gain),
+            (MoreNoise, self.noise),
+        )
+        if not all(0 <= size < math.inf for _, size in wanted):
+            raise ValueError("--gain, --noise, --exposure, --readout, --sheen: expected numbers of 0 or more.")
+        capture = synthetic(
+            self.seed,
+            cameras=self.cameras,
+            held_out=self.held_out,
+            frames=self.frames,
+            size=(self.width, self.height),
+            offsets=self.max_offset,
+            effects=tuple(effect(size) for effect, size in wanted if size),
+        )
+        write_capture(capture, self.out)
+        held = " ".join(f.name for f in capture.held_out)
+        print(f"{self.out}: {len(capture.footage)} cameras, held out: {held or 'none'}; truth.json, start.json")
+        print(
+            f"try: recon fit {self.out} --offsets {self.out}/start.json --tracks {self.out}/tracks/*.npz "
+            f"--truth {self.out}/truth.json --width {self.width} --steps 1500 --out result"
+            + (f" --held-out {held}" if held else "")
+        )
+        return 0

@@ -1,0 +1,1 @@
+"""How good a reconstruction is: held-out views, offsets, coherence of the motion."""

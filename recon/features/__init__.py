@@ -1,0 +1,1 @@
+"""Features on Gaussians, lifted from feature maps, and feature tracks of one video."""

@@ -1,0 +1,88 @@
+"""Feature maps for lifting, from OpenCV: what goes into the slot of :func:`recon.feature_tracks.feature_tracks`.
+
+Any callable of an image and its soft mask will do there, one that asks a network for instance; these need no weights.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from recon.footage.footage import FOREGROUND
+
+
+@dataclass(frozen=True)
+class LabMaps:
+    """Colours of the foreground around every pixel: Gaussian-windowed histograms in CIE Lab, square-rooted.
+
+    The mean over frames and pixels of such vectors is nearly that of :class:`otsync.priors.features.LabHistogram`,
+    whose constants are used, but for the root, which is taken before the mean.
+
+    Args:
+        sigma: of the window, pixels at 640 of width. bins: per axis of Lab; bins^3 channels.
+    """
+
+    sigma: float = 8.0
+    bins: int = 4
+
+    def __call__(self, image: UInt8[np.ndarray, "h w 3"], mask: UInt8[np.ndarray, "h w"]) -> Float[np.ndarray, "h w C"]:
+        """Unit vectors; zero where no foreground is near."""
+        import cv2
+
+        h, w = mask.shape
+        n, unit = self.bins, w / 640
+        lab = cv2.cvtColor(image.astype(np.float32) / 255, cv2.COLOR_RGB2LAB)
+        lightness = np.clip(lab[..., 0] * n / 100, 0, n - 1).astype(int)
+        green, blue = (np.clip((lab[..., c] + 20) * n / 60, 0, n - 1).astype(int) for c in (1, 2))
+        bin_of = np.where(mask > 255 * FOREGROUND, (lightness * n + green) * n + blue, -1)
+        # a blur at a lower resolution costs less, and a window of several pixels does not see the difference
+        shrink = max(1, round(self.sigma * unit / 2))
+        size = (max(1, round(w / shrink)), max(1, round(h / shrink)))
+        out = np.zeros((h, w, n**3), np.float32)
+        for b in np.unique(bin_of[bin_of >= 0]):
+            plane = cv2.resize((bin_of == b).astype(np.float32), size, interpolation=cv2.INTER_AREA)
+            plane = cv2.GaussianBlur(plane, (0, 0), self.sigma * unit / shrink)
+            out[..., b] = cv2.resize(plane, (w, h), interpolation=cv2.INTER_LINEAR)
+        total = out.sum(-1, keepdims=True)
+        return np.sqrt(np.divide(out, total, out=np.zeros_like(out), where=total > 1e-6))
+
+
+@dataclass(frozen=True)
+class DaisyMaps:
+    """DAISY (Tola et al., PAMI 2010): histograms of gradient directions on rings around every foreground pixel; of tracks
+    alone: :class:`otsync.priors.Daisy`.
+
+    Args:
+        radius: of the outer ring, pixels at 640 of width. rings, spokes, directions: (rings * spokes + 1) * directions
+            channels, 64 as it is.
+    """
+
+    radius: float = 24.0
+    rings: int = 3
+    spokes: int = 5
+    directions: int = 4
+
+    def __call__(self, image: UInt8[np.ndarray, "h w 3"], mask: UInt8[np.ndarray, "h w"]) -> Float[np.ndarray, "h w C"]:
+        """Every ring's histogram has unit norm; zero outside the mask. ValueError where OpenCV lacks DAISY."""
+        import cv2
+
+        if not hasattr(cv2, "xfeatures2d"):
+            raise ValueError(
+                "DaisyMaps: needs OpenCV's contributed modules; found OpenCV without them. pip install "
+                "opencv-contrib-python-headless, or use LabMaps."
+            )
+        radius = max(2.0, self.radius * mask.shape[1] / 640)
+        contributed: Any = cv2.xfeatures2d
+        daisy = contributed.DAISY_create(
+            radius, self.rings, self.spokes, self.directions, contributed.DAISY_NRM_PARTIAL
+        )
+        out = np.zeros((*mask.shape, (self.rings * self.spokes + 1) * self.directions), np.float32)
+        row, column = np.nonzero(mask)
+        if len(row):
+            points = [cv2.KeyPoint(float(x), float(y), 1.0) for x, y in zip(column, row, strict=True)]
+            _, found = daisy.compute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), points)
+            out[row, column] = np.nan_to_num(found)
+        return out

@@ -1,0 +1,120 @@
+"""What a fit begins with, made from a recording and its offsets: what takes part, then every stage, kept on disk.
+
+With :mod:`recon.initial` and :mod:`recon.pipeline` this is the only part of ``recon`` that calls otsync's algorithms,
+and imports them when it runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from otsync.clocks.shutter import at_frame_times, check_within_a_frame
+from otsync.compute.threads import MapLike
+from otsync.io import Scene
+from otsync.io.mend import cut
+from otsync.progress import Progress
+from otsync.types import Clock, Offsets, TrackSet
+from recon.backdrop.fit import StaticFit, with_backdrop
+from recon.footage.footage import Footage
+from recon.observe.effects import common_exposure
+from recon.pipeline.intake import readable, split
+from recon.pipeline.plan import Plan
+from recon.pipeline.stages import backdrop_of_scene, initial_scene, lifted_tracks, read_footage
+from recon.pipeline.track_sets import tracks_of
+from recon.scene.gaussians4d import Gaussians4D
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """What a fit of a recording begins with.
+
+    Args:
+        footage: of the training videos, in the order of ``offsets``. held_out: of the others.
+        clocks: of the held-out videos, where the given offsets tell.
+        offsets: of the training videos alone.
+        initial: scene before any refinement. gains: (V,3) factors from its colours to each video's.
+        frame: name of the world frame. left_out: videos that have no offset.
+    """
+
+    footage: tuple[Footage, ...]
+    held_out: tuple[Footage, ...]
+    clocks: dict[str, Clock]
+    offsets: Offsets
+    tracks: tuple[TrackSet, ...]
+    initial: Gaussians4D
+    gains: np.ndarray
+    frame: str
+    left_out: tuple[str, ...] = ()
+
+    @property
+    def layered(self) -> bool:
+        """Whether the fit draws what moves over backgrounds, rather than together with what is static."""
+        return all(f.background is not None for f in self.footage)
+
+
+def prepare(
+    scene: Scene,
+    offsets: Offsets,
+    tracks: Sequence[TrackSet] | None = None,
+    *,
+    plan: Plan | None = None,
+    held_out: Sequence[str] = (),
+    backdrop: StaticFit | None = None,
+    cache: Any = None,
+    map: MapLike = map,
+    progress: Progress | None = None,
+) -> Prepared:
+    """Everything that a fit begins with.
+
+    Args:
+        offsets: of the recording's videos.
+        tracks: in space, one set a video; those of other than training videos are left out, with a note. Default:
+            tracked and lifted here.
+        held_out: names of videos that nothing here sees but their own footage.
+        backdrop: the static part, its gains those of the training videos in their order; default: fitted here.
+        cache: an :class:`otsync.priors.cache.Cache`. map: any map-like callable; two threads use two cores.
+
+    ValueError names what is missing or does not fit: a backdrop with gains of other videos, nothing that moves.
+    """
+    from otsync.files.cache import Cache
+
+    plan, progress, cache = plan or Plan(), progress or Progress(), cache or Cache()
+    for video in scene.videos:
+        check_within_a_frame(common_exposure(plan.effects), video.times, "exposure")
+    if plan.frames is not None:
+        scene = cut(scene, *plan.frames)
+    with progress.stage("reading"):
+        scene = readable(scene, cache, map, progress)
+        train, others, offsets, clocks = split(scene, offsets, held_out, progress)
+    if backdrop is not None and backdrop.gains.shape != (len(train.videos), 3):
+        raise ValueError(
+            f"backdrop: expected gains of shape ({len(train.videos)},3), of the videos to fit in their order "
+            f"({', '.join(train.names)}); found {backdrop.gains.shape}. Keep the gains of those videos alone."
+        )
+    if tracks is None:
+        with progress.stage("tracks"):
+            tracks = lifted_tracks(train, offsets, cache, map, progress)
+    else:
+        tracks = tuple(at_frame_times(t) for t in tracks_of(train, tracks, held_out, progress.note))
+    with progress.stage("footage"):
+        footage = read_footage(train, plan.width, cache, map, progress)
+        held = () if others is None else read_footage(others, plan.width, cache, map, progress)
+    if not any((f.boxes[:, 2] > f.boxes[:, 0]).any() for f in footage):
+        raise ValueError("scene: expected something that moves; the masks are empty in every frame of every video.")
+    with progress.stage("backdrop"):
+        static = backdrop
+        if static is None:
+            static = backdrop_of_scene(train, tracks, footage, plan, cache, progress)
+    with progress.stage("initial scene"):
+        initial = initial_scene(train, offsets, tuple(tracks), footage, static, plan, cache, map, progress)
+    gains = np.ones((len(footage), 3)) if static is None else static.gains
+    if static is not None:
+        footage = tuple(
+            f if f.background is None else with_backdrop(static, f, gains[v]) for v, f in enumerate(footage)
+        )
+    left_out = tuple(n for n in scene.names if n not in train.names and n not in held_out)
+    return Prepared(footage, held, clocks, offsets, tuple(tracks), initial, gains, scene.frame, left_out)

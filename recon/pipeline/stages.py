@@ -1,0 +1,263 @@
+"""Tracks in space, footage, backdrop and initial scene of a recording: each kept on disk, so that a run continues.
+
+tracks, depth    otsync's own stages, shared with the synchronisation that came before
+footage          frames at working size, masks, backgrounds
+backdrop         static Gaussians behind what moves
+initial scene    a scaffold through the lifted tracks, Gaussians seeded from depth
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from otsync.compute.threads import MapLike
+from otsync.files.digest import content_key
+from otsync.io import Scene
+from otsync.progress import Progress
+from otsync.types import Offsets, TrackSet, Video
+from recon.backdrop.fit import StaticFit, fit_backdrop
+from recon.footage.depth import working_depth
+from recon.footage.footage import Footage, footage_of
+from recon.motion import build_scaffold
+from recon.pipeline.intake import only
+from recon.pipeline.plan import Plan
+from recon.pipeline.track_sets import of_every_video
+from recon.scene.gaussians import Gaussians
+from recon.scene.gaussians4d import Gaussians4D, scene_arrays, scene_from_arrays
+from recon.scene.seed import moments, seed, shown_at
+
+MANY: dict[str, Any] = {"count": 700, "min_life": 10, "apart": 4.0}
+"""Tracks for a scaffold: more and shorter ones than synchronisation asks for, since every limb must have some."""
+
+
+def lifted_tracks(scene: Scene, offsets: Offsets, cache: Any, map: MapLike, progress: Progress) -> tuple[TrackSet, ...]:
+    """Tracks in space of every video that has some: by given depth, else by hull and stereo at the offsets."""
+    from otsync.recordings import routes as recordings
+
+    stages = replace(recordings.Stages(), selection=recordings.Selection(**MANY))
+    raw = recordings.track_all(scene, stages, cache, map, progress.tell)
+    flat: list[TrackSet | None] = []
+    for video, found in zip(scene.videos, raw, strict=True):
+        try:
+            flat.append(recordings.select(video, found, stages, scene.frame))
+        except ValueError:
+            flat.append(None)
+            progress.note(f"video {video.name}: nothing moves enough to be tracked; it only adds images")
+    if not any(flat):
+        raise ValueError(
+            "scene: expected something that moves; found no track that lives and moves enough in any video. Check the "
+            "masks, or choose a part of the recording with motion (--frames)."
+        )
+    out: list[TrackSet] = []
+    for v, (video, tracks) in enumerate(zip(scene.videos, flat, strict=True)):
+        if tracks is not None and video.depth is not None:
+            part = scene.take([video.name])
+            try:
+                out += recordings.lift_given(part, [raw[v]], stages, cache)
+            except ValueError as error:
+                progress.note(str(error))
+    bare = [v for v, video in enumerate(scene.videos) if video.depth is None and flat[v] is not None]
+    if bare:
+        lacking = recordings.lacks_stereo(scene, stages)
+        if lacking and not out:
+            raise ValueError(
+                f"depth: none was given for {', '.join(scene.videos[v].name for v in bare)}, and none can be measured: "
+                f"{lacking}. Add depth maps to the scene, or more static cameras."
+            )
+        if lacking:
+            progress.note(f"no tracks in space from {', '.join(scene.videos[v].name for v in bare)}: {lacking}")
+        else:
+            kept = [v for v, t in enumerate(flat) if t is not None]
+            part, sets = scene.take([scene.names[v] for v in kept]), [t for t in flat if t is not None]
+            depth = recordings.stereo_depth(part, sets, only(offsets, part.names), stages, cache, map)
+            lifted = [stages.lift(t, z) for t, z in zip(sets, depth, strict=True)]
+            out += [t for v, t in zip(kept, lifted, strict=True) if v in bare and len(t)]
+    if not out:
+        raise ValueError("depth: expected depth where things move; no track could be lifted. Check the depth or masks.")
+    return tuple(out)
+
+
+def without_depth(scene: Scene) -> set[str]:
+    """Names of videos that came without depth and for which none can be measured."""
+    from otsync.recordings.routes import Stages
+
+    static = [v.name for v in scene.videos if v.camera.w2c.ndim == 2]
+    measured = set(static) if len(static) >= Stages().stereo.min_views else set()
+    return {v.name for v in scene.videos if v.depth is None} - measured
+
+
+def read_footage(scene: Scene, width: int, cache: Any, map: MapLike, progress: Progress) -> tuple[Footage, ...]:
+    """Frames, masks and backgrounds of every video at working size."""
+    from otsync.recordings.routes import Stages
+
+    tracking = Stages().tracking
+    measured = [v.name for v, m in zip(scene.videos, scene.masks, strict=True) if m is None]
+    if measured:
+        progress.note(
+            f"no masks given for {', '.join(measured)}: what differs from the median over time counts as moving"
+        )
+
+    def one(item: tuple[Video, Any]) -> Footage:
+        video, given = item
+        return footage_of(video, tracking.masks(video, given, cache), width=width)
+
+    return tuple(map(one, list(zip(scene.videos, scene.masks, strict=True))))
+
+
+def world_footprint(tracks: Sequence[TrackSet], footage: Sequence[Footage]) -> float:
+    """World units that a working pixel covers at the median depth of what moves."""
+    focal = {f.name: float(f.K[0, 0]) for f in footage}
+    samples = []
+    for t in tracks:
+        if t.camera is None or t.name not in focal:
+            continue
+        z = t.camera.to_camera(t.positions())[..., 2]
+        samples.append(z[np.isfinite(z) & (z > 0)] / focal[t.name])
+    values = np.concatenate(samples) if samples else np.zeros(0)
+    if not len(values):
+        raise ValueError("tracks: expected tracks in space of the fitted videos, with their cameras; found none.")
+    return float(np.median(values))
+
+
+def scene_key(scene: Scene, tracks: Sequence[TrackSet]) -> tuple[Any, ...]:
+    """What the pixels, masks, poses, depth maps and tracks are, for the cache."""
+    from otsync.recordings.routes import Stages
+
+    tracking = Stages().tracking
+    rows = []
+    for video, masks in zip(scene.videos, scene.masks, strict=True):
+        c, depth = video.camera, "none"
+        if video.depth is not None:
+            own = getattr(video.depth, "digest", None)
+            depth = (
+                own() if own is not None else content_key(*[None if z is None else np.asarray(z) for z in video.depth])
+            )
+        lens = None if c.distortion is None else c.distortion
+        rows.append(content_key(tracking.key(video, masks), depth, video.times, c.K, c.w2c, lens, c.width, c.height))
+    return (*rows, *(replace(t, name="") for t in tracks))
+
+
+def backdrop_of_scene(
+    scene: Scene, tracks: Sequence[TrackSet], footage: Sequence[Footage], plan: Plan, cache: Any, progress: Progress
+) -> StaticFit | None:
+    """Static Gaussians fitted to what the cameras see behind the things that move, kept; None where nothing shows."""
+
+    def build() -> dict[str, np.ndarray]:
+        lifted = [t.positions()[t.seen] for t in tracks]
+        points = np.concatenate([p[:: max(1, len(p) // POINTS)] for p in lifted])
+        depth = [None if v.depth is None else working_depth(v, width=plan.width) for v in scene.videos]
+        found = fit_backdrop(
+            footage,
+            depth=None if all(d is None for d in depth) else depth,
+            points=points,
+            steps=plan.backdrop_steps,
+            seed=plan.seed,
+            device=plan.device,
+        )
+        parts = {n: getattr(found.gaussians, n).numpy() for n in GAUSSIAN}
+        return {**parts, "gains": found.gains, "near": np.array(found.near), "psnr": found.psnr}
+
+    key = (*scene_key(scene, tracks), plan.width, plan.backdrop_steps, plan.seed)
+    if plan.device != "cpu":  # rounds otherwise
+        key = (*key, plan.device)
+    try:
+        kept = cache.arrays("backdrop", key, build)
+    except ValueError as error:
+        progress.note(f"no static part: {error}")
+        return None
+    gaussians = Gaussians(*(torch.from_numpy(np.array(kept[n])) for n in GAUSSIAN))
+    progress.tell(f"backdrop: {len(gaussians)} Gaussians, {np.nanmean(kept['psnr']):.2f} dB")
+    return StaticFit(gaussians, kept["gains"], float(kept["near"]), kept["psnr"])
+
+
+POINTS = 2000
+"""Positions of what moves, per video, that the backdrop takes its scale from."""
+
+GAUSSIAN = ("means", "quats", "log_scales", "opacity_logits", "sh")
+
+
+def initial_scene(
+    scene: Scene,
+    offsets: Offsets,
+    tracks: tuple[TrackSet, ...],
+    footage: tuple[Footage, ...],
+    static: StaticFit | None,
+    plan: Plan,
+    cache: Any,
+    map: MapLike,
+    progress: Progress,
+) -> Gaussians4D:
+    """The scene before any refinement: a scaffold through the tracks, and what the depth maps show of it; kept."""
+    clocks = (np.round(offsets.seconds, 6).tolist(), np.round(offsets.rates, 9).tolist(), offsets.reference)
+    gains = np.ones((len(footage), 3)) if static is None else static.gains
+    key = (*scene_key(scene, tracks), clocks, gains.tolist(), plan.width, plan.scaffold, plan.seeding, plan.seed)
+
+    def build() -> dict[str, np.ndarray]:
+        built = seeded(scene, offsets, tracks, footage, gains, plan, cache, map, progress)
+        # in the layout that a file gives back: sums over another one differ in their last bits
+        return {k: np.array(v, order="C") for k, v in scene_arrays(built).items()}
+
+    found = scene_from_arrays(cache.arrays("initial", key, build))
+    progress.tell(f"initial scene: {len(found)} moving Gaussians")
+    if static is None:
+        return found
+    return replace(found, static=static.gaussians, near=static.near)
+
+
+def seeded(
+    scene: Scene,
+    offsets: Offsets,
+    tracks: tuple[TrackSet, ...],
+    footage: tuple[Footage, ...],
+    gains: np.ndarray,
+    plan: Plan,
+    cache: Any,
+    map: MapLike,
+    progress: Progress,
+) -> Gaussians4D:
+    """Build what :func:`initial_scene` keeps."""
+    from otsync.recordings.dense_depth import depth_maps
+
+    footprint = world_footprint(tracks, footage)
+    frame_step = 1.0 / float(offsets.fps[offsets.reference])
+    motion = build_scaffold(
+        of_every_video(tracks, offsets.names),
+        offsets.seconds,
+        footprint=footprint,
+        frame_step=frame_step,
+        options=plan.scaffold,
+        rates=offsets.rates,
+        seed=plan.seed,
+    )
+    progress.tell(f"scaffold: {len(motion)} nodes of {sum(len(t) for t in tracks)} tracks, footprint {footprint:.4g}")
+    worlds = [offsets.clock(v).world(f.times) for v, f in enumerate(footage)]
+    span = (float(min(t[0] for t in worlds)), float(max(t[-1] for t in worlds)))
+    times = moments(span, frame_step)
+    blind = without_depth(scene)
+    shown = zip(*(shown_at(footage, offsets, float(t), frame_step) for t in times), strict=True)
+    wanted = [
+        [] if v.name in blind else sorted({k for k in frames if k is not None})
+        for v, frames in zip(scene.videos, shown, strict=True)
+    ]
+    maps = depth_maps(scene, offsets, wanted, width=plan.width, cache=cache, map=map)
+    depth = [
+        working_depth(v, dict(zip(k, m, strict=True)).get, width=plan.width)
+        for v, k, m in zip(scene.videos, wanted, maps, strict=True)
+    ]
+    return seed(
+        motion,
+        footage,
+        offsets,
+        depth,
+        footprint=footprint,
+        frame_step=frame_step,
+        span=span,
+        times=times,
+        gains=gains,
+        options=plan.seeding,
+    )

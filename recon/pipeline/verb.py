@@ -1,0 +1,269 @@
+"""From a recording and its offsets to a 4D scene and better offsets: prepare, fit, compare, write.
+
+A run that was killed continues from its stages and its checkpoint, and ends with the same result.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from otsync.compute.threads import MapLike
+from otsync.files.arrays import write_json
+from otsync.io import Scene
+from otsync.io.mend import cut
+from otsync.progress import Progress
+from otsync.types import Clock, Offsets, TrackSet
+from recon.evaluate.figures import offset_error
+from recon.evaluate.lpips import Lpips
+from recon.evaluate.views import ViewScore, view
+from recon.fit.optimize import RATES, without
+from recon.fit.verb import Reconstruction, fit
+from recon.observe.effects import Gain, MotionBlur, common_exposure, optics, with_declared
+from recon.pipeline.intake import given_clocks, readable
+from recon.pipeline.plan import Plan
+from recon.pipeline.prepare import Prepared, prepare
+from recon.pipeline.stages import read_footage
+from recon.result.folder import FilmedBy, Result, clear_parts, metrics_of, save_run
+from recon.result.report import write_reconstruction_report
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What :func:`reconstruct` came to.
+
+    Args:
+        found: the fit. coarse: the offsets it began with, of the same videos. truth: (V,) seconds, where known.
+        views: how well every camera that was compared is shown. left_out: videos without an offset.
+    """
+
+    found: Reconstruction
+    coarse: Offsets
+    views: tuple[ViewScore, ...]
+    left_out: tuple[str, ...] = ()
+    truth: np.ndarray | None = None
+    lpips_reason: str = ""
+
+
+def reconstruct(
+    scene: Scene,
+    offsets: Offsets,
+    out: Path,
+    *,
+    plan: Plan | None = None,
+    tracks: Sequence[TrackSet] | None = None,
+    held_out: Sequence[str] = (),
+    truth: Offsets | None = None,
+    steps: int | None = None,
+    budget: float | None = None,
+    cache: Any = None,
+    map: MapLike = map,
+    progress: Progress | None = None,
+) -> Outcome:
+    """Prepare, fit, evaluate and write the result folder (see :mod:`recon.result`).
+
+    A run that was killed continues from its stages and from ``fit.npz``; given ``steps``, it ends with the same files.
+
+    Args:
+        tracks: in space, of training videos; default: tracked and lifted here.
+        truth: true offsets of at least the training videos. steps, budget: see :func:`recon.fit.fit`.
+    """
+    from otsync.files.cache import Cache
+
+    plan, progress, cache = plan or Plan(), progress or Progress(), cache or Cache(out / "stages")
+    rates = without(RATES, *plan.freeze)  # says what is wrong before the work
+    out.mkdir(parents=True, exist_ok=True)
+    clear_parts(out, out / "stages")
+    ready = prepare(scene, offsets, tracks, plan=plan, held_out=held_out, cache=cache, map=map, progress=progress)
+    true = None if truth is None else true_seconds(truth, ready.offsets)
+    effects = (*with_declared(plan.effects, [f.readout for f in ready.footage]), Gain(start=ready.gains))
+    with progress.stage("fit"):
+        found = fit(
+            ready.initial.to(plan.device),
+            ready.footage,
+            ready.offsets,
+            losses=plan.losses,
+            effects=effects,
+            rates=rates,
+            steps=steps,
+            budget=budget,
+            batch=plan.batch,
+            densify=plan.densify,
+            seed=plan.seed,
+            checkpoint=out / "fit.npz",
+            save_every=plan.save_every,
+        )
+    _write_fit(out, found)
+    with progress.stage("views"):
+        videos, scores = compared(found, ready, plan, progress)
+    outcome = Outcome(found, ready.offsets, scores, ready.left_out, true, Lpips().reason)
+    _write(out, outcome, videos, ready, plan, progress)
+    return outcome
+
+
+def compared(
+    found: Reconstruction, ready: Prepared, plan: Plan, progress: Progress
+) -> tuple[tuple[FilmedBy, ...], tuple[ViewScore, ...]]:
+    """Every camera on the fitted scene, and how well the held-out ones and some of the others are shown.
+
+    A camera that cannot be placed or scored is noted and left out: it shall not cost the fit.
+    """
+    gains = found.parameters["gain"].detach().cpu().numpy().astype(float)
+    clocks = [
+        Clock(float(s), float(r), "fitted") for s, r in zip(found.offsets.seconds, found.offsets.rates, strict=True)
+    ]
+    videos = [FilmedBy.of(f, clocks[n], gains[n]) for n, f in enumerate(ready.footage)]
+    scores = []
+    for footage in ready.held_out:
+        try:
+            looking = view(
+                found.scene,
+                footage,
+                ready.clocks.get(footage.name),
+                layered=ready.layered,
+                optics=optics(plan.effects, footage.readout),
+            )
+            scores.append(looking.score(most=plan.views))
+        except ValueError as error:
+            progress.note(f"held-out video {footage.name} is not compared: {error}")
+        else:
+            videos.append(FilmedBy.of(footage, looking.clock, looking.gain, held_out=True))
+    for n in _some(len(ready.footage), SHOWN_TRAINING):
+        footage = ready.footage[n]
+        try:
+            looking = view(
+                found.scene,
+                footage,
+                clocks[n],
+                gain=gains[n],
+                layered=ready.layered,
+                optics=optics(plan.effects, footage.readout, n),
+            )
+            scores.append(looking.score(most=max(1, plan.views // 4), held_out=False))
+        except ValueError as error:
+            progress.note(f"video {footage.name} is not compared: {error}")
+    return tuple(videos), tuple(scores)
+
+
+SHOWN_TRAINING = 2
+"""Training cameras that are compared as well, to show what the held-out ones lack."""
+
+
+def _some(count: int, most: int) -> list[int]:
+    return sorted({int(i) for i in np.linspace(0, count - 1, min(count, most)).round()})
+
+
+def _write_fit(out: Path, found: Reconstruction) -> None:
+    """Scene and clocks, before anything is done with them that may fail.
+
+    ``run.json`` of an earlier run goes first: from here until the new one is written the folder is not finished, so
+    that a kill cannot leave the old cameras beside the new scene.
+    """
+    (out / "run.json").unlink(missing_ok=True)
+    found.scene.save(out / "scene.npz")
+    found.offsets.save(out / "offsets.json")
+
+
+def _write(
+    out: Path, outcome: Outcome, videos: Sequence[FilmedBy], ready: Prepared, plan: Plan, progress: Progress
+) -> None:
+    """The rest of the result folder; run.json last but for the report, since with it the folder counts as finished."""
+    found = outcome.found
+    metrics = metrics_of(outcome.views, found.stats, outcome.lpips_reason)
+    if outcome.truth is not None:
+        metrics["offset_error"] = offset_figures(found.offsets, outcome.truth)
+    write_json(out / "metrics.json", metrics)
+    options = {
+        "width": plan.width,
+        "frames": plan.frames,
+        "seed": plan.seed,
+        "freeze": list(plan.freeze),
+        "layered": ready.layered,
+        "exposure": common_exposure(plan.effects),
+    }
+    save_run(
+        out,
+        videos,
+        options=options,
+        frame=ready.frame,
+        notes=progress.notes,
+        seconds=progress.seconds,
+    )
+    write_reconstruction_report(
+        out / "report.html",
+        found,
+        outcome.coarse,
+        [f.name for f in ready.footage],
+        outcome.views,
+        seconds=progress.seconds,
+        notes=progress.notes,
+        truth=outcome.truth,
+        lpips_reason=outcome.lpips_reason,
+    )
+
+
+def offset_figures(offsets: Offsets, true: np.ndarray) -> dict[str, Any]:
+    """Mean and largest absolute error in frames, relative to the reference; None where there is no other video."""
+    step = 1.0 / float(offsets.fps[offsets.reference])
+    error = offset_error(offsets.seconds, true, step, reference=offsets.reference)
+    alone = len(error.errors) < 2
+    return {
+        "mean_frames": None if alone else error.mean,
+        "max_frames": None if alone else error.max,
+        "frames": [float(e) for e in error.errors],
+    }
+
+
+def true_seconds(truth: Offsets, offsets: Offsets) -> np.ndarray:
+    """True offsets of the videos relative to their reference. ValueError names those that the truth lacks."""
+    missing = [n for n in offsets.names if n not in truth.names]
+    if missing:
+        raise ValueError(f"truth: expected offsets of {', '.join(offsets.names)}; {', '.join(missing)} are not in it.")
+    seconds = np.array([truth.seconds[truth.names.index(n)] for n in offsets.names])
+    return seconds - seconds[offsets.reference]
+
+
+def evaluate(
+    result: Result,
+    scene: Scene,
+    names: Sequence[str],
+    offsets: Offsets | None = None,
+    *,
+    most: int = 50,
+    lpips_weights: Path | None = None,
+    cache: Any = None,
+    map: MapLike = map,
+    progress: Progress | None = None,
+) -> tuple[tuple[ViewScore, ...], str]:
+    """Scores of the named cameras against a finished result, and why LPIPS is missing ("" when it is not).
+
+    Clocks: as ``offsets`` say, else those of the result, else found on the frozen scene. Views are through the shutters
+    that the scene's cameras declare and the exposure that the result was fitted with, where all cameras had the same.
+    """
+    from otsync.files.cache import Cache
+
+    progress, cache = progress or Progress(), cache or Cache()
+    lpips = Lpips.load(lpips_weights)
+    part = scene.take(names)
+    frames = result.options.get("frames")
+    if frames is not None:
+        part = cut(part, int(frames[0]), int(frames[1]))
+    part = readable(part, cache, map, progress)
+    known = {v.name: v for v in result.videos}
+    scores = []
+    exposure = float(result.options.get("exposure", 0.0))
+    blur = (MotionBlur(exposure),) if exposure else ()
+    for footage in read_footage(part, int(result.options["width"]), cache, map, progress):
+        own = known.get(footage.name)
+        clock, gain = (None, None) if own is None else (own.clock, own.gain)
+        if offsets is not None and (own is None or own.held_out):
+            clock = given_clocks(offsets).get(footage.name, clock)
+        looking = view(
+            result.scene, footage, clock, gain=gain, layered=result.layered, optics=optics(blur, footage.readout)
+        )
+        scores.append(looking.score(most=most, lpips=lpips, held_out=own is None or own.held_out))
+    return tuple(scores), lpips.reason

@@ -1,0 +1,91 @@
+"""A 4D scene as files that other tools read: 3DGS .ply at a moment or as a sequence, .splat, plain arrays, tracks.
+
+No public format stores splined motion: a sequence of .ply is what every viewer of 3DGS can play. ``.npz`` keeps
+everything and is read back by :meth:`Gaussians4D.load`; the dense trajectories are an ordinary otsync track set.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+
+from otsync.files.arrays import write_json
+from otsync.types import TrackSet
+from recon.scene.gaussians4d import Gaussians4D
+from recon.scene.ply import save_ply, save_splat
+
+Format = Literal["ply", "ply-sequence", "splat", "checkpoint", "tracks"]
+
+MAX_FRAMES = 100_000
+"""Frames of one export; more is a wrong unit of time rather than a wish."""
+
+
+def frame_times(scene: Gaussians4D, fps: float | None = None) -> np.ndarray:
+    """World seconds (T,) of the frames over the scene's span, ``fps`` a second; default: the reference's own frames."""
+    if fps is not None and not (np.isfinite(fps) and fps > 0):
+        raise ValueError(f"fps: expected frames per second above 0; found {fps}.")
+    step = scene.frame_step if fps is None else 1.0 / fps
+    count = int((scene.span[1] - scene.span[0]) / step + 1e-6) + 1
+    if count > MAX_FRAMES:
+        raise ValueError(
+            f"fps: expected at most {MAX_FRAMES} frames; the span {scene.span} at {1 / step:g} has {count}."
+        )
+    return scene.span[0] + step * np.arange(count)
+
+
+def check_times(scene: Gaussians4D, times: Sequence[float]) -> None:
+    """ValueError for world seconds that the videos do not cover by more than a frame: nothing was seen there."""
+    low, high = scene.span[0] - scene.frame_step, scene.span[1] + scene.frame_step
+    beyond = [float(t) for t in times if not low <= t <= high]
+    if beyond:
+        raise ValueError(
+            f"times: expected world seconds in {scene.span[0]:.3f} to {scene.span[1]:.3f}, which the videos cover; "
+            f"found {beyond[0]:g}."
+        )
+
+
+def export_ply_sequence(scene: Gaussians4D, times: Sequence[float], folder: str | os.PathLike[str]) -> None:
+    """``00000.ply``, ``00001.ply``, ... (3DGS) at world ``times``, and ``frames.json`` with the seconds of each."""
+    folder = Path(folder)
+    names = [f"{n:05d}.ply" for n in range(len(times))]
+    stale = sorted({p.name for p in folder.glob("*.ply")} - set(names))
+    if stale:
+        raise ValueError(f"{folder}: expected a folder without another sequence; it holds {stale[0]}. Choose another.")
+    for name, t in zip(names, times, strict=True):
+        save_ply(scene.at(float(t)), folder / name)
+    frames = [{"file": name, "seconds": float(t)} for name, t in zip(names, times, strict=True)]
+    write_json(folder / "frames.json", {"format": "otsync.ply_sequence", "version": 1, "frames": frames})
+
+
+def scene_tracks(scene: Gaussians4D, times: Sequence[float], name: str = "scene", frame: str = "world") -> TrackSet:
+    """The trajectories of all moving Gaussians at world ``times`` as a track set on the world's clock.
+
+    frame: name of the world frame that the recording declares. Features are the Gaussians' own, where lifted.
+    """
+    features = None if scene.features is None else scene.features.detach().cpu().numpy()
+    return TrackSet(scene.tracks(times), features=features, timestamps=np.asarray(times, float), name=name, frame=frame)
+
+
+def export(
+    scene: Gaussians4D, kind: Format, out: str | os.PathLike[str], times: Sequence[float], frame: str = "world"
+) -> None:
+    """Write ``scene`` in one of the formats; ply and splat hold one moment, so ``times`` has one entry for them."""
+    if kind not in get_args(Format):
+        raise ValueError(f"format: expected one of {', '.join(get_args(Format))}; found {kind!r}.")
+    if kind != "checkpoint":
+        check_times(scene, times)
+    if kind in ("ply", "splat"):
+        if len(times) != 1:
+            raise ValueError(f"times: expected one moment for {kind}; found {len(times)}. Use ply-sequence for more.")
+        save: Callable = save_ply if kind == "ply" else save_splat
+        save(scene.at(float(times[0])), out)
+    elif kind == "ply-sequence":
+        export_ply_sequence(scene, times, out)
+    elif kind == "checkpoint":
+        scene.save(out)
+    else:
+        scene_tracks(scene, times, frame=frame).save(out)

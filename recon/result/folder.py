@@ -1,0 +1,250 @@
+"""The folder that a reconstruction is kept in, and reading it back.
+
+scene.npz      the 4D scene          offsets.json   the refined clocks
+run.json       cameras, clocks and colour gains of every video, options, wall times, notes
+metrics.json   figures of the views  report.html    all of it to look at
+fit.npz        where the fit stood   stages/        what led there, from which a killed run continues
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+
+from otsync.files.arrays import read_json, write_json
+from otsync.types import Camera, Clock, Offsets
+from otsync.types.clock import Source
+from recon.evaluate.views import ViewScore
+from recon.footage.footage import Footage
+from recon.scene.gaussians4d import Gaussians4D
+
+FORMAT, VERSION = "otsync.reconstruction", 1
+MAX_VIDEOS = 10_000
+MAX_SIDE, MAX_PIXELS = 16_384, 2**26
+"""Of one image: what a foreign run.json, or a wish for a width, may ask memory for."""
+
+
+@dataclass(frozen=True, eq=False)
+class FilmedBy:
+    """One video's camera as the reconstruction knows it.
+
+    Args:
+        camera: at working size, without distortion. gain: factors of R, G, B from the scene's colours to its images.
+        clock: its place in world time. times: (T,) seconds of its frames on its own clock.
+    """
+
+    name: str
+    camera: Camera
+    clock: Clock
+    gain: np.ndarray
+    times: np.ndarray
+    held_out: bool = False
+
+    @classmethod
+    def of(cls, footage: Footage, clock: Clock, gain: np.ndarray, held_out: bool = False) -> FilmedBy:
+        return cls(footage.name, footage.camera, clock, gain, footage.times, held_out)
+
+    def pose(self, t: float) -> np.ndarray:
+        """w2c (4,4) at world second ``t``: of the nearest frame where the camera moves."""
+        if self.camera.w2c.ndim == 2:
+            return self.camera.w2c
+        world = self.clock.world(self.times)
+        return self.camera.w2c[int(np.argmin(np.abs(world - t)))]
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """What :func:`load_result` reads: all that rendering, evaluation and export need."""
+
+    scene: Gaussians4D
+    offsets: Offsets
+    videos: tuple[FilmedBy, ...]
+    options: dict[str, Any] = field(default_factory=dict)
+    frame: str = "world"
+
+    @property
+    def layered(self) -> bool:
+        """Whether the fit drew what moves over what is static; see :class:`recon.held_out.View`."""
+        return bool(self.options.get("layered", True))
+
+    def video(self, name: str) -> FilmedBy:
+        """The named video. ValueError lists what there is."""
+        for one in self.videos:
+            if one.name == name:
+                return one
+        raise ValueError(f"camera: expected one of {', '.join(v.name for v in self.videos)}; found {name!r}.")
+
+
+def save_run(
+    folder: Path,
+    videos: Sequence[FilmedBy],
+    *,
+    options: Mapping[str, Any],
+    frame: str,
+    notes: Sequence[str],
+    seconds: Mapping[str, float],
+) -> None:
+    """Write ``run.json``."""
+    rows = []
+    for v in videos:
+        c = v.camera
+        camera = {"K": c.K.tolist(), "w2c": c.w2c.tolist(), "width": c.width, "height": c.height, "readout": c.readout}
+        clock = {"offset_seconds": v.clock.offset, "rate": v.clock.rate, "known": v.clock.how}
+        rows.append(
+            {
+                "name": v.name,
+                "held_out": v.held_out,
+                "camera": camera,
+                "clock": clock,
+                "gain": [float(g) for g in v.gain],
+                "times": v.times.tolist(),
+            }
+        )
+    document = {
+        "format": FORMAT,
+        "version": VERSION,
+        "frame": frame,
+        "options": dict(options),
+        "videos": rows,
+        "notes": list(notes),
+        "seconds": {k: round(float(s), 2) for k, s in seconds.items()},
+    }
+    write_json(folder / "run.json", document)
+
+
+def metrics_of(views: Sequence[ViewScore], stats: Mapping[str, float], lpips_reason: str = "") -> dict[str, Any]:
+    """The content of ``metrics.json``: nothing in it depends on wall time, so that equal fits give equal files."""
+
+    def plain(figures: Mapping[str, float]) -> dict[str, float | None]:
+        return {k: float(v) if math.isfinite(v) else None for k, v in figures.items()}
+
+    rows = [
+        {
+            "name": v.name,
+            "held_out": v.held_out,
+            "frames": len(v.frames),
+            "clock": v.clock.how,
+            "offset_seconds": v.clock.offset,
+            "gain": [float(g) for g in v.gain],
+            **plain(v.mean),
+        }
+        for v in views
+    ]
+    held = [v for v in views if v.held_out]
+    names = ("psnr", "ssim", "lpips", "mask_psnr", "mask_ssim")
+    means = {}
+    for name in names:
+        known = [v.mean[name] for v in held if math.isfinite(v.mean.get(name, math.nan))]
+        means[name] = float(np.mean(known)) if known else None
+    document = {"format": "otsync.metrics", "version": 1, "held_out": means, "views": rows}
+    document["fit"] = plain({k: v for k, v in stats.items() if k != "seconds"})
+    if lpips_reason:
+        document["lpips"] = lpips_reason
+    return document
+
+
+def load_result(folder: str | os.PathLike[str]) -> Result:
+    """Read a result folder. ValueError and FileNotFoundError name the file that is missing or unsound."""
+    folder = Path(folder)
+    if not (folder / "run.json").is_file():
+        raise FileNotFoundError(
+            f"{folder}: expected a finished reconstruction (run.json, scene.npz, offsets.json); found none. "
+            "Run: recon fit SCENE --offsets offsets.json --out FOLDER"
+        )
+    document = read_json(folder / "run.json")
+    if not isinstance(document, dict) or document.get("format") != FORMAT or document.get("version") != VERSION:
+        raise ValueError(f"{folder / 'run.json'}: expected format {FORMAT!r}, version {VERSION}; found another.")
+    try:
+        rows = document["videos"]
+        if not isinstance(rows, list) or not 1 <= len(rows) <= MAX_VIDEOS:
+            raise ValueError(f"expected 1 to {MAX_VIDEOS} videos")
+        videos = tuple(_filmed_by(row) for row in rows)
+        options, frame = _options(document["options"]), str(document["frame"])
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
+        raise ValueError(
+            f"{folder / 'run.json'}: not a sound reconstruction; {type(error).__name__}: {error}. Run the fit again."
+        ) from None
+    scene, offsets = Gaussians4D.load(folder / "scene.npz"), Offsets.load(folder / "offsets.json")
+    return Result(scene, offsets, videos, options, frame)
+
+
+def _options(found: dict[str, Any]) -> dict[str, Any]:
+    """What the fit was told, as far as evaluation needs it. ValueError for no width, range of frames or exposure."""
+    options = dict(found)
+    if type(options["width"]) is not int or not 1 <= options["width"] <= MAX_SIDE:
+        raise ValueError(f"options.width: expected 1 to {MAX_SIDE} pixels; found {options['width']!r}")
+    frames = options.get("frames")
+    if frames is not None and not (
+        isinstance(frames, list)
+        and len(frames) == 2
+        and all(type(k) is int for k in frames)
+        and 0 <= frames[0] < frames[1]
+    ):
+        raise ValueError(f"options.frames: expected null, or first and last frame; found {frames!r}")
+    exposure = options.get("exposure", 0.0)
+    if type(exposure) not in (int, float) or not 0 <= exposure < math.inf:
+        raise ValueError(f"options.exposure: expected seconds of 0 or more; found {exposure!r}")
+    return options
+
+
+def check_size(width: int, height: int) -> None:
+    """ValueError for images that nobody renders and no memory holds."""
+    if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE and width * height <= MAX_PIXELS):
+        raise ValueError(
+            f"width, height: expected 1 to {MAX_SIDE} pixels each and {MAX_PIXELS} in all; found {width} x {height}."
+        )
+
+
+def clear_parts(*folders: Path) -> None:
+    """Remove the unfinished files that killed writers left in ``folders`` (see :func:`otsync.files.atomic_write`).
+
+    Those of processes that still live stay: another run may be writing there.
+    """
+    if os.name != "posix":  # elsewhere a process cannot be asked for without harming it
+        return
+    for part in (p for folder in folders for p in folder.glob(".*.part")):
+        pid = part.name.removesuffix(".part").rpartition(".")[2].partition("-")[0]
+        if pid.isdecimal() and not _lives(int(pid)):
+            part.unlink(missing_ok=True)
+
+
+def _lives(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        pass
+    return True
+
+
+def _filmed_by(row: dict[str, Any]) -> FilmedBy:
+    c = row["camera"]
+    check_size(int(c["width"]), int(c["height"]))
+    readout = None if c["readout"] is None else float(c["readout"])
+    camera = Camera(
+        np.array(c["K"], float), np.array(c["w2c"], float), int(c["width"]), int(c["height"]), None, readout
+    )
+    seconds, rate, how = (row["clock"][k] for k in ("offset_seconds", "rate", "known"))
+    clock = Clock(float(seconds), float(rate), how)
+    if (
+        how not in get_args(Source)
+        or not math.isfinite(clock.offset)
+        or not (math.isfinite(clock.rate) and clock.rate > 0)
+    ):
+        raise ValueError(
+            f"clock: expected seconds, a rate above 0, known {' or '.join(get_args(Source))}; found {row['clock']}"
+        )
+    gain = np.array(row["gain"], float)
+    if gain.shape != (3,) or not np.isfinite(gain).all():
+        raise ValueError(f"gain: expected three numbers; found {row['gain']!r}")
+    times = np.array(row["times"], float)
+    if times.ndim != 1 or not len(times) or (camera.w2c.ndim == 3 and len(times) != len(camera.w2c)):
+        raise ValueError(f"times: expected one second per frame; found shape {times.shape}")
+    return FilmedBy(str(row["name"]), camera, clock, gain, times, bool(row["held_out"]))

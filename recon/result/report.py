@@ -1,0 +1,219 @@
+"""The page of a reconstruction: what came out, how the fit got there, and pictures beside what was filmed.
+
+One self-contained HTML file without a script, in the style of the synchronisation report.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import Mapping, Sequence
+from html import escape
+
+import numpy as np
+
+from otsync.report.figures import CHOSEN, GREY, axes_of, svg
+from otsync.report.frames import inline_image
+from otsync.report.page import number, status_words, write_page
+from otsync.types import Offsets
+from recon.evaluate.views import ViewScore
+from recon.fit.verb import History, Reconstruction
+
+SHOWN_VIEWS = 2
+"""Cameras whose pictures are shown; all stand in the table."""
+
+PICTURE = 240
+"""Width of a picture, pixels: nine of them are about 60 kB."""
+
+HOW = {"given": "as given", "found": "found on the frozen scene", "fitted": "fitted with the scene"}
+
+
+def write_reconstruction_report(
+    path: str | os.PathLike[str],
+    found: Reconstruction,
+    coarse: Offsets,
+    videos: Sequence[str],
+    views: Sequence[ViewScore],
+    *,
+    seconds: Mapping[str, float] | None = None,
+    notes: Sequence[str] = (),
+    truth: np.ndarray | None = None,
+    lpips_reason: str = "",
+) -> None:
+    """Write the page, atomically.
+
+    Args:
+        coarse: the offsets that the fit began with; same videos as ``found.offsets``.
+        videos: names of those that took part in the fit, in its order.
+        views: held-out cameras, and training ones to compare with.
+        seconds: wall time of every stage. notes: what was lacking or assumed, in words.
+        truth: (V,) true offsets in seconds relative to the reference, where they are known.
+    """
+    parts = [
+        "<h1>Reconstruction</h1>",
+        f"<p>{_verdict(found, views)}</p>",
+        "".join(f"<p class=no>{escape(note)}</p>" for note in notes),
+        "<h2>Offsets</h2>",
+        _offset_rows(found, coarse, truth),
+        "<p class=s>In frames of the reference. Before: what the fit began with. Moved: after the common shift of all "
+        "videos, which images cannot tell, is taken out. t<sub>world</sub> = rate · t<sub>video</sub> + offset.</p>",
+        f"<h2>Convergence</h2><p class=s>{_pace(found)}</p>",
+        convergence(found, coarse, videos, truth),
+        "<h2>Views</h2>",
+        _view_rows(views, lpips_reason),
+        views_over_time(views) if any(len(v.frames) > 1 for v in views) else "",
+        *_pictures(views),
+        "<h2>Numbers</h2>",
+        _numbers(found, seconds or {}),
+    ]
+    write_page(path, "Reconstruction", parts)
+
+
+def _verdict(found: Reconstruction, views: Sequence[ViewScore]) -> str:
+    held = [v for v in views if v.held_out]
+    text = f"<b>{len(found.offsets)} videos, {len(found.scene)} moving Gaussians"
+    if found.scene.static is not None:
+        text += f", {len(found.scene.static)} static"
+    text += ".</b> "
+    if held:
+        mean = {
+            k: float(np.nanmean([v.mean[k] for v in held]))
+            for k in ("psnr", "mask_psnr")
+            if not all(np.isnan(v.mean[k]) for v in held)
+        }
+        text += f"Held-out cameras: {number(mean.get('psnr', np.nan), 2)} dB"
+        text += f", {number(mean['mask_psnr'], 2)} dB where things move." if "mask_psnr" in mean else "."
+    else:
+        text += "No camera was held out: the figures below are of cameras that the fit has seen."
+    return text
+
+
+def _offset_rows(found: Reconstruction, coarse: Offsets, truth: np.ndarray | None) -> str:
+    offsets = found.offsets
+    head = "<th>video<th>before<th>after<th>± sigma<th>moved" + ("<th>true<th>error" if truth is not None else "")
+    rows = []
+    for v, name in enumerate(offsets.names):
+        fps = offsets.fps[offsets.component[v]]
+        cells = [coarse.frames[v], offsets.frames[v], offsets.sigma[v] * fps, offsets.frames[v] - coarse.frames[v]]
+        if truth is not None:
+            cells += [truth[v] * fps, offsets.frames[v] - truth[v] * fps]
+        tail = "reference" if v == offsets.reference else status_words(offsets.status[v], offsets.flags[v])
+        rows.append(
+            f"<tr><td>{escape(name)}" + "".join(f"<td>{number(float(x), 3)}" for x in cells) + f"<td class=t>{tail}"
+        )
+    return f"<div class=scroll><table><tr>{head}<th class=t>status before the fit{''.join(rows)}</table></div>"
+
+
+def convergence(found: Reconstruction, coarse: Offsets, videos: Sequence[str], truth: np.ndarray | None = None) -> str:
+    """Left: every camera's offset against steps, relative to the reference. Right: PSNR of the training boxes."""
+    history, step = found.history, found.scene.frame_step
+    figure, (left, right) = axes_of(7.2, 2.7, 2)
+    if len(history.step):
+        for name, curve, is_reference in offset_curves(history, coarse, videos, truth):
+            color = GREY if is_reference else None
+            left.plot(history.step, curve / step, lw=1, color=color, label=name)
+        left.axhline(0, color="black", lw=0.5)
+        left.set(xlabel="step", ylabel="error, frames" if truth is not None else "moved, frames")
+        if len(history.offsets.T) <= 12:
+            left.legend(fontsize=5, ncols=2)
+        known = np.isfinite(history.psnr)
+        right.plot(history.step[known], history.psnr[known], color=CHOSEN, lw=1)
+        right.set(xlabel="step", ylabel="PSNR of training boxes, dB")
+    return svg(figure, "offsets and PSNR over the fit")
+
+
+def _pace(found: Reconstruction) -> str:
+    # a fit that was continued knows the time of its sessions one by one: the longest is what it took, about
+    seconds = max([found.stats.get("seconds", 0.0), *found.history.seconds.tolist()])
+    text = f"{found.stats.get('steps', 0.0):.0f} steps" + (f", {seconds:.1f} s" if seconds >= 0.1 else "")
+    return text + ". Left: relative to the reference. Right: mean over the images since the last point."
+
+
+def offset_curves(
+    history: History, coarse: Offsets, videos: Sequence[str], truth: np.ndarray | None
+) -> list[tuple[str, np.ndarray, bool]]:
+    """(name, (R,) seconds relative to the reference, whether it is the reference) of every video that was fitted.
+
+    Against the truth where it is known, else against where the fit began.
+    """
+    index = [coarse.names.index(name) for name in videos]
+    zero = coarse.seconds if truth is None else truth
+    reference = videos.index(coarse.names[coarse.reference]) if coarse.names[coarse.reference] in videos else 0
+    moved = history.offsets - zero[index]
+    moved = moved - moved[:, [reference]]
+    return [(name, moved[:, v], v == reference) for v, name in enumerate(videos)]
+
+
+def _view_rows(views: Sequence[ViewScore], lpips_reason: str) -> str:
+    if not views:
+        return "<p class=s>No view was compared.</p>"
+    names = {
+        "psnr": ("PSNR", 2),
+        "ssim": ("SSIM", 4),
+        "lpips": ("LPIPS", 4),
+        "mask_psnr": ("PSNR, moving", 2),
+        "mask_ssim": ("SSIM, moving", 4),
+    }
+    rows = []
+    for v in views:
+        cells = "".join(f"<td>{number(v.mean.get(key, np.nan), digits)}" for key, (_, digits) in names.items())
+        gain = " ".join(f"{g:.3f}" for g in v.gain)
+        role = "held out" if v.held_out else "training"
+        rows.append(
+            f"<tr><td>{escape(v.name)}<td class=t>{role}{cells}<td>{len(v.frames)}<td style='white-space:nowrap'>{gain}<td class=t>{HOW[v.clock.how]}"
+        )
+    head = "".join(f"<th>{title}" for title, _ in names.values())
+    missing = f" LPIPS: {escape(lpips_reason)}." if lpips_reason else ""
+    return (
+        f"<div class=scroll><table><tr><th>camera<th class=t>role{head}<th>frames<th>gain R G B<th class=t>clock"
+        f"{''.join(rows)}</table></div><p class=s>Nothing of the cameras' own pictures is shown: static Gaussians, "
+        f"and over them what moves. The gain comes from what is static.{missing}</p>"
+    )
+
+
+def views_over_time(views: Sequence[ViewScore]) -> str:
+    """PSNR of every compared frame: the whole image, and where things move (dashed)."""
+    figure, ax = axes_of(7.2, 2.3)
+    for n, v in enumerate(views):
+        color = f"C{n % 10}" if v.held_out else GREY
+        for key, style in (("psnr", "-"), ("mask_psnr", "--")):
+            values = np.array([frame[key] for frame in v.frames])
+            if np.isfinite(values).any():
+                ax.plot(v.times, values, style, lw=1, color=color, label=v.name if style == "-" else None)
+    ax.set(xlabel="world seconds (dashed: what moves)", ylabel="PSNR, dB")
+    if len(views) <= 10:
+        ax.legend(fontsize=6, ncols=2)
+    return svg(figure, "PSNR over time")
+
+
+def _pictures(views: Sequence[ViewScore]) -> list[str]:
+    """Rendered, filmed, and their difference four times, of the first cameras; what is missing where there are none."""
+    try:
+        from PIL import Image
+    except ModuleNotFoundError:  # a report without pictures is better than none
+        return ["<p class=s>No pictures: they need pillow; pip install 'otsync[video]'.</p>"]
+    parts = []
+    for v in [v for v in views if v.pictures][:SHOWN_VIEWS]:
+        rows = []
+        for rendered, filmed in v.pictures:
+            apart = np.clip(4 * np.abs(rendered.astype(int) - filmed), 0, 255).astype(np.uint8)
+            height = max(1, round(PICTURE * filmed.shape[0] / filmed.shape[1]))
+            size, box = (PICTURE, height), Image.Resampling.BOX
+            cells = [np.asarray(Image.fromarray(x).resize(size, box)) for x in (rendered, filmed, apart)]
+            rows.append(np.concatenate(cells, 1))
+        parts.append(f"<p>{escape(v.name)}: rendered, filmed, four times their difference</p>")
+        parts.append(inline_image(np.concatenate(rows), f"{v.name} rendered and filmed"))
+    return parts
+
+
+def _numbers(found: Reconstruction, seconds: Mapping[str, float]) -> str:
+    from otsync import __version__
+
+    stages = "".join(f"<tr><td>{escape(k)}<td>{v:.1f} s" for k, v in seconds.items())
+    stats = "".join(f"<tr><td>{escape(k)}<td>{v:.5g}" for k, v in found.stats.items())
+    knots = found.scene.motion.parameters().get("knots")
+    nodes = "" if knots is None else f"<tr><td>scaffold nodes<td>{knots.shape[1]}<tr><td>knots<td>{knots.shape[0]}"
+    return (
+        f"<table>{stages}</table><table>{stats}{nodes}</table>"
+        f"<p class=s>otsync {__version__}, Python {platform.python_version()}, {platform.machine()}.</p>"
+    )

@@ -1,0 +1,75 @@
+"""Rendered images to a video file or a folder of PNG files."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+
+CONTAINERS = {".mp4": "mp4", ".mov": "mov", ".mkv": "matroska"}
+
+
+def check_target(out: Path) -> None:
+    """ValueError, before any rendering, for a target that :func:`write_images` would not know how to write."""
+    if out.suffix and out.suffix.lower() not in CONTAINERS:
+        raise ValueError(f"{out}: expected {', '.join(CONTAINERS)}, or a folder for PNG frames; found {out.suffix}.")
+    if not out.suffix and out.is_file():
+        raise ValueError(f"{out}: expected a folder for PNG frames; found a file. Choose another place.")
+
+
+def write_images(images: Iterable[UInt8[np.ndarray, "h w 3"]], out: str | os.PathLike[str], fps: float = 30.0) -> int:
+    """Write RGB images of one size as they come; how many there were.
+
+    ``out`` with the suffix of a container: H.264 at ``fps``, an odd last row or column left out; otherwise a folder
+    that receives ``00000.png``, ... A video appears under its name only when it is complete.
+    """
+    out = Path(out)
+    check_target(out)
+    return _video(images, out, fps) if out.suffix else _frames(images, out)
+
+
+def _frames(images: Iterable[np.ndarray], folder: Path) -> int:
+    from PIL import Image
+
+    from otsync.files.arrays import atomic_write
+
+    count = 0
+    for image in images:
+        with atomic_write(folder / f"{count:05d}.png") as stream:
+            Image.fromarray(image).save(stream, "PNG")
+        count += 1
+    return count
+
+
+def _video(images: Iterable[np.ndarray], out: Path, fps: float) -> int:
+    import av
+
+    if not (np.isfinite(fps) and fps > 0):
+        raise ValueError(f"fps: expected frames per second above 0; found {fps}.")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    part = out.with_name(f".{out.name}.{os.getpid()}.part")
+    count = 0
+    try:
+        with av.open(str(part), "w", format=CONTAINERS[out.suffix.lower()]) as video:
+            stream = None
+            for image in images:
+                even = image[: image.shape[0] // 2 * 2, : image.shape[1] // 2 * 2]
+                if stream is None:
+                    rate = Fraction(fps).limit_denominator(60_000)
+                    stream = video.add_stream("libx264", rate=rate, options={"crf": "18"})
+                    stream.height, stream.width, stream.pix_fmt = *even.shape[:2], "yuv420p"
+                frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24")
+                video.mux(stream.encode(frame))
+                count += 1
+            if stream is None:
+                raise ValueError(f"{out}: expected at least one image to write; got none.")
+            video.mux(stream.encode())
+        os.replace(part, out)
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
+    return count

@@ -1,0 +1,196 @@
+"""A scene of moving and static Gaussians that can be asked for any instant of world time."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from otsync.files.arrays import read_npz, write_npz
+from otsync.types import Camera
+from recon.motion import Motion, motion_from_arrays
+from recon.motion.arrays import numbers
+from recon.raster import Rendering
+from recon.scene.device import device_of
+from recon.scene.gaussians import Gaussians
+
+FORMAT, VERSION = "otsync.scene4d", 1
+
+UNSOUND = (
+    KeyError,
+    IndexError,
+    TypeError,
+    AttributeError,
+    OverflowError,
+    RecursionError,
+    json.JSONDecodeError,
+    UnicodeDecodeError,
+)
+"""What a stranger's header raises, apart from ValueError: JSON of other types, of other lengths, too deep or too large."""
+
+
+@dataclass(frozen=True, eq=False)
+class Gaussians4D:
+    """Dynamic Gaussians that a motion carries, and static ones that never meet it.
+
+    Args:
+        dynamic: N Gaussians; means and quats are those of the rest pose that the motion binds them to.
+        motion: a Scaffold, PerGaussian or Static, which carries rest poses to any world time.
+        footprint: world units that one working pixel covers at the median depth of what moves: the unit of every
+            length in losses and learning rates, so that a scene in millimetres fits as one in metres does.
+        frame_step: seconds of one frame of the reference.
+        span: (first, last) world seconds that the videos cover.
+        static: S Gaussians, or None.
+        near: distance along z, world units, below which nothing static is drawn: a backdrop just in front of a
+            camera that it was not fitted to would hide the scene.
+        features: (N,D) time-invariant features of the dynamic Gaussians, or None.
+    """
+
+    dynamic: Gaussians
+    motion: Motion
+    footprint: float
+    frame_step: float
+    span: tuple[float, float]
+    static: Gaussians | None = None
+    near: float = 0.01
+    features: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("footprint", "frame_step"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0):
+                raise ValueError(f"{name}: expected a positive number, got {value}")
+        if not (math.isfinite(self.near) and self.near >= 0):
+            raise ValueError(f"near: expected a distance of 0 or more, got {self.near}")
+        if not (len(self.span) == 2 and all(map(math.isfinite, self.span)) and self.span[0] <= self.span[1]):
+            raise ValueError(f"span: expected (first, last) world seconds in order, got {self.span}")
+
+    def __len__(self) -> int:
+        return len(self.dynamic)
+
+    def moving(self, t: Tensor | float, clocks: Tensor | None = None) -> Gaussians:
+        """The dynamic Gaussians at world time ``t`` (seconds), differentiable in it."""
+        means, quats = self.motion.warp(self.dynamic.means, self.dynamic.quats, as_time(t), clocks)
+        return replace(self.dynamic, means=means, quats=quats)
+
+    def at(self, t: Tensor | float, clocks: Tensor | None = None) -> Gaussians:
+        """All Gaussians at world time ``t`` (seconds): dynamic first, then static."""
+        moving = self.moving(t, clocks)
+        return moving if self.static is None else join(moving, self.static)
+
+    def to(self, device: torch.device | str) -> Gaussians4D:
+        """The same scene on "cpu", or on a GPU ("cuda"): a fit of it then runs there. ValueError where there is none."""
+        device = device_of(device)
+        return replace(
+            self,
+            dynamic=self.dynamic.to(device),
+            motion=self.motion.to(device),
+            static=None if self.static is None else self.static.to(device),
+            features=None if self.features is None else self.features.to(device),
+        )
+
+    def tracks(self, times: Sequence[float] | np.ndarray, clocks: Tensor | None = None) -> np.ndarray:
+        """Trajectories (N,T,3) of the dynamic Gaussians at world ``times`` (seconds), float32, world units."""
+        with torch.no_grad():
+            paths = [self.moving(float(t), clocks).means for t in times]
+        return torch.stack(paths, 1).cpu().numpy() if paths else np.zeros((len(self), 0, 3), np.float32)
+
+    def render(self, camera: Camera, t: Tensor | float, **options: Any) -> Rendering:
+        """What a static ``camera`` sees at world time ``t``; options are those of :func:`recon.raster.render`."""
+        if camera.w2c.ndim == 3:
+            raise ValueError("camera: expected one pose, got one per frame: take the pose of the wanted frame")
+        options.setdefault("near_plane", self.near)
+        return self.at(t).render(camera, **options)
+
+    def save(self, path: str | os.PathLike[str], extra: Mapping[str, np.ndarray] | None = None) -> None:
+        """Write everything as plain arrays (``.npz``), atomically; NaN is refused."""
+        write_npz(path, {**scene_arrays(self), **(extra or {})})
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Gaussians4D:
+        """Read what :meth:`save` wrote. ValueError names the file for anything else."""
+        try:
+            return scene_from_arrays(read_npz(path))
+        except UNSOUND as error:
+            raise ValueError(f"{path}: not a sound 4D scene; {type(error).__name__}: {error}. Write it anew.") from None
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
+
+
+def as_time(t: Tensor | float) -> Tensor:
+    """World seconds as a float64 scalar; float32 would round long recordings to tenths of a frame."""
+    return t if isinstance(t, Tensor) else torch.tensor(float(t), dtype=torch.float64)
+
+
+def join(a: Gaussians, b: Gaussians) -> Gaussians:
+    """All Gaussians of a, then of b; the one with fewer spherical-harmonics coefficients is padded with zeros."""
+    k = max(a.sh.shape[1], b.sh.shape[1])
+
+    def padded(sh: Tensor) -> Tensor:
+        return sh if sh.shape[1] == k else torch.cat([sh, sh.new_zeros(len(sh), k - sh.shape[1], 3)], 1)
+
+    parts = {f.name: torch.cat([getattr(a, f.name), getattr(b, f.name)]) for f in fields(a) if f.name != "sh"}
+    return Gaussians(**parts, sh=torch.cat([padded(a.sh), padded(b.sh)]))
+
+
+def scene_arrays(scene: Gaussians4D) -> dict[str, np.ndarray]:
+    """A scene as named plain arrays, without its graph."""
+    about = {
+        "format": FORMAT,
+        "version": VERSION,
+        "footprint": scene.footprint,
+        "frame_step": scene.frame_step,
+        "span": list(scene.span),
+        "near": scene.near,
+    }
+    out = {"scene": np.frombuffer(json.dumps(about).encode(), np.uint8)}
+    for part in ("dynamic", "static"):
+        gaussians = getattr(scene, part)
+        if gaussians is not None:
+            flat = gaussians.detach().finite()
+            out |= {f"{part}.{f.name}": getattr(flat, f.name).numpy() for f in fields(flat)}
+    if scene.features is not None:
+        out["features"] = scene.features.detach().cpu().numpy()
+    return out | {f"motion.{k}": v for k, v in scene.motion.arrays().items()}
+
+
+def scene_from_arrays(arrays: Mapping[str, np.ndarray]) -> Gaussians4D:
+    """The scene that :func:`scene_arrays` took apart. One of :data:`UNSOUND` or ValueError say what is missing or wrong."""
+    about = json.loads(arrays["scene"].tobytes().decode())
+    if not isinstance(about, dict) or about.get("format") != FORMAT or about.get("version") != VERSION:
+        raise ValueError(f"expected a 4D scene (format {FORMAT!r}, version {VERSION}); found another. Write it anew.")
+    dynamic = _gaussians(arrays, "dynamic")
+    motion = {k[len("motion.") :]: v for k, v in arrays.items() if k.startswith("motion.")}
+    for name, axis in (("binding_rest", 0), ("own_knots", 1)):
+        if name in motion and (motion[name].ndim <= axis or motion[name].shape[axis] != len(dynamic)):
+            raise ValueError(
+                f"motion.{name}: expected {len(dynamic)} Gaussians along axis {axis}; found shape {motion[name].shape}."
+            )
+    first, last = about["span"]
+    return Gaussians4D(
+        dynamic=dynamic,
+        motion=motion_from_arrays(motion),
+        footprint=float(about["footprint"]),
+        frame_step=float(about["frame_step"]),
+        span=(float(first), float(last)),
+        static=_gaussians(arrays, "static") if "static.means" in arrays else None,
+        near=float(about["near"]),
+        features=numbers(arrays, "features", (len(dynamic), None)) if "features" in arrays else None,
+    )
+
+
+def _gaussians(arrays: Mapping[str, np.ndarray], part: str) -> Gaussians:
+    """The Gaussians whose arrays are named ``part.*``; shapes are checked by their own class."""
+    names = [f"{part}.{f.name}" for f in fields(Gaussians)]
+    means, *others = (numbers(arrays, n, (None,) * np.ndim(arrays[n])) for n in names)
+    found = Gaussians(means, *others)
+    if any(x.dtype != means.dtype for x in others):
+        raise ValueError(f"{part}: expected arrays of one precision; found {[str(x.dtype) for x in (means, *others)]}.")
+    return found

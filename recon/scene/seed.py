@@ -1,0 +1,217 @@
+"""Where Gaussians begin: surfaces that the depth maps show, taken over moment by moment.
+
+At the middle of the clip every surface voxel gets a Gaussian and is bound to the scaffold. At each further moment the
+model is warped there, and only where it has nothing near are new ones added: what a moment shows that an earlier one
+hid. Their means are those of that moment, so each moment is a rest of the scaffold.
+
+A rolling shutter is not undone here: its rows are up to half a readout off, which the fit then corrects.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+
+from otsync.types import Offsets
+from otsync.types.checks import check_number, check_whole
+from recon.footage.depth import Depths, depth_at
+from recon.footage.footage import Footage
+from recon.motion import Scaffold
+from recon.scene.gaussians import Gaussians
+from recon.scene.gaussians4d import Gaussians4D
+
+logger = logging.getLogger("recon.seed")
+
+INSIDE = 230
+"""Masks of 0..255 from which on a pixel shows nothing but what moves: edges mix in the background's colour and depth."""
+
+APART = 8 * 1 / 30
+"""Seconds between the moments that seeds are taken at."""
+
+
+@dataclass(frozen=True)
+class Seeding:
+    """How densely Gaussians begin.
+
+    Args:
+        voxel: footprints between seeds. support: pixels that must have seen a voxel, so that stray depths seed nothing.
+        reach: voxels within which a warped Gaussian counts as being there already.
+        scale: standard deviation, in voxels. opacity: at the start.
+        sh_degree: 1 to 4 where the colours of what moves depend on the direction they are seen from (sheen, strong
+            lamps), in the world's directions; 0: they do not, and nothing is computed for it.
+    """
+
+    voxel: float = 2.7
+    support: int = 2
+    reach: float = 1.3
+    scale: float = 0.55
+    opacity: float = 0.8
+    sh_degree: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("voxel", "reach", "scale"):
+            check_number(name, getattr(self, name))
+        check_whole("support", self.support, 1)
+        check_number("opacity", self.opacity, 0, 1)
+        check_whole("sh_degree", self.sh_degree, 0, 4)
+
+
+def moments(span: tuple[float, float], frame_step: float, apart: float = APART) -> np.ndarray:
+    """World seconds to seed at: the middle first, then from it outwards, ``apart`` seconds each, then both ends.
+
+    The middle is a whole number of the reference's frames after the first second, which the earliest video begins at:
+    moments lie between the frames of every other video, and of the reference where another began between two of its.
+    """
+    first, last = span
+    middle = first + frame_step * round((last - first) / 2 / frame_step)
+    steps = int((last - first) / 2 // apart)
+    times = [middle]
+    for k in range(1, steps + 1):
+        times += [middle - k * apart, middle + k * apart]
+    inside = [t for t in times if first - 1e-9 <= t <= last + 1e-9]
+    ends = [t for t in (first, last) if min(abs(t - x) for x in inside) > apart / 4]
+    return np.array([*inside, *ends])
+
+
+def shown_at(footage: Sequence[Footage], offsets: Offsets, t: float, frame_step: float) -> list[int | None]:
+    """Of every video the readable frame believed nearest to world second ``t``.
+
+    None where that is further than one frame of the reference away. Whoever makes depth maps for seeding asks here which
+    frames need one: halfway between two frames another rounding would choose the other.
+    """
+    frames: list[int | None] = []
+    for f in footage:
+        at = offsets.names.index(f.name)
+        clock = offsets.clock(at)
+        k = f.nearest(clock.own(t))
+        far = k is None or abs(clock.world(f.times[k]) - t) > frame_step
+        frames.append(None if far else k)
+    return frames
+
+
+def cloud_at(
+    footage: Sequence[Footage],
+    depth: Sequence[Depths | None],
+    offsets: Offsets,
+    t: float,
+    frame_step: float,
+    gains: Float[np.ndarray, "V 3"] | None = None,
+) -> tuple[Float[np.ndarray, "P 3"], Float[np.ndarray, "P 3"]]:
+    """Positions and colours of all pixels of what moves, over all videos, in the frames of :func:`shown_at`.
+
+    Colours are divided by the videos' gains.
+    """
+    points, colors = [np.zeros((0, 3))], [np.zeros((0, 3))]
+    for v, (f, k) in enumerate(zip(footage, shown_at(footage, offsets, t, frame_step), strict=True)):
+        z = None if k is None else depth_at(depth[v], f, k)
+        if k is None or z is None:
+            continue
+        known = z > 0
+        if f.masks is not None:
+            known &= f.masks[k] > INSIDE
+        row, column = np.nonzero(known)
+        rays = np.stack([column + 0.5, row + 0.5, np.ones(len(row))], 1) @ np.linalg.inv(f.K).T
+        w2c = f.pose(k)
+        points.append((rays * z[row, column, None] - w2c[:3, 3]) @ w2c[:3, :3])
+        gain = np.ones(3) if gains is None else gains[v]
+        colors.append(f.images[k][row, column] / 255.0 / gain)
+    return np.concatenate(points), np.concatenate(colors).clip(0, 1)
+
+
+def thinned(
+    points: Float[np.ndarray, "P 3"], colors: Float[np.ndarray, "P 3"], voxel: float, support: int
+) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 3"]]:
+    """Mean position and colour of every voxel that at least ``support`` points fell into."""
+    _, inverse, count = np.unique(
+        np.floor(points / voxel).astype(np.int64), axis=0, return_inverse=True, return_counts=True
+    )
+    inverse = inverse.reshape(-1)
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        sums = [np.bincount(inverse, values[:, c], len(count)) for c in range(3)]
+        return np.stack(sums, 1) / np.maximum(count, 1)[:, None]
+
+    keep = count >= support
+    return mean(points)[keep], mean(colors)[keep]
+
+
+def seed(
+    motion: Scaffold,
+    footage: Sequence[Footage],
+    offsets: Offsets,
+    depth: Sequence[Depths | None],
+    *,
+    footprint: float,
+    frame_step: float,
+    span: tuple[float, float],
+    times: Float[np.ndarray, " R"] | None = None,
+    gains: Float[np.ndarray, "V 3"] | None = None,
+    options: Seeding | None = None,
+) -> Gaussians4D:
+    """Gaussians on the surfaces that the depth maps show, bound to a scaffold.
+
+    Args:
+        depth: per video, in the order of ``footage``. offsets: believed clocks, by name.
+        footprint: world units of a working pixel. span: (first, last) world seconds. times: see :func:`moments`.
+        gains: factors of the videos' colours.
+
+    In a scaffold per video (whose clocks are numbered as ``footage``) each video seeds what it sees into its own nodes,
+    and only where those before it have seeded nothing.
+
+    Raises ValueError when no depth falls on anything that moves, and for a video without any.
+    """
+    options = options or Seeding()
+    times = moments(span, frame_step) if times is None else times
+    voxel = options.voxel * footprint
+    means, colors = torch.zeros(0, 3), np.zeros((0, 3))
+    everyone = range(len(footage))
+    own = set() if motion.clock is None else set(motion.clock.tolist())
+    groups = [list(everyone)] if motion.clock is None else [[v] for v in everyone if v in own]
+    for t in times:
+        for group in groups:
+            points, shades = thinned(
+                *cloud_at(
+                    [footage[v] for v in group],
+                    [depth[v] for v in group],
+                    offsets,
+                    float(t),
+                    frame_step,
+                    None if gains is None else gains[group],
+                ),
+                voxel,
+                options.support,
+            )
+            if len(means) and len(points):
+                here = motion.warp(means, _upright(len(means)), float(t))[0].detach().numpy()
+                new = cKDTree(here).query(points)[0] > options.reach * voxel
+                points, shades = points[new], shades[new]
+            if not len(points):
+                continue
+            motion = motion.bind(points, float(t), video=None if motion.clock is None else group[0])
+            means = torch.cat([means, torch.as_tensor(points, dtype=torch.float32)])
+            colors = np.concatenate([colors, shades])
+        logger.info("seeds until %.3f s: %d", t, len(means))
+    if not len(means):
+        raise ValueError(
+            "depth: expected depth where something moves, at one moment at least; found none. Check masks and depth maps."
+        )
+    n = len(means)
+    gaussians = Gaussians.from_colors(
+        means,
+        _upright(n),
+        torch.full((n, 3), options.scale * voxel),
+        torch.full((n,), options.opacity),
+        torch.as_tensor(colors, dtype=torch.float32),
+        sh_degree=options.sh_degree,
+    )
+    return Gaussians4D(gaussians, motion, footprint, frame_step, span)
+
+
+def _upright(n: int) -> torch.Tensor:
+    return torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1)

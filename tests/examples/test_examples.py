@@ -1,0 +1,34 @@
+"""The examples are the manual: each runs on a small world."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+
+def run(script: str, *args: str, cwd: Path) -> str:
+    done = subprocess.run(
+        [sys.executable, ROOT / "examples" / script, *args], capture_output=True, text=True, cwd=cwd, timeout=300
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    return done.stdout
+
+
+@pytest.mark.parametrize(
+    ("script", "args", "expected"),
+    [
+        ("01_match_tracks.py", ["--n", "120"], "best three:"),
+        ("02_synchronize.py", ["--videos", "3", "--out", "sync"], "report.html"),
+        ("03_ot_versus_fgw.py", ["--n", "120", "--seeds", "0", "--out", "picture.png"], "fused (FGW)"),
+        ("04_your_own_matcher.py", ["--videos", "3"], "given matches: errors"),
+    ],
+)
+def test_example_runs(script, args, expected, tmp_path):
+    assert expected in run(script, *args, cwd=tmp_path)
+    if "--out" in args:
+        assert (tmp_path / args[args.index("--out") + 1]).exists()

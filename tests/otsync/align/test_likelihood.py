@@ -1,0 +1,199 @@
+"""The likelihood scan against its formula, and its laws."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from otsync import LikelihoodScan, Matches, Refused, Status, TrackSet, align
+from otsync.align.likelihood import Signal, evidence, noise_floor, statistics
+from otsync.align.peaks import local_peaks, vertex
+from otsync.clocks.common import common_clock
+from otsync.simulate import simulate
+from tests.conftest import wiggle
+
+ALL = Matches(np.stack([np.arange(12)] * 2, 1))
+
+
+def moving_pair(lag: int, frames: int = 90, n: int = 12, noise: float = 0.0, seed: int = 0):
+    """Two windows on the same smooth tracks; b starts ``lag`` frames later."""
+    rng = np.random.default_rng(seed)
+    world = wiggle(rng, n, frames + abs(lag))
+    a, b = (world[:, s : s + frames] for s in ((0, lag) if lag >= 0 else (-lag, 0)))
+    a, b = (x + noise * rng.normal(size=x.shape) for x in (a, b))
+    return TrackSet(a, fps=30), TrackSet(b, fps=30)
+
+
+def brute_force(a, b, k, least):
+    """n, Var a + Var b, Var(a - b) of one match at one lag, by numpy."""
+    lo, hi = max(0, k), min(len(a), len(b) + k)
+    x, y = a[lo:hi], b[lo - k : hi - k]
+    both = np.isfinite(x[:, 0]) & np.isfinite(y[:, 0])
+    if both.sum() < least:
+        return 0.0, 0.0, 0.0
+    x, y = x[both], y[both]
+    return float(both.sum()), x.var(0).sum() + y.var(0).sum(), (x - y).var(0).sum()
+
+
+def with_gaps(tracks: TrackSet, seed: int) -> TrackSet:
+    rng = np.random.default_rng(seed)
+    seen = np.ones((len(tracks), tracks.n_frames), bool)
+    for row in seen:
+        start = rng.integers(0, tracks.n_frames - 20)
+        row[start : start + rng.integers(5, 20)] = False
+    return dataclasses.replace(tracks, visible=seen)
+
+
+def test_statistics_are_those_of_numpy():
+    a, b = moving_pair(7, frames=60, noise=0.05)
+    a, b = with_gaps(a, 1), with_gaps(b, 2)
+    lags = np.arange(-30, 31)
+    found = statistics(Signal.of(a.positions()), Signal.of(b.positions()), lags, 12)
+    for m in range(len(a)):
+        for n, k in enumerate(lags):
+            expected = brute_force(a.positions()[m], b.positions()[m], k, 12)
+            np.testing.assert_allclose([f[m, n] for f in found], expected, rtol=1e-9, atol=1e-12)
+
+
+def test_windows_are_the_formula():
+    """Σ ¼ c log((Va + Vb + e²) / (Vr + e²)) over windows of two blocks from the first common frame on."""
+    a, b = moving_pair(5, frames=70, noise=0.05)
+    a, b = with_gaps(a, 3), with_gaps(b, 4)
+    pair = common_clock(a, b, ALL)
+    lags = pair.lags(24, None)
+    curves = evidence(pair, lags)
+    floor = noise_floor(*statistics(Signal.of(pair.a), Signal.of(pair.b), lags, 12))
+    block, least = 20, 10
+    for n in (0, 20, len(lags) // 2, len(lags) - 1):
+        k, total = lags[n], 0.0
+        first, end = max(0, k), min(70, 70 + k)
+        starts = [first + (j - 1) * block for j in range(-(-(end - first) // block) + 1)]
+        for m in range(len(ALL)):
+            for s in starts:
+                lo, hi = max(s, first), min(s + 2 * block, end)
+                x, y = pair.a[m, lo:hi], pair.b[m, lo - k : hi - k]
+                c, power, residual = brute_force(x, y, 0, least)
+                if c:
+                    total += 0.25 * c * np.log((power + floor) / (residual + floor))
+        assert curves.windows[n] == pytest.approx(total / len(ALL), rel=1e-9)
+
+
+@pytest.mark.parametrize("lag", [-23, -4, 0, 11, 30])
+def test_finds_a_known_lag(lag):
+    a, b = moving_pair(lag, noise=0.02)
+    found = align(a, b, ALL, LikelihoodScan())
+    assert found.status.ok
+    assert found.frames == pytest.approx(lag, abs=0.25)
+    assert found.hypotheses[0, 0] == pytest.approx(found.offset)
+    assert (np.diff(found.hypotheses[:, 1]) <= 0).all()
+    assert found.curve is not None
+    assert found.curve[:, 1].max() == pytest.approx(found.hypotheses[0, 1])
+
+
+def test_exchanging_the_videos_flips_the_sign():
+    a, b = moving_pair(9, noise=0.05)
+    a, b = with_gaps(a, 5), with_gaps(b, 6)
+    there, back = (align(*x, LikelihoodScan(), throw=False) for x in ((a, b, ALL), (b, a, ALL.swapped())))
+    assert there.offset == pytest.approx(-back.offset, abs=1e-9)
+    np.testing.assert_allclose(there.curve[:, 1], back.curve[::-1, 1], atol=1e-8)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 2.0**20, 1e6])
+def test_no_unit_enters(scale):
+    a, b = moving_pair(9, noise=0.05)
+    found = align(a, b, ALL, LikelihoodScan(), throw=False)
+    other = align(*(dataclasses.replace(t, xyz=t.xyz * scale) for t in (a, b)), ALL, LikelihoodScan(), throw=False)
+    np.testing.assert_allclose(other.curve[:, 1], found.curve[:, 1], rtol=1e-6, atol=1e-8)
+    assert other.flags == found.flags
+
+
+def test_constant_errors_of_tracks_change_nothing():
+    a, b = moving_pair(9, noise=0.05)
+    moved = dataclasses.replace(b, xyz=b.xyz + np.random.default_rng(1).normal(size=(12, 1, 3)))
+    found, other = (align(a, x, ALL, LikelihoodScan(), throw=False) for x in (b, moved))
+    np.testing.assert_allclose(other.curve[:, 1], found.curve[:, 1], rtol=1e-7, atol=1e-7)
+
+
+def test_a_wrong_match_has_no_veto():
+    """Matches of unrelated motion lower the peak in proportion and do not move it."""
+    a, b = moving_pair(9, noise=0.02)
+    stranger = TrackSet(wiggle(np.random.default_rng(99), 12, 90), fps=30)
+    both = TrackSet(np.concatenate([b.xyz, stranger.xyz]), fps=30)
+    pairs = np.concatenate([ALL.pairs, np.stack([np.arange(12), np.arange(12) + 12], 1)])
+    found = align(a, both, Matches(pairs), LikelihoodScan(), throw=False)
+    assert found.frames == pytest.approx(9, abs=0.3)
+
+
+def test_many_matches_are_cut_to_the_best():
+    a, b = moving_pair(9)
+    pairs = np.concatenate([ALL.pairs, np.stack([np.arange(12), np.roll(np.arange(12), 5)], 1)])
+    score = np.r_[np.ones(12), np.zeros(12)]
+    cut = align(a, b, Matches(pairs, score), LikelihoodScan(limit=12), throw=False)
+    assert cut.stats["matches"] == 12
+    np.testing.assert_array_equal(cut.curve, align(a, b, ALL, LikelihoodScan(), throw=False).curve)
+
+
+def test_max_lag_limits_the_search():
+    a, b = moving_pair(20)
+    found = align(a, b, ALL, LikelihoodScan(max_lag=19 / 30), throw=False)
+    assert np.abs(found.curve[:, 0]).max() <= 19 / 30 + 1e-9
+    assert Status.BORDER in found.flags and Status.BORDER not in align(a, b, ALL, throw=False).flags
+
+
+def test_no_matches_and_no_overlap_are_refused():
+    a, b = moving_pair(0)
+    with pytest.raises(Refused, match="few_matches"):
+        align(a, b, Matches(np.zeros((0, 2), int)), LikelihoodScan())
+    with pytest.raises(Refused, match="no_overlap"):
+        align(a, b, ALL, LikelihoodScan(min_overlap=10.0))
+
+
+def test_nothing_moves_is_static():
+    still = TrackSet(np.repeat(np.random.default_rng(0).normal(size=(12, 1, 3)), 90, 1), fps=30)
+    found = align(still, still, ALL, LikelihoodScan(), throw=False)
+    assert Status.STATIC in found.flags and Status.WEAK in found.flags
+
+
+def test_periodic_motion_is_ambiguous():
+    t = np.arange(120) / 30
+    phase = np.random.default_rng(0).uniform(0, 6.28, (12, 1, 3))
+    wave = np.sin(2 * np.pi * 1.0 * t[None, :, None] + phase)
+    a, b = TrackSet(wave[:, :90], fps=30), TrackSet(wave[:, 10:100], fps=30)
+    found = align(a, b, ALL, LikelihoodScan(), throw=False)
+    assert Status.AMBIGUOUS in found.flags or Status.ALIAS in found.flags
+    spacing = np.diff(np.sort(found.hypotheses[:, 0]))
+    np.testing.assert_allclose(spacing[spacing < 1.5], 1.0, atol=0.2)
+
+
+def test_a_wrong_frame_rate_is_noticed():
+    (a, b), truth = simulate("tennis", preset="mid", fps=[30, 25], frames=[150, 125], offsets=[0, 0.4], seed=3)
+    m = truth.matches(0, 1)
+    assert align(a, b, m).frames / 25 == pytest.approx(0.4, abs=0.02)
+    wrong = align(a, dataclasses.replace(b, fps=30.0), m, throw=False)
+    assert Status.RATE_MISMATCH in wrong.flags
+    assert wrong.stats["other_rate"] == pytest.approx(6 / 5)
+
+
+def test_peaks_are_apart_and_ordered():
+    lags = np.arange(-10, 11)
+    score = np.zeros(21)
+    score[[3, 5, 10, 17]] = 4, 5, 5, 3
+    assert local_peaks(lags, score, 4, 3) == [10, 5, 17]
+    assert vertex(lags, -((lags - 1.3) ** 2), 11) == pytest.approx(1.3)
+
+
+def test_curves_that_peak_elsewhere_disagree_and_short_overlaps_alias():
+    a, b = moving_pair(9, noise=0.05)
+    pair = common_clock(a, b, ALL)
+    lags = pair.lags(24, None)
+    curves, scan = evidence(pair, lags), LikelihoodScan()
+    top = int(np.argmax(curves.total))
+    assert scan._stats(pair, lags, curves, [top])["disagreement"] <= 1 / 30
+    for part in ("slow", "windows"):
+        moved = dataclasses.replace(curves, **{part: np.roll(getattr(curves, part), 8)})
+        assert scan._stats(pair, lags, moved, [top])["disagreement"] >= 7 / 30
+    end = curves.total.copy()
+    end[2] = end[top] * 0.9
+    assert scan._stats(pair, lags, dataclasses.replace(curves, total=end), [top])["alias"] > 1.0

@@ -1,0 +1,110 @@
+"""Splines in continuous time, and two videos on one clock."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from otsync import Matches, TrackSet
+from otsync.clocks.common import common_clock, is_uniform
+from otsync.clocks.splines import TrackSplines
+from tests.conftest import wiggle
+
+
+def curve(t):
+    return np.stack([np.sin(2 * t), np.cos(3 * t), 0.5 * t**2 - t], -1)
+
+
+def test_a_cubic_polynomial_is_reproduced_with_its_velocity():
+    """Third differences of its coefficients are constant, so only a strong penalty bends it."""
+    t = np.arange(60) / 30
+    x = np.stack([t**2, 1 - t, 0.3 * t**2], -1)[None]
+    s = TrackSplines(t, x)
+    inside = np.linspace(0.1, 1.8, 50)
+    np.testing.assert_allclose(s.value(inside)[0], np.stack([inside**2, 1 - inside, 0.3 * inside**2], -1), atol=1e-5)
+    np.testing.assert_allclose(s.velocity(inside)[0, :, 1], -1, atol=1e-3)
+
+
+def test_smooth_motion_between_samples_is_far_better_than_linear():
+    t = np.arange(90) / 30
+    s = TrackSplines(t, curve(t)[None], smoothing=0.1)
+    between = t[5:-5] + 1 / 60
+    spline = np.abs(s.value(between)[0] - curve(between)).max()
+    linear = np.abs((curve(t)[5:-5] + curve(t)[6:-4]) / 2 - curve(between)).max()
+    assert spline < linear / 10
+
+
+def test_velocity_is_the_derivative_of_value():
+    rng = np.random.default_rng(0)
+    t = np.arange(40) / 25
+    s = TrackSplines(t, wiggle(rng, 3, 40))
+    at, h = np.linspace(0.2, 1.3, 17), 1e-6
+    np.testing.assert_allclose(s.velocity(at), (s.value(at + h) - s.value(at - h)) / (2 * h), atol=1e-6)
+
+
+def test_support_never_bridges_a_gap_nor_leaves_the_clip():
+    x = np.zeros((1, 30, 3))
+    x[0, 10:13] = np.nan
+    s = TrackSplines(np.arange(30) / 30, x)
+    at = np.array([-0.01, 0, 9 / 30, 9.5 / 30, 11 / 30, 12.9 / 30, 13 / 30, 20.5 / 30, 29 / 30, 29.1 / 30])
+    assert s.support(at)[0].tolist() == [False, True, True, False, False, False, True, True, True, False]
+    assert np.isnan(s.sample(at)[0, 3]).all() and np.isfinite(s.sample(at)[0, 7]).all()
+
+
+def test_one_dropped_frame_is_bridged_and_three_are_not():
+    t = np.delete(np.arange(30) / 30, [5, 15, 16, 17])
+    s = TrackSplines(t, np.zeros((1, 26, 3)))
+    assert s.support(np.array([5 / 30, 16 / 30]))[0].tolist() == [True, False]
+
+
+def test_take_equals_fitting_the_subset():
+    t, x = np.arange(50) / 30, wiggle(np.random.default_rng(1), 6, 50)
+    index = np.array([4, 1, 1])
+    at = np.linspace(0, 1.6, 9)
+    np.testing.assert_allclose(
+        TrackSplines(t, x).take(index).value(at), TrackSplines(t, x[index]).value(at), atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 4])
+def test_very_short_clips_do_not_break(n):
+    s = TrackSplines(np.arange(n) / 30, np.ones((2, n, 3)))
+    np.testing.assert_allclose(s.value(np.arange(n) / 30), 1)
+
+
+def as_video(t, offset=0.0, **clock):
+    """One track of the curve, filmed from world time ``offset`` on, at the video's own seconds ``t``."""
+    return TrackSet(curve(t + offset)[None], **clock)
+
+
+def test_equal_clocks_are_taken_as_they_are():
+    t = np.arange(60) / 30
+    a, b = as_video(t, fps=30), as_video(t, 0.2, fps=30)
+    pair = common_clock(a, b, Matches([[0, 0]]))
+    np.testing.assert_array_equal(pair.a, a.xyz)
+    assert pair.seconds(6) == pytest.approx(0.2) and pair.origin == 0
+    np.testing.assert_allclose(pair.a[:, 6:], pair.b[:, :-6])
+
+
+@pytest.mark.parametrize("fps_b", [25.0, 60.0, 29.97])
+def test_different_rates_meet_on_the_slower_clock(fps_b):
+    t, u = np.arange(90) / 30, np.arange(int(3 * fps_b)) / fps_b
+    pair = common_clock(as_video(t, fps=30), as_video(u, fps=fps_b), Matches([[0, 0]]))
+    assert pair.fps == min(30, fps_b)
+    n = min(pair.a.shape[1], pair.b.shape[1]) - 3
+    np.testing.assert_allclose(pair.a[:, 3:n], pair.b[:, 3:n], atol=2e-3)
+
+
+def test_timestamps_are_honoured():
+    rng = np.random.default_rng(2)
+    kept = np.sort(rng.choice(120, 105, replace=False))
+    t = kept / 30 + 7.0
+    b = as_video(t - 7.0, 0.5, timestamps=t)
+    assert not is_uniform(b)
+    pair = common_clock(as_video(np.arange(120) / 30, fps=30), b, Matches([[0, 0]]))
+    # world time of b's clock is t - 7 + 0.5, so offset(a, b) = -6.5
+    lag = round(pair.lag(-6.5))
+    known = np.isfinite(pair.b[0, :, 0])
+    for j in np.flatnonzero(known):
+        if 0 <= j + lag < 120:
+            np.testing.assert_allclose(pair.b[0, j], pair.a[0, j + lag], atol=5e-3)

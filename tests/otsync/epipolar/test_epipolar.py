@@ -1,0 +1,286 @@
+"""Two-view geometry, the epipolar scan, its continuous fit, and positions as costs, on exact tracks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from otsync import Matches, Status, TrackSet, synchronize
+from otsync.align.peaks import separate_peaks
+from otsync.costs.positions import CurveDistance, MedianPosition, SynchronousDistance, capped, scene_scale
+from otsync.epipolar.refine import EpipolarRefine, detrended
+from otsync.epipolar.scan import TRACK_CAP, EpipolarScan, mixture
+from otsync.geometry import common_target, fundamental, fundamentals, sampson, undistort, view_angle
+from otsync.match.candidates import Candidates
+from otsync.types import Camera
+from tests.recording_world import paths, ring
+
+FPS = 30.0
+
+
+def filmed(camera: Camera, xyz: np.ndarray, **more) -> TrackSet:
+    uv = camera.project(xyz)
+    return TrackSet(None, uv=uv, camera=camera, fps=FPS, frame="world", **more)
+
+
+def world(offset: float, frames: int = 120, n: int = 40, seed: int = 0, apart: int = 1):
+    """Two cameras; b started ``offset`` frames later; feature k belongs to track k, with a little noise."""
+    rng = np.random.default_rng(seed)
+    a, b = ring(4, width=640, height=360)[0 :: apart + 1][:2]
+    features = rng.normal(size=(n, 12))
+    t = np.arange(frames) / FPS
+    sets = []
+    for camera, start, name in ((a, 0.0, "a"), (b, offset, "b")):
+        noisy = features + 0.5 * rng.normal(size=features.shape)
+        sets.append(filmed(camera, paths(t + start / FPS, n, seed + 5), features=noisy, name=name))
+    return sets
+
+
+def test_points_of_one_world_meet_the_epipolar_constraint():
+    rng = np.random.default_rng(0)
+    a, b = ring(4)[:2]
+    x = rng.normal(size=(50, 1, 3)) * 0.4
+    xa, xb = a.project(x)[:, 0], b.project(x)[:, 0]
+    F = fundamental(a, b)
+    ha, hb = (np.concatenate([p, np.ones((50, 1))], 1) for p in (xa, xb))
+    assert np.abs(np.einsum("ni,ij,nj->n", hb, F, ha)).max() < 1e-9
+    assert np.abs(sampson(F, xa, xb)).max() < 1e-6
+    np.testing.assert_allclose(sampson(F, xa, xb + 3.0), sampson(F.T, xb + 3.0, xa), atol=1e-9)
+
+
+def test_sampson_is_the_distance_that_a_point_was_moved_across_its_line():
+    a, b = ring(4)[:2]
+    x = np.zeros((1, 1, 3))
+    xa, xb = a.project(x)[0], b.project(x)[0]
+    F = fundamental(a, b)
+    line = F @ np.append(xa[0], 1)
+    across = line[:2] / np.linalg.norm(line[:2])
+    moved = sampson(F, xa, xb + 0.01 * across)
+    # the correction is shared by both images: never more than the move, at least 1/sqrt 2 of it for like cameras
+    assert 0.6 * 0.01 < abs(float(moved[0])) <= 0.01 + 1e-9
+    assert np.sign(moved[0]) == np.sign(sampson(F, xa, xb + 0.02 * across)[0])
+
+
+def test_undistort_inverts_the_lens():
+    import cv2
+
+    camera = replace(ring(2)[0], distortion=np.array([-0.2, 0.05, 0.001, -0.002, 0.0]))
+    x = np.random.default_rng(0).normal(size=(30, 1, 3)) * 0.3
+    rvec = cv2.Rodrigues(camera.w2c[:3, :3])[0]
+    seen = cv2.projectPoints(x[:, 0], rvec, camera.w2c[:3, 3], camera.K, camera.distortion)[0][:, 0]
+    np.testing.assert_allclose(undistort(camera, seen), camera.project(x)[:, 0], atol=0.02)
+    assert np.isnan(undistort(camera, np.full((2, 2), np.nan))).all()
+
+
+def test_cameras_of_a_ring_look_at_its_middle():
+    cameras = ring(5)
+    np.testing.assert_allclose(common_target(cameras), 0, atol=1e-6)
+    assert view_angle(cameras[0], cameras[0], np.zeros(3)) < 1e-3
+    assert 30 < view_angle(cameras[0], cameras[1], np.zeros(3)) < 40
+
+
+@pytest.mark.parametrize("offset", [0.0, 13.0, -27.0, 40.0, 7.5, -3.3])
+def test_offset_from_pixels_alone(offset):
+    a, b = world(offset)
+    matches = Candidates(8, None)(a, b)
+    scanned = EpipolarScan()(a, b, matches)
+    assert abs(scanned.frames - offset) < 1.1  # noiseless residuals saturate the mixture around the peak
+    refined = EpipolarRefine()(a, b, matches, scanned)
+    assert abs(refined.frames - offset) < 0.05
+    assert refined.status.ok
+    assert refined.sigma * FPS < 0.2
+
+
+def test_swapping_the_videos_flips_the_sign():
+    a, b = world(11.0)
+    matches = Candidates(8, None)(a, b)
+    there = EpipolarScan()(a, b, matches)
+    back = EpipolarScan()(b, a, matches.swapped())
+    assert abs(there.frames + back.frames) < 0.1
+    np.testing.assert_allclose(there.hypotheses[0, 0], -back.hypotheses[0, 0], atol=0.1 / FPS)
+
+
+def test_all_wrong_candidates_are_flagged():
+    a, _ = world(0.0, seed=1)
+    _, b = world(0.0, seed=2)
+    rng = np.random.default_rng(0)
+    pairs = np.stack([rng.integers(0, 40, 200), rng.integers(0, 40, 200)], 1)
+    found = EpipolarScan()(a, b, Matches(pairs))
+    assert not found.status.ok
+
+
+def test_another_rate_and_timestamps():
+    a, b = world(9.0)
+    keep = np.arange(0, 120, 2)
+    slow = replace(b, uv=b.uv[:, keep], visible=b.seen[:, keep], fps=15.0)
+    found = EpipolarScan()(a, slow, Candidates(8, None)(a, slow))
+    assert abs(found.offset * FPS - 9.0) < 1.1
+    stamped = replace(b, fps=None, timestamps=5.0 + np.arange(120) / FPS)
+    found = EpipolarScan()(a, stamped, Candidates(8, None)(a, stamped))
+    assert abs(found.offset - (9.0 / FPS - 5.0)) < 1.1 / FPS
+
+
+def test_a_camera_that_moves():
+    a, b = world(6.0)
+    t = np.arange(120)
+    poses = []
+    for k in t:
+        turn = np.eye(4)
+        c, s = np.cos(0.002 * k), np.sin(0.002 * k)
+        turn[:3, :3] = [[c, 0, s], [0, 1, 0], [-s, 0, c]]
+        turn[:3, 3] = [0.004 * k, 0, 0]
+        poses.append(turn @ b.camera.w2c)
+    moving = replace(b.camera, w2c=np.stack(poses))
+    assert fundamentals(a.camera, moving).shape == (1, 120, 3, 3)
+    carried = filmed(moving, paths((t + 6.0) / FPS, 40, 5), features=b.features)
+    matches = Candidates(8, None)(a, carried)
+    scanned = EpipolarScan()(a, carried, matches)
+    assert abs(EpipolarRefine()(a, carried, matches, scanned).frames - 6.0) < 0.1
+
+
+def test_the_graph_takes_pixels_only():
+    cameras = ring(5, width=640, height=360)
+    true = np.array([0, 12, -9, 4.5, 20])
+    rng = np.random.default_rng(3)
+    features = rng.normal(size=(30, 12))
+    t = np.arange(110)
+    tracks = [
+        filmed(c, paths((t + o) / FPS, 30, 9), features=features + 0.5 * rng.normal(size=features.shape), name=f"c{v}")
+        for v, (c, o) in enumerate(zip(cameras, true, strict=True))
+    ]
+    found = synchronize(
+        tracks, matcher=Candidates(8, None), aligner=EpipolarScan(), refiner=EpipolarRefine(), rematch=0
+    )
+    assert found.ok
+    np.testing.assert_allclose(found.frames, true, atol=0.06)
+
+
+def test_motion_and_position_must_be_of_one_candidate():
+    """At lag 1 one candidate moves right and the other is in the right place; at lag 3 one of them does both."""
+
+    class Fixed(EpipolarScan):
+        def scores(self, *problem):
+            motion, position = np.zeros((2, 2, 5))
+            motion[0, 1], position[1, 1], motion[0, 3], position[0, 3] = 9.0, 9.0, 8.0, 8.0
+            return [motion, position]
+
+    nothing, lags = np.zeros((1, 5, 2)), np.arange(5)
+    total = Fixed().evidence(nothing, nothing, np.eye(3)[None, None], np.array([[0, 0], [0, 1]]), lags, 30.0, 1.0)
+    assert np.argmax(total) == 3
+
+
+def test_what_the_scan_needs_is_named():
+    a, b = world(0.0)
+    with pytest.raises(ValueError, match=r"b: expected pixels"):
+        EpipolarScan()(a, replace(b, camera=None), Candidates()(a, b))
+    none = EpipolarScan()(a, b, Matches(np.zeros((0, 2), int)))
+    assert none.status is Status.FEW_MATCHES and np.isnan(none.offset)
+    short = replace(b, uv=b.uv[:, :10], visible=b.seen[:, :10])
+    assert EpipolarScan()(a, short, Candidates()(a, short)).status is Status.NO_OVERLAP
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**31))
+def test_mixture_is_capped_floored_and_ignores_order(seed):
+    rng = np.random.default_rng(seed)
+    score = rng.normal(0, 20, (30, 5))
+    track = rng.integers(0, 7, 30)
+    total = mixture(score, track)
+    n = len(np.unique(track))
+    assert (total <= TRACK_CAP * n + 1e-9).all() and (total >= -1.0 * n - 1e-9).all()
+    order = rng.permutation(30)
+    np.testing.assert_allclose(mixture(score[order], track[order]), total)
+
+
+def test_separate_peaks_are_apart_and_ordered():
+    curve = np.array([0, 3, 1, 2, 0, 5, 4.5, 4.8, 0.0])
+    assert separate_peaks(curve, 3).tolist() == [5, 1]
+    assert separate_peaks(curve, 1).tolist() == [5, 7, 1, 3]
+
+
+def test_detrending_removes_constants_and_keeps_gaps():
+    x = np.random.default_rng(0).normal(size=(3, 40))
+    known = np.ones((3, 40), bool)
+    known[1, 10:20] = False
+    out = detrended(x + 7, known, 5)
+    np.testing.assert_allclose(out, detrended(x, known, 5), atol=1e-12)
+    assert (out[1, 10:20] == 0).all()
+    assert np.abs(detrended(np.full((1, 40), 3.0), np.ones((1, 40), bool), 5)).max() < 1e-12
+
+
+def lifted(xyz: np.ndarray, **more) -> TrackSet:
+    return TrackSet(xyz, fps=FPS, frame="world", **more)
+
+
+def test_curve_distance_knows_no_time_and_no_unit():
+    t = np.arange(90) / FPS
+    x = paths(t, 12, 3)
+    late = paths(t + 0.5, 12, 3)
+    cost = CurveDistance().matrix(lifted(x), lifted(late))
+    assert (cost.argmin(1) == np.arange(12)).mean() > 0.9
+    np.testing.assert_allclose(CurveDistance().matrix(lifted(50 * x), lifted(50 * late)), cost, rtol=1e-9)
+    np.testing.assert_allclose(CurveDistance().matrix(lifted(late), lifted(x)), cost.T, rtol=1e-9)
+    assert cost.max() <= CurveDistance().cap
+
+
+def test_curve_distance_against_brute_force():
+    rng = np.random.default_rng(1)
+    xa, xb = rng.normal(size=(4, 30, 3)), rng.normal(size=(5, 25, 3))
+    seen = rng.random((4, 30)) < 0.7
+    a, b = lifted(xa, visible=seen), lifted(xb)
+    cost = CurveDistance(share=1.0, cap=1e9, samples=100, scale=1.0).matrix(a, b)
+    unit = scene_scale(a.positions(), b.positions())
+    for i in range(4):
+        for j in range(5):
+            d = np.linalg.norm(xa[i, seen[i]][:, None] - xb[j][None], axis=2)
+            np.testing.assert_allclose(cost[i, j], 0.5 * (d.min(1).mean() + d.min(0).mean()) / unit, rtol=1e-9)
+
+
+def test_trimming_forgives_what_the_other_never_saw():
+    t = np.arange(90) / FPS
+    x = paths(t, 3, 3)
+    part = np.zeros((3, 90), bool)
+    part[:, :70] = True
+    whole, cut = lifted(x), lifted(x, visible=part)
+    loose = CurveDistance(share=0.7).matrix(cut, whole)
+    strict = CurveDistance(share=1.0).matrix(cut, whole)
+    assert np.diag(loose).max() < 1e-9 < np.diag(strict).min()
+
+
+def test_positions_are_compared_only_in_one_declared_frame():
+    x = paths(np.arange(40) / FPS, 3, 0)
+    a = lifted(x)
+    for frame in (None, "elsewhere"):
+        for cost in (CurveDistance(), MedianPosition()):
+            with pytest.raises(ValueError, match="frame"):
+                cost.matrix(a, TrackSet(x, fps=FPS, frame=frame))
+    np.testing.assert_allclose(np.diag(MedianPosition().matrix(a, a)), 0, atol=1e-12)
+
+
+@pytest.mark.parametrize("cost", [CurveDistance(), MedianPosition(), SynchronousDistance(0.1)], ids=repr)
+def test_costs_of_pairs_are_entries_of_the_matrix(cost):
+    """AnchoredFGW reads costs at candidates, never as a matrix of all pairs."""
+    t = np.arange(60) / FPS
+    a, b = lifted(paths(t, 7, 3)), lifted(paths(t + 0.1, 5, 3))
+    i, j = np.array([0, 6, 3, 3]), np.array([4, 0, 2, 1])
+    np.testing.assert_array_equal(cost.pairs(a, b, i, j), cost.matrix(a, b)[i, j])
+
+
+def test_unknown_distances_cost_as_much_as_any_wrong_pair():
+    np.testing.assert_array_equal(capped(np.array([1.0, np.nan, 100.0]), 2.0, 3.0), [0.5, 3.0, 3.0])
+
+
+def test_candidates_hold_both_sides_best_and_the_cheapest_first():
+    a, b = world(0.0)
+    found = Candidates(3, None)(a, b)
+    cost = 1 - (a.features @ b.features.T) / np.outer(*[np.linalg.norm(f, axis=1) for f in (a.features, b.features)])
+    assert set(found.pairs[:, 0]) == set(range(40)) == set(found.pairs[:, 1])
+    np.testing.assert_allclose(-found.score, cost[tuple(found.pairs.T)], atol=1e-9)
+    assert (np.diff(found.score) <= 0).all()
+    assert len(Candidates(3, 10)(a, b)) == 10
+    flat = replace(a, features=np.ones((40, 3)))
+    assert Candidates()(flat, replace(b, features=np.ones((40, 3)))).status is Status.NO_INFORMATION

@@ -1,0 +1,332 @@
+"""Anchored FGW: accuracy, laws, limits, and its compiled loops against plain numpy."""
+
+from __future__ import annotations
+
+import tracemalloc
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from scipy.sparse import issparse
+
+from otsync import AnchoredFGW, Cosine, FusedGromovWasserstein, Labels, Matches, Status, TrackSet, match, matcher_for
+from otsync.match.anchored import kernels
+from otsync.match.anchored.clouds import clouds
+from otsync.match.vouch import chirality
+from otsync.metrics import match_quality
+from otsync.simulate import matching_world
+from tests.conftest import wiggle
+
+
+@pytest.fixture(scope="module")
+def world():
+    return matching_world(800, seed=3)
+
+
+@pytest.fixture(scope="module")
+def found(world):
+    return AnchoredFGW()(*world[:2])
+
+
+def as_set(m: Matches) -> set[tuple[int, int]]:
+    return set(map(tuple, m.pairs.tolist()))
+
+
+def agreement(one: Matches, other: Matches) -> float:
+    return len(as_set(one) & as_set(other)) / max(len(one), len(other))
+
+
+def with_gaps(tracks: TrackSet, share: float, rng) -> TrackSet:
+    """Tracks that vanish for runs of 20 frames."""
+    visible = tracks.seen.copy()
+    starts = rng.integers(0, tracks.n_frames, (len(tracks), round(share * tracks.n_frames / 20)))
+    for n, row in enumerate(starts):
+        for s in row:
+            visible[n, s : s + 20] = False
+    xyz = tracks.xyz.copy()
+    xyz[~visible] = np.nan
+    return replace(tracks, xyz=xyz, visible=visible)
+
+
+def test_more_precise_than_the_dense_solver_by_the_promised_margin():
+    a, b, truth = matching_world(800, seed=3)
+    dense = match_quality(match(a, b, FusedGromovWasserstein(), throw=False), truth)
+    anchored = match_quality(match(a, b, AnchoredFGW()), truth)
+    assert anchored["p50"] > dense["p50"] + 0.15 and anchored["recall"] >= dense["recall"]
+    assert anchored["p50"] > 0.93 and anchored["flips"] < 0.05
+
+
+def test_grouped_cells_are_as_good(world):
+    a, b, truth = matching_world(4000, seed=5, frames=60)
+    assert match_quality(AnchoredFGW()(a, b), truth)["p50"] > 0.95
+    a, b, truth = world
+    assert match_quality(AnchoredFGW(cells=300)(a, b), truth)["p50"] > 0.9
+
+
+@pytest.mark.parametrize("change", ["gaps", "sizes", "no cue", "90 degrees", "half of b"])
+def test_harder_worlds(change):
+    rng = np.random.default_rng(0)
+    options = {"sizes": {"n_b": 350}, "no cue": {"left_right": 0.0}, "90 degrees": {"angle": 90.0}}.get(change, {})
+    a, b, truth = matching_world(900, seed=8, **options)
+    if change == "gaps":
+        a, b = with_gaps(a, 0.4, rng), with_gaps(b, 0.4, rng)
+    keep = np.arange(len(b))
+    if change == "half of b":
+        height = np.nan_to_num(truth.surfaces[1].position[:, 2], nan=rng.uniform(0, 1.7))
+        keep = np.flatnonzero(height > np.median(height))
+    m = match(a, b.take(keep), AnchoredFGW())
+    m = Matches(np.stack([m.pairs[:, 0], keep[m.pairs[:, 1]]], 1), m.score)
+    right = truth.match_errors(m.best(len(keep) // 3), 0, 1)[0] <= 0.06 * truth.size
+    assert right.mean() > (0.8 if change == "90 degrees" else 0.9)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("unit", [1e-6, 1e6])
+def test_the_unit_of_length_changes_nothing(world, dtype, unit):
+    a, b = (replace(x, xyz=x.xyz.astype(dtype)) for x in world[:2])
+    scaled = (replace(x, xyz=x.xyz * dtype(unit)) for x in (a, b))
+    assert as_set(AnchoredFGW()(*scaled)) == as_set(AnchoredFGW()(a, b))
+
+
+def test_a_rigid_motion_hardly_changes_anything(world, found):
+    a, b, _ = world
+    rotation = np.array([[0.6, -0.8, 0], [0.8, 0.6, 0], [0, 0, 1.0]])
+    moved = replace(a, xyz=a.xyz.astype(float) @ rotation.T + [30, -10, 20])
+    assert agreement(AnchoredFGW()(moved, b), found) > 0.95
+
+
+def test_swapping_videos_and_permuting_tracks_changes_nothing(world, found):
+    a, b, _ = world
+    assert as_set(AnchoredFGW()(b, a).swapped()) == as_set(found)
+    order, other = np.random.default_rng(0).permutation(len(a)), np.random.default_rng(1).permutation(len(b))
+    m = AnchoredFGW()(a.take(order), b.take(other))
+    assert {(int(order[i]), int(other[j])) for i, j in m.pairs} == as_set(found)
+
+
+def test_swap_and_permutation_agree_without_the_canonical_order_too(world):
+    """Other draws of anchors find the same places: what the canonical order makes exact is not a matter of luck."""
+    a, b, truth = world
+    one, other = AnchoredFGW(seed=0)(a, b).best(400), AnchoredFGW(seed=1)(a, b).best(400)
+    partner = dict(other.pairs.tolist())
+    i = np.array([i for i in one.pairs[:, 0] if int(i) in partner])
+    here, there = (
+        truth.surfaces[1].position[dict_values(one, i)],
+        truth.surfaces[1].position[[partner[int(k)] for k in i]],
+    )
+    assert (np.linalg.norm(here - there, axis=1) < 0.12 * truth.size).mean() > 0.93
+
+
+def dict_values(m: Matches, i: np.ndarray) -> list[int]:
+    partner = dict(m.pairs.tolist())
+    return [partner[int(k)] for k in i]
+
+
+def test_threads_and_repetition_change_no_bit(world, found, monkeypatch):
+    from threadpoolctl import threadpool_limits
+
+    from otsync.compute.threads import get_threads, set_threads
+
+    monkeypatch.setattr("otsync.compute.threads._threads", get_threads())  # puts it back
+    for threads in (1, 2, 5):
+        set_threads(threads)
+        with threadpool_limits(min(threads, 2)):
+            again = AnchoredFGW()(*world[:2])
+        np.testing.assert_array_equal(again.pairs, found.pairs)
+        np.testing.assert_array_equal(again.score, found.score)
+
+
+def test_memory_and_plan_are_sparse():
+    a, b, _ = matching_world(8000, seed=1, frames=20)
+    tracemalloc.start()
+    m = AnchoredFGW()(a, b)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 8000**2 * 4  # not even one dense matrix in single precision
+    assert issparse(m.plan) and m.plan.shape == (8000, 8000)
+    np.testing.assert_allclose(m.plan.sum(), m.stats["mass"])
+    assert m.plan.sum(1).max() <= 1 / 8000 + 1e-12 and m.plan.sum(0).max() <= 1 / 8000 + 1e-12
+
+
+def test_the_plan_and_the_pairs_are_the_callers(found):
+    rows, columns = found.plan.nonzero()
+    assert set(zip(rows.tolist(), columns.tolist(), strict=True)) == as_set(found)
+    assert (np.diff(found.score) <= 0).all()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_unrelated_videos_are_told(seed):
+    a, b = matching_world(500, seed=20 + seed)[0], matching_world(500, seed=30 + seed)[1]
+    for matcher in (AnchoredFGW(), FusedGromovWasserstein()):
+        assert Status.NO_MATCH in match(a, b, matcher, throw=False).flags
+
+
+def test_a_mirrored_scene_is_told(world):
+    a, b, _ = world
+    assert Status.AMBIGUOUS in match(a, replace(b, xyz=b.xyz * [-1, 1, 1]), AnchoredFGW(), throw=False).flags
+
+
+def test_a_symmetric_scene_is_told_and_labels_settle_it():
+    """Two copies of a cloud, each the other turned by half a turn about the middle: exchanging them changes nothing."""
+    rng = np.random.default_rng(1)
+    half = wiggle(rng, 150, 40) * 0.3 + [1.0, 0, 0]
+    xyz = np.concatenate([half, half * [-1, -1, 1]])
+    features = np.tile(rng.normal(size=(150, 16)), (2, 1))
+
+    def video() -> TrackSet:
+        noise = 0.01 * rng.normal(size=xyz.shape), 0.1 * rng.normal(size=features.shape)
+        return TrackSet(xyz + noise[0], features=features + noise[1], labels=np.repeat([0, 1], 150), fps=30)
+
+    a, b = video(), video()
+    assert match(a, b, AnchoredFGW(), throw=False).status is Status.AMBIGUOUS
+    m = match(a, b, AnchoredFGW(costs=(Cosine(), Labels())))
+    assert (m.pairs[:, 0] // 150 == m.pairs[:, 1] // 150).all() and len(m) > 250
+    right = (m.pairs[:, 0] == m.pairs[:, 1]).mean()
+    assert right > 0.9
+
+
+@dataclass(frozen=True)
+class Plain:
+    """A cost of one's own, without factors."""
+
+    inner: Labels
+    weight: float = 3.0
+
+    def matrix(self, a, b):
+        return self.inner.matrix(a, b)
+
+    def pairs(self, a, b, i, j):
+        return self.inner.pairs(a, b, i, j)
+
+
+def test_a_cost_of_ones_own_is_honoured(world):
+    rng = np.random.default_rng(0)
+    a, b = (replace(x, labels=rng.integers(0, 2, len(x))) for x in world[:2])
+    for costs, low, high in (((), 0.4, 0.6), ((Plain(Labels()),), 1.0, 1.0), ((Labels(weight=3.0),), 1.0, 1.0)):
+        m = AnchoredFGW(costs=costs)(a, b)
+        agree = (a.labels[m.pairs[:, 0]] == b.labels[m.pairs[:, 1]]).mean()
+        assert low <= agree <= high and len(m) > 200
+
+
+def test_weights_of_costs_scale_like_beta(world):
+    a, b, _ = world
+    half = AnchoredFGW(costs=(Cosine(weight=0.5),), beta=2.0, alpha=0.444)(a, b)
+    assert agreement(half, AnchoredFGW()(a, b)) > 0.95
+
+
+@pytest.mark.parametrize("soft", [False, True])
+def test_labels_pairs_and_factors_equal_the_matrix(soft):
+    rng = np.random.default_rng(2)
+    labels = [rng.random((n, 3)) * (rng.random((n, 1)) > 0.3) if soft else rng.integers(-1, 3, n) for n in (7, 5)]
+    a, b = (TrackSet(np.zeros((len(l), 1, 3)), labels=l, fps=30) for l in labels)
+    M = Labels().matrix(a, b)
+    for i in range(7):
+        for j in range(5):
+            p, q = labels[0][i], labels[1][j]
+            if soft:
+                known = p.sum() > 0 and q.sum() > 0
+                expected = 1 - (p / p.sum()) @ (q / q.sum()) if known else 0.5
+            else:
+                expected = float(p != q) if min(p, q) >= 0 else 0.5
+            assert M[i, j] == pytest.approx(expected)
+    i, j = np.divmod(np.arange(35), 5)
+    np.testing.assert_allclose(Labels().pairs(a, b, i, j), M.ravel())
+
+
+def test_labels_refuse_what_they_cannot_use():
+    a = TrackSet(np.zeros((2, 1, 3)), labels=np.array([0, 1]), fps=30)
+    with pytest.raises(ValueError, match=r"b\.labels: expected .* found none"):
+        Labels().matrix(a, replace(a, labels=None))
+    with pytest.raises(ValueError, match=r"b\.labels: expected the classes"):
+        Labels().matrix(a, replace(a, labels=np.ones((2, 3))))
+    with pytest.raises(ValueError, match=r"weights >= 0"):
+        Labels().matrix(replace(a, labels=-np.ones((2, 3))), replace(a, labels=np.ones((2, 3))))
+
+
+def test_tracks_never_seen_are_never_matched(world):
+    a, b, _ = world
+    visible = b.seen.copy()
+    visible[::2] = False
+    m = match(a, replace(b, visible=visible), AnchoredFGW())
+    assert len(m) > 100 and (m.pairs[:, 1] % 2 == 1).all()
+
+
+@pytest.mark.parametrize("field", ["anchors", "cells", "tau", "mass", "restarts", "beta"])
+def test_parameters_are_checked(field):
+    with pytest.raises(ValueError, match=f"AnchoredFGW.{field}: expected"):
+        AnchoredFGW(**{field: -1})
+
+
+def test_the_default_goes_by_size():
+    assert isinstance(matcher_for(100, 5000), FusedGromovWasserstein)
+    assert isinstance(matcher_for(500, 5000), AnchoredFGW)
+
+
+# --- compiled loops against numpy ---------------------------------------------------------------------------------
+
+
+def test_columns_poses_and_groups_equal_numpy():
+    rng = np.random.default_rng(4)
+    xyz, seen = rng.normal(size=(40, 9, 3)) * 7 + 100, rng.random((40, 9)) < 0.6
+    seen[0] = False
+    xyz[~seen] = np.nan
+    a, _ = clouds(TrackSet(xyz, seen, fps=30), TrackSet(xyz, seen, fps=30))
+    assert sorted(a.index.tolist()) == list(range(1, 40))
+    expected = ((xyz[a.index] - a.middle) / a.size).transpose(2, 1, 0)
+    np.testing.assert_allclose(a.columns, np.nan_to_num(expected), atol=1e-5)
+    np.testing.assert_array_equal(a.weight.T > 0, seen[a.index])
+    pose = a.poses(9).reshape(39, 9, 3)
+    for n in range(39):
+        times = np.flatnonzero(seen[a.index[n]])
+        for t in range(9):
+            at = times[np.argmin(np.abs(times - t))]
+            np.testing.assert_array_equal(pose[n, t], a.columns[:, at, n])
+    label = np.arange(39) % 5
+    groups = a.groups(label, 5)
+    with np.errstate(invalid="ignore"):
+        mean = np.stack(
+            [np.nanmean(np.where(a.weight > 0, a.columns, np.nan)[:, :, label == g], axis=2) for g in range(5)], 2
+        )
+    np.testing.assert_allclose(groups.columns, np.nan_to_num(mean), atol=1e-5)
+    np.testing.assert_array_equal(groups.weight > 0, np.isfinite(mean[0]))
+
+
+def test_shortlist_equals_brute_force():
+    rng = np.random.default_rng(5)
+    sa, sb = rng.random((20, 6)).astype(np.float32), rng.random((30, 6)).astype(np.float32)
+    sa[0, 0], sb[3, 1] = 1e9, -1e9
+    ua, ub = rng.normal(size=(20, 4)).astype(np.float32), rng.normal(size=(30, 4)).astype(np.float32)
+    group, of_b = rng.integers(0, 3, 20), np.sort(rng.integers(0, 4, 30))
+    allowed = np.array([[0, 1], [2, -1], [3, 1]])
+    index, value = np.full((20, 5), -1), np.full((20, 5), np.inf, np.float32)
+    start = np.searchsorted(of_b, np.arange(5))
+    tau2, weight = np.float32(0.04), np.float32(0.3)
+    kernels.shortlist(
+        sa, sb, ua, ub, tau2, weight, np.float32(1), group, allowed, start, np.arange(30), index, value, 0, 20
+    )
+    cost = np.minimum((sa[:, None] - sb[None]) ** 2, 0.04).mean(2) + 0.3 * (1 - ua @ ub.T)
+    for i in range(20):
+        members = np.flatnonzero(np.isin(of_b, allowed[group[i]]))
+        best = members[np.argsort(cost[i, members])][:5]
+        np.testing.assert_array_equal(index[i, : len(best)], best)
+        np.testing.assert_allclose(value[i, : len(best)], cost[i, best], rtol=1e-4, atol=1e-6)
+
+
+def test_nearest_spread_and_one_to_one():
+    rng = np.random.default_rng(6)
+    points, centers = rng.normal(size=(50, 4)).astype(np.float32), rng.normal(size=(7, 4)).astype(np.float32)
+    label = np.empty(50, np.int64)
+    kernels.nearest(points, np.ascontiguousarray(centers.T), label, 0, 50)
+    np.testing.assert_array_equal(label, ((points[:, None] - centers) ** 2).sum(2).argmin(1))
+    chosen = kernels.spread_out(points, 5, 3)
+    for k in range(1, 5):
+        apart = ((points[:, None] - points[chosen[:k]]) ** 2).sum(2).min(1)
+        assert apart[chosen[k]] == pytest.approx(apart.max())
+    i, j = np.array([0, 0, 1, 2, 2]), np.array([1, 0, 1, 1, 2])
+    np.testing.assert_array_equal(kernels.one_to_one(i, j, 3, 3), [0, 4])
+
+
+def test_chirality_of_a_mirror_image_is_the_complement():
+    rng = np.random.default_rng(7)
+    points = rng.normal(size=(60, 1, 3)) + 0.01 * rng.normal(size=(60, 5, 3))
+    assert chirality(points, points) == 1 and chirality(points, points * [-1, 1, 1]) == 0
+    assert np.isnan(chirality(points * [1, 1, 0], points)) and np.isnan(chirality(points[:3], points[:3]))

@@ -1,0 +1,143 @@
+"""Every finding of the check, made on purpose; and silence on a sound scene."""
+
+from __future__ import annotations
+
+import copy
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from otsync.io.document import FORMAT, VERSION
+from otsync.recordings.check import MIRRORED, check_scene
+from tests.recording_world import ring
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory) -> tuple[Path, dict]:
+    folder = tmp_path_factory.mktemp("scene")
+    videos = []
+    for n, camera in enumerate(ring(4, width=32, height=18)):
+        (folder / f"c{n}").mkdir()
+        (folder / f"d{n}").mkdir()
+        for k in range(50):
+            Image.fromarray(np.full((18, 32, 3), 5 * k, np.uint8)).save(folder / f"c{n}" / f"{k:02d}.jpg")
+            Image.fromarray(np.full((18, 32), 3300, np.uint16)).save(folder / f"d{n}" / f"{k:02d}.png")
+        told = {"K": camera.K.tolist(), "w2c": camera.w2c.tolist(), "width": 32, "height": 18}
+        depth = {"frames": f"d{n}/*.png", "scale": 0.001}
+        videos.append({"name": f"c{n}", "frames": f"c{n}/*.jpg", "fps": 30, "camera": told, "depth": depth})
+    return folder, {"format": FORMAT, "version": VERSION, "videos": videos}
+
+
+def findings(sound, change=None) -> list:
+    folder, document = sound
+    document = copy.deepcopy(document)
+    if change is not None:
+        change(document["videos"])
+    (folder / "scene.json").write_text(json.dumps(document))
+    return check_scene(folder)
+
+
+def text(found) -> str:
+    return " | ".join(f"{f.severity} {f.video}: {f.what} {f.remedy}" for f in found)
+
+
+def test_a_sound_scene_has_no_findings(sound):
+    assert findings(sound) == []
+
+
+def each_pose(videos, function):
+    for v in videos:
+        v["camera"]["w2c"] = function(np.array(v["camera"]["w2c"])).tolist()
+
+
+def test_the_mirrored_camera_to_world_trap(sound):
+    mirror = np.diag([1.0, 1, -1, 1])
+
+    def change(videos):
+        each_pose(videos, lambda m: np.linalg.inv(m) @ mirror)
+
+    found = findings(sound, change)
+    assert any(f.severity == "error" and "det(R) = -1" in f.what and "invert" in f.remedy for f in found)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "remedy"),
+    [
+        (lambda m: np.linalg.inv(m), "camera-to-world matrices: invert"),
+        (lambda m: MIRRORED @ m, "negate rows 1 and 2"),
+        (lambda m: np.linalg.inv(m) @ MIRRORED, "negate columns 1 and 2"),
+    ],
+)
+def test_poses_in_another_convention_are_recognised(sound, spoil, remedy):
+    found = findings(sound, lambda videos: each_pose(videos, spoil))
+    assert any(f.severity == "error" and remedy in f.remedy for f in found), text(found)
+
+
+def set_camera(videos, key, value):
+    videos[1]["camera"][key] = value
+
+
+@pytest.mark.parametrize(
+    ("change", "severity", "words"),
+    [
+        (lambda v: set_camera(v, "K", [[460, 0, 320], [0, 460, 180], [0, 0, 1]]), "error", "another resolution"),
+        (lambda v: set_camera(v, "K", [[3.6, 0, 16], [0, 3.6, 9], [0, 0, 1]]), "warning", "millimetres"),
+        (lambda v: set_camera(v, "width", 64), "error", "32 x 18"),
+        (lambda v: set_camera(v, "w2c", None), "error", "w2c is missing"),
+        (lambda v: set_camera(v, "w2c", np.array(v[1]["camera"]["w2c"]).T.tolist()), "error", "transpose"),
+        (lambda v: v[1].update(depth={"frames": "d1/*.png", "scale": 1}), "error", "times 0.001"),
+        (lambda v: v[1].update(frames="nowhere/*.jpg"), "error", "no files"),
+        (lambda v: v[1].update(range=[0, 20], depth=None), "warning", "few"),
+        (lambda v: set_camera(v, "readout", 20.0), "error", "phones: 0.005 to 0.03"),
+        (lambda v: v[1].update(fps=25, timestamps=[k / 30 for k in range(50)]), "error", "25"),
+    ],
+)
+def test_each_fault_is_found_and_named(sound, change, severity, words):
+    found = findings(sound, change)
+    assert any(f.severity == severity and words in f"{f.what} {f.remedy}" for f in found), text(found)
+
+
+def test_a_scaled_pose_is_found(sound):
+    def change(videos):
+        m = np.array(videos[2]["camera"]["w2c"])
+        m[:3, :3] *= 2
+        videos[2]["camera"]["w2c"] = m.tolist()
+
+    assert any("no rotation" in f.what and f.video == "c2" for f in findings(sound, change))
+
+
+def test_one_camera_that_looks_elsewhere_is_a_warning(sound):
+    def change(videos):
+        m = np.array(videos[2]["camera"]["w2c"])
+        turn = np.diag([-1.0, 1, -1, 1])
+        videos[2]["camera"]["w2c"] = (turn @ m).tolist()
+
+    found = findings(sound, change)
+    assert any(f.severity == "warning" and f.video == "c2" and "others look" in f.what for f in found), text(found)
+
+
+def test_truncated_and_missing_files_are_counted(sound):
+    folder, _ = sound
+    path = folder / "c3" / "07.jpg"
+    whole = path.read_bytes()
+    try:
+        path.write_bytes(whole[:200])
+        found = findings(sound)
+        assert any(f.video == "c3" and "1 of 50 frames" in f.what and "07.jpg" in f.what for f in found), text(found)
+        path.write_bytes(b"")
+        assert any(f.video == "c3" and f.severity == "error" for f in findings(sound))
+    finally:
+        path.write_bytes(whole)
+
+
+def test_a_file_that_is_no_scene_is_a_finding(tmp_path):
+    (tmp_path / "scene.json").write_text("{")
+    assert check_scene(tmp_path)[0].severity == "error"
+    assert check_scene(tmp_path / "nowhere")[0].severity == "error"
+
+
+def test_the_papers_scene_is_sound(data):
+    assert [f for f in check_scene(data / "panoptic_basketball", every_frame=False) if f.severity == "error"] == []

@@ -1,0 +1,245 @@
+"""Spline refinement: gradients, laws, honest sigma, rates, timestamps, refusals."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from otsync import Alignment, Matches, Refused, SplineRefine, Status, TrackSet, Unrefined, align, refine
+from otsync.clocks.splines import TrackSplines
+from otsync.refine.gauss_newton import Side, _linearise, fit_clock, neighbours
+from otsync.simulate import simulate
+from otsync.types import Clock
+
+ANTISYMMETRY = 1e-3 / 30
+"""Seconds: what exchanging the videos may change, the stated tolerance."""
+
+
+def smooth(rng: np.random.Generator, n: int):
+    """xyz(t) of n points, defined at every real t."""
+    f, phase = rng.uniform(0.3, 1.5, (n, 4, 3)), rng.uniform(0, 6.3, (n, 4, 3))
+    size, base = rng.normal(size=(n, 4, 3)) * 0.2, rng.normal(size=(n, 1, 3))
+    return lambda t: base + np.einsum("nfc,nfct->ntc", size, np.sin(2 * np.pi * f[..., None] * t + phase[..., None]))
+
+
+def films(seed: int = 0, offset: float = 0.3, n: int = 12, noise: float = 0.0, fps_b: float = 30.0, rate: float = 1.0):
+    rng = np.random.default_rng(seed)
+    move = smooth(rng, n)
+    a = move(np.arange(120) / 30)
+    b = move(rate * np.arange(int(120 * fps_b / 30)) / fps_b + offset)
+    a, b = (x + noise * rng.normal(size=x.shape) for x in (a, b))
+    return TrackSet(a, fps=30), TrackSet(b, fps=fps_b), Matches(np.stack([np.arange(n)] * 2, 1))
+
+
+def near(offset: float) -> Alignment:
+    return Alignment(offset, fps=30.0)
+
+
+@pytest.mark.parametrize("offset", [-0.517, 0.0, 0.013, 0.2891])
+@pytest.mark.parametrize("fps_b", [25.0, 30.0, 60.0])
+def test_exact_tracks_give_exact_offsets(offset, fps_b):
+    a, b, m = films(offset=offset, fps_b=fps_b)
+    found = refine(a, b, m, near(offset + 0.04))
+    assert found.offset == pytest.approx(offset, abs=0.005 / 30)
+    assert found.sigma < 0.05 / 30
+
+
+def test_the_step_is_the_gradient_of_the_residual():
+    """The Jacobian in the normal equations is the finite difference of the detrended residual."""
+    a, b, _ = films(noise=0.01)
+    curves = TrackSplines(a.times, a.positions()), TrackSplines(b.times, b.positions())
+    h, clock = 1e-5, Clock(0.31)
+    for forward in (True, False):
+        own, other = curves if forward else curves[::-1]
+        side = Side.of(own, other, 14 / 30, forward)
+
+        def residual(clock, own=own, other=other, side=side):
+            t = side.there(clock)
+            ok = own.support(own.times) & other.support(t)
+            x = np.where(ok[..., None], own.value(own.times) - other.value(t), 0)
+            out = np.zeros_like(x)
+            for k in range(x.shape[1]):
+                window = slice(side.lo[k], side.hi[k])
+                seen = ok[:, window].sum(1)[:, None]
+                out[:, k] = x[:, k] - x[:, window].sum(1) / np.maximum(seen, 1)
+            return np.where(ok[..., None], out, 0), ok
+
+        (r0, ok0), (r1, ok1) = residual(Clock(clock.offset - h)), residual(Clock(clock.offset + h))
+        both = ok0 & ok1
+        slope = np.where(both[..., None], (r1 - r0) / (2 * h), 0)
+        r = residual(clock)[0]
+        system = _linearise((side, side), clock, 0.0, False)
+        plain = (slope * r).sum(2)
+        # compare where weights are common: the unweighted products from the kernel
+        from otsync.refine import kernels
+
+        M, T = both.shape
+        first, value, dslope = other.basis(side.there(clock))
+        rr, g, hh = np.empty((M, T)), np.empty((1, M, T)), np.empty((1, 1, M, T))
+        ok = own.support(own.times) & other.support(side.there(clock))
+        sign = 1.0 if forward else -1.0
+        kernels.shift_residuals(
+            side.at,
+            other.by_track,
+            other.mean,
+            first,
+            value,
+            sign * dslope,
+            np.zeros(T),
+            ok,
+            side.lo,
+            side.hi,
+            1.0,
+            rr,
+            g,
+            hh,
+        )
+        np.testing.assert_allclose(g[0][both], plain[both], atol=1e-4 * np.abs(plain).max())
+        np.testing.assert_allclose(hh[0, 0][both], (slope**2).sum(2)[both], rtol=1e-3, atol=1e-4 * (slope**2).max())
+        np.testing.assert_allclose(rr[ok], (r**2).sum(2)[ok], rtol=1e-9, atol=1e-12)
+        assert system is not None and system.H[0, 0] > 0
+
+
+@pytest.mark.parametrize("preset", ["mid", "hard", "brutal"])
+def test_exchanging_the_videos_flips_the_sign(preset):
+    (a, b), truth = simulate("tennis", preset=preset, offsets=[0, 0.37], seed=11)
+    m = truth.matches(0, 1)
+    there, back = (refine(*x, align(*x, throw=False), throw=False) for x in ((a, b, m), (b, a, m.swapped())))
+    assert there.offset == pytest.approx(-back.offset, abs=ANTISYMMETRY)
+    assert there.sigma == pytest.approx(back.sigma, rel=0.02)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e6])
+def test_unit_order_and_rigid_motion_change_nothing(scale):
+    (a, b), truth = simulate("softball", preset="mid", offsets=[0, -0.37], seed=12)
+    m = truth.matches(0, 1)
+    rng = np.random.default_rng(0)
+    q = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    order = rng.permutation(len(a))
+    place = np.argsort(order)
+    moved = [dataclasses.replace(t, xyz=scale * (t.xyz @ q.T + [5.0, -3.0, 1.0])) for t in (a, b)]
+    other = Matches(np.stack([place[m.pairs[:, 0]], m.pairs[:, 1]], 1)[::-1])
+    first = refine(a, b, m, align(a, b, m))
+    second = refine(moved[0].take(order), moved[1], other, align(moved[0].take(order), moved[1], other))
+    assert second.offset == pytest.approx(first.offset, abs=1e-5 / 30)
+    assert second.sigma == pytest.approx(first.sigma, rel=1e-3)
+    assert second.flags == first.flags
+
+
+def test_constant_errors_of_tracks_drop_out():
+    a, b, m = films(noise=0.003)
+    shifted = dataclasses.replace(b, xyz=b.xyz + np.random.default_rng(5).normal(size=(12, 1, 3)))
+    first, second = (refine(a, x, m, near(0.3)) for x in (b, shifted))
+    assert second.offset == pytest.approx(first.offset, abs=1e-6)
+
+
+def test_wrong_matches_lose_their_weight():
+    a, b, m = films(n=24, noise=0.005)
+    wrong = m.pairs.copy()
+    wrong[:8, 1] = np.roll(wrong[:8, 1], 1)
+    found = refine(a, b, Matches(wrong), near(0.3), throw=False)
+    assert found.offset == pytest.approx(0.3, abs=0.06 / 30)
+    assert found.stats["effective_matches"] < 20
+
+
+def test_gaps_are_never_bridged():
+    """Samples inside gaps are garbage; the answer must not see them."""
+    a, b, m = films(noise=0.002)
+    seen = np.ones((12, 120), bool)
+    seen[:, 40:70] = False
+    garbage = b.xyz.copy()
+    garbage[:, 40:70] += 10.0
+    first, second = (refine(a, dataclasses.replace(b, xyz=x, visible=seen), m, near(0.3)) for x in (b.xyz, garbage))
+    assert first.offset == second.offset
+    assert first.offset == pytest.approx(0.3, abs=0.05 / 30)
+
+
+def test_dropped_frames_with_timestamps_cost_nothing():
+    a, b, m = films(noise=0.002)
+    keep = np.sort(np.random.default_rng(3).choice(120, 95, replace=False))
+    dropped = TrackSet(b.xyz[:, keep], timestamps=b.times[keep])
+    found = refine(a, dropped, m, align(a, dropped, m))
+    assert found.offset == pytest.approx(0.3, abs=0.02 / 30)
+    ignored = TrackSet(b.xyz[:, keep], fps=30 * 95 / 120)
+    assert abs(refine(a, ignored, m, align(a, ignored, m, throw=False), throw=False).offset - 0.3) > 0.2 / 30
+
+
+def test_sigma_covers_errors_of_independent_noise():
+    """Within two sigmas nearly always, within one not nearly always."""
+    z = []
+    for seed in range(24):
+        a, b, m = films(seed, offset=0.1 + seed / 97, noise=0.03)
+        found = refine(a, b, m, near(0.1 + seed / 97), throw=False)
+        z.append(abs(found.offset - 0.1 - seed / 97) / found.sigma)
+    assert np.mean(np.array(z) < 2) >= 0.85
+    assert np.mean(z) > 0.15
+
+
+@pytest.mark.slow
+def test_a_fitted_rate_is_kept_only_when_significant():
+    for frames, rate, kept in ((900, 1.001, True), (900, 1.0, False), (150, 1.001, False)):
+        tracks, truth = simulate("softball", preset="mid", frames=frames, rates=[1, rate], offsets=[0, 0.3], seed=4)
+        m = truth.matches(0, 1)
+        found = refine(*tracks, m, align(*tracks, m), SplineRefine(rate="fit"))
+        assert (found.rate != 1.0) == kept
+        if kept:
+            assert found.rate == pytest.approx(1.001, abs=2e-4)
+            assert found.offset == pytest.approx(0.3, abs=0.1 / 30)
+            fixed = refine(*tracks, m, align(*tracks, m), throw=False)
+            assert fixed.rate == 1.0 and Status.RATE_MISMATCH in fixed.flags
+
+
+def test_flags_of_the_alignment_stay():
+    a, b, m = films()
+    start = dataclasses.replace(near(0.3), flags=(Status.ALIAS,))
+    with pytest.raises(Refused, match="alias"):
+        refine(a, b, m, start)
+    found = refine(a, b, m, start, throw=False)
+    assert found.flags == (Status.ALIAS,)
+
+
+def test_what_raises_which_flag():
+    a, b, m = films()
+    assert Status.MOVED in refine(a, b, m, near(0.3 + 3 / 30), throw=False).flags
+    few = Matches(m.pairs[:3])
+    assert Status.FEW_MATCHES in refine(a, b, few, near(0.3), throw=False).flags
+    short = TrackSet(b.xyz[:, :36], fps=30)
+    assert Status.SHORT_OVERLAP in refine(a, short, m, near(0.3), throw=False).flags
+    stranger = films(seed=9)[1]
+    assert Status.POOR_FIT in refine(a, stranger, m, near(0.3), throw=False).flags
+    assert Status.NO_OVERLAP in refine(a, b, m, near(100.0), throw=False).flags
+
+
+def test_no_answer_stays_no_answer_and_unrefined_changes_nothing():
+    a, b, m = films()
+    nothing = Alignment(float("nan"), flags=(Status.NO_OVERLAP,))
+    assert np.isnan(refine(a, b, m, nothing, throw=False).offset)
+    start = near(0.25)
+    assert refine(a, b, m, start, Unrefined()).offset == 0.25
+
+
+def test_fit_without_common_samples_is_none():
+    a, b, _ = films()
+    curves = TrackSplines(a.times, a.positions()), TrackSplines(b.times, b.positions())
+    assert fit_clock(*curves, Clock(50.0), 14 / 30) is None
+
+
+def test_neighbourhoods_do_not_depend_on_order():
+    x = np.random.default_rng(0).normal(size=(40, 3))
+    order = np.random.default_rng(1).permutation(40)
+    np.testing.assert_array_equal(neighbours(x, 6)[order], neighbours(x[order], 6))
+    assert len(np.unique(neighbours(x, 6))) == 6
+    assert len(np.unique(neighbours(x[:3], 6))) == 3
+
+
+def test_blur_is_the_residual_over_the_speed():
+    a, b, _ = films(n=40, noise=0.06)
+    curves = TrackSplines(a.times, a.positions()), TrackSplines(b.times, b.positions())
+    fit = fit_clock(*curves, Clock(0.3), 14 / 30)
+    t = np.arange(20, 90) / 30
+    residual = curves[0].value(t) - curves[1].value(t - 0.3)
+    residual -= residual.mean(1, keepdims=True)
+    speed = curves[1].velocity(t - 0.3)
+    assert fit.blur == pytest.approx(np.sqrt((residual**2).sum() / (speed**2).sum()), rel=0.25)

@@ -1,0 +1,84 @@
+"""The report page: complete, self-contained, honest about doubt, safe with strangers' names."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from otsync import DTW, ConstantShift, Matches, Offsets, Status, synchronize
+from otsync.report import write_report
+from tests.otsync.align.test_align import films
+
+
+@pytest.fixture(scope="module")
+def answer():
+    a, b, matches = films(0, 0.4)
+    c = films(0, -0.3)[1]
+    tracks = [replace(t, name=n) for t, n in ((a, "left"), (b, "<script>alert(1)</script>"), (c, "right & far $x_{$"))]
+    given = {(0, 1): matches, (0, 2): matches}
+    return tracks, synchronize(tracks, matches=given, aligner=ConstantShift())
+
+
+class Outline(HTMLParser):
+    """Tags and references of a page; fails on tags that do not nest."""
+
+    def __init__(self):
+        super().__init__()
+        self.tags: list[str] = []
+        self.links: list[str] = []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.links += [v for k, v in attrs if k in ("src", "href", "xlink:href") and v]
+
+
+def test_page_is_self_contained_small_and_deterministic(tmp_path, answer):
+    tracks, offsets = answer
+    pages = []
+    for n in range(2):
+        write_report(tmp_path / f"{n}.html", offsets, tracks, truth=[0, 0.4, -0.3], title="A <title>")
+        pages.append((tmp_path / f"{n}.html").read_text())
+    assert pages[0] == pages[1] and len(pages[0]) < 400_000
+    outline = Outline()
+    outline.feed(pages[0])
+    assert "script" not in outline.tags and outline.tags.count("svg") >= 3
+    assert all(link.startswith(("data:", "#")) for link in outline.links)
+    assert not re.search(r"url\((?!#)", pages[0]) and "A &lt;title&gt;" in pages[0]
+    assert "&lt;script&gt;alert" in pages[0] and "right &amp; far" in pages[0]
+    assert "12.0" in pages[0]  # frames of offset
+
+
+def test_doubt_is_said_with_its_remedy(tmp_path, answer):
+    tracks, offsets = answer
+    doubtful = replace(
+        offsets,
+        flags=((), (Status.AMBIGUOUS, Status.SPREAD), (Status.FAILED,)),
+        seconds=np.array([0, 0.4, np.nan]),
+    )
+    write_report(tmp_path / "r.html", doubtful, tracks)
+    page = (tmp_path / "r.html").read_text()
+    assert "1 of 3 videos are to be trusted; 1 answers are doubtful, 1 missing" in page
+    assert "ambiguous, spread" in page and "Look at the hypotheses" in page and "no answer" in page
+
+
+def test_a_page_from_a_file_alone(tmp_path, answer):
+    """Without tracks, matches and curves there are tables and bars."""
+    _, offsets = answer
+    offsets.save(tmp_path / "o.json")
+    write_report(tmp_path / "r.html", Offsets.load(tmp_path / "o.json"))
+    assert "On the common clock" in (tmp_path / "r.html").read_text()
+
+
+def test_many_pairs_stay_small_and_show_residuals(tmp_path):
+    a, b, matches = films(3, 0.1)
+    tracks = [replace(t, name=f"v{n}") for n, t in enumerate([a, b] * 3)]
+    offsets = synchronize(tracks, matches={(0, v): matches for v in range(1, 6)}, aligner=DTW())
+    pairs = {(i, j): offsets.alignments[0, 1] for i in range(6) for j in range(i + 1, 6)}
+    more = replace(offsets, alignments=pairs, matches=dict.fromkeys(pairs, Matches([[0, 0]])))
+    write_report(tmp_path / "r.html", more, tracks)
+    page = (tmp_path / "r.html").read_text()
+    assert "15 pairs; median |residual|" in page and "7 further pairs" in page and len(page) < 400_000

@@ -1,0 +1,271 @@
+"""What the benchmark of configurations measures, and that rows which took hours are never lost or mixed."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from otsync.files.cache import Cache
+from otsync.io import open_scene
+from otsync.progress import Progress
+from otsync.types import Clock, Offsets, TrackSet
+from recon.bench import fits as bench
+from recon.bench.configurations import CONFIGURATIONS
+from recon.bench.plot import curve, held, plot
+from recon.bench.rows import find, measured_before, paper_tables
+from recon.motion import HermiteSpline, PerGaussian
+from recon.observe.effects import Gain, RollingShutter
+from recon.pipeline.plan import Plan
+from recon.pipeline.prepare import prepare
+from recon.scene.gaussians4d import Gaussians4D
+from tests.recon.worlds import FRAMES, SIZE, capture, write_world
+
+STEP = 1 / 30
+
+
+@pytest.fixture(scope="module")
+def truth() -> Gaussians4D:
+    """The simulated world itself, its motion splined through every frame."""
+    c = capture()
+    path = HermiteSpline.of(-0.1, 2.1, STEP, 0.1)
+    rest = c.world.moving(0.2)
+    knots = torch.as_tensor(c.world.positions(np.asarray(path.times)), dtype=torch.float32).transpose(0, 1)
+    return Gaussians4D(
+        rest,
+        PerGaussian(path, knots - rest.means),
+        footprint=0.02,
+        frame_step=STEP,
+        span=(0.0, 2.0),
+        static=c.world.static,
+        near=c.near,
+    )
+
+
+@pytest.mark.parametrize("clock", ["fps", "timestamps", "rate", "cut"])
+def test_held_out_tracks_are_compared_at_their_own_times(truth, clock):
+    """The Gaussians' own tracks are followed as on the reference's clock, whatever clock they are given on."""
+    offset, rate, fps = 0.013, 1.0, 30.0
+    own = np.arange(60) * STEP
+    if clock == "fps":
+        fps = 25.0
+        own = np.arange(50) / fps
+    elif clock == "timestamps":
+        own = own + 0.3 * STEP * np.sin(np.arange(60))
+    elif clock == "rate":
+        rate = 1.2
+    else:
+        own = own[7:]
+    tracks = TrackSet(truth.tracks(rate * own + offset)[::40], timestamps=own, name="b")
+    offsets = replace(Offsets.known(("a", "b"), np.array([0.0, offset]), fps), rates=np.array([1.0, rate]))
+    figures = bench.motion_figures(truth, SimpleNamespace(offsets=offsets), [tracks])  # type: ignore[arg-type]
+    plain = TrackSet(truth.tracks(np.arange(60) * STEP)[::40], fps=30.0, name="a")
+    wanted = bench.motion_figures(truth, SimpleNamespace(offsets=offsets), [plain])  # type: ignore[arg-type]
+    assert figures["follow_20"] == pytest.approx(wanted["follow_20"], abs=0.1)  # footprints
+
+
+def test_positions_between_frames_lie_on_the_line_and_not_where_nothing_was_seen():
+    xyz = np.arange(6.0)[None, :, None] * np.ones((1, 1, 3))
+    xyz[0, 3] = np.nan
+    tracks = TrackSet(xyz, timestamps=np.array([0.0, 1, 2, 3, 4, 9]), name="a")
+    found = bench.positions_at(tracks, np.array([-0.5, 0.0, 0.5, 2.0, 2.5, 3.0, 4.0, 6.0, 9.0, 9.5]))[0, :, 0]
+    nan = np.nan
+    np.testing.assert_allclose(found, [nan, 0, 0.5, 2, nan, nan, 4, nan, 5, nan])
+    assert np.isnan(bench.positions_at(TrackSet(xyz[:, :1], fps=1.0, name="a"), np.zeros(2))).all()
+
+
+@pytest.mark.parametrize("layered", [True, False])
+def test_held_out_views_are_drawn_as_the_fit_drew_them(truth, monkeypatch, layered):
+    seen = []
+    real = bench.view
+
+    def looking(*args, **options):
+        seen.append(options.get("layered", True))
+        return real(*args, **options)
+
+    monkeypatch.setattr(bench, "view", looking)
+    ready = SimpleNamespace(held_out=capture().held_out, clocks={"held0": Clock(0.0)}, layered=layered)
+    figures = bench.held_out_figures(replace(truth, span=(0.0, (FRAMES - 1) * STEP)), ready)  # type: ignore[arg-type]
+    assert seen == [layered] and figures["psnr"] > 20 and np.isnan(figures["lpips"])
+
+
+TINY = bench.Protocol(held_out=("held0",), width=SIZE[0], backdrop_steps=5)
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory):
+    """A recording, its truth, and a cache that the stages of every protocol share."""
+    folder = write_world(tmp_path_factory.mktemp("world"))
+    return open_scene(folder), Offsets.load(folder / "truth.json"), Cache(folder / "stages")
+
+
+def material(world, *cameras: str, **changed) -> bench.Material:
+    scene, truth, cache = world
+    return bench.material_of(scene, truth, replace(TINY, cameras=cameras or None, **changed), cache, map, Progress())
+
+
+def test_few_cameras_in_another_order_keep_what_the_rig_gave_each(world):
+    """Their images alone are fewer: depth, tracks and the static part are those of all, each camera with its own."""
+    whole, few = material(world, "cam0", "cam1", "cam2"), material(world, "cam2", "cam0")
+    assert material(world).backdrop is None and whole.train == ("cam0", "cam1", "cam2")
+    assert few.scene.names == ("cam2", "cam0", "held0") == few.truth.names and few.train == ("cam2", "cam0")
+    assert few.truth.seconds.tolist() == [whole.truth.seconds[2], whole.truth.seconds[0], whole.truth.seconds[3]]
+    assert few.truth.names[few.truth.reference] == "cam0"
+    counts = [{t.name: len(t) + len(k) for t, k in zip(m.tracks, m.kept, strict=True)} for m in (few, whole)]
+    assert counts[0] == {n: counts[1][n] for n in ("cam0", "cam2")} and min(counts[0].values()) > 0
+    for name in few.train:
+        mine, theirs = (m.scene.videos[m.scene.names.index(name)] for m in (few, whole))
+        assert all(np.array_equal(a, b) for a, b in zip(mine.depth, theirs.depth, strict=True))
+    gains, psnr = whole.backdrop.gains, whole.backdrop.psnr
+    assert np.ptp(gains, axis=0).min() > 1e-4 and len(set(psnr)) == 3  # so that another camera's would be noticed
+    assert np.array_equal(few.backdrop.gains, gains[[2, 0]]) and np.array_equal(few.backdrop.psnr, psnr[[2, 0]])
+    assert torch.equal(few.backdrop.gaussians.means, whole.backdrop.gaussians.means)
+
+
+def test_a_backdrop_with_the_gains_of_other_videos_is_refused(world):
+    scene, truth, cache = world
+    whole = material(world, "cam0", "cam1", "cam2").backdrop
+    with pytest.raises(ValueError, match=r"backdrop: expected gains of shape \(2,3\).*\(cam0, cam1\); found \(3, 3\)"):
+        prepare(
+            scene,
+            truth,
+            capture().tracks,
+            plan=Plan(width=SIZE[0]),
+            held_out=("held0", "cam2"),
+            backdrop=whole,
+            cache=cache,
+        )
+
+
+def test_a_rig_without_a_static_part_is_said(world):
+    scene, truth, cache = world
+    everywhere = [np.ones((len(v.frames), SIZE[1], SIZE[0]), bool) for v in scene.videos]
+    progress = Progress()
+    protocol = replace(TINY, cameras=("cam0", "cam1"))
+    found = bench.material_of(replace(scene, masks=tuple(everywhere)), truth, protocol, cache, map, progress)
+    assert found.backdrop is None
+    assert any("the whole rig gave no static part" in note for note in progress.notes)
+
+
+def test_declared_readouts_reach_the_fit_by_video(world, monkeypatch):
+    readouts, seen, fit = {"cam0": 0.01, "cam1": None, "cam2": 0.03}, [], bench.fit
+
+    def spied(*args, **options):
+        seen.append(([f.name for f in args[1]], options["effects"]))
+        return fit(*args, **options)
+
+    monkeypatch.setattr(bench, "fit", spied)
+    scene, truth, cache = world
+    videos = tuple(replace(v, camera=replace(v.camera, readout=readouts.get(v.name))) for v in scene.videos)
+    rolled = material((replace(scene, videos=videos), truth, cache), "cam2", "cam0", "cam1")
+    row = bench.measure("ours", CONFIGURATIONS["ours"], rolled, TINY, 1.0, 0, 1, cache, map)
+    ((names, (shutter, gain)),) = seen
+    assert names == ["cam2", "cam0", "cam1"] and shutter == RollingShutter((0.03, 0.01, 0.0))
+    assert isinstance(gain, Gain) and np.array_equal(gain.start, rolled.backdrop.gains)
+    assert row["images"] == TINY.batch
+
+
+def row(name: str, amplitude: float = 1.0, seed: int = 0, **figures: float | None) -> dict:
+    base = {
+        "steps": 2500,
+        "cpu_seconds": 100.0,
+        "start": 0.5,
+        "mean": 0.1,
+        "max": 0.2,
+        "psnr": 25.0,
+        "ssim": 0.9,
+        "lpips": None,
+        "mask_psnr": 20.0,
+        "mask_ssim": 0.8,
+        "neighbour_change": 0.3,
+        "follow_20": 2.0,
+    }
+    return {"configuration": name, "amplitude": amplitude, "seed": seed, **base, **figures}
+
+
+def test_rows_are_continued_only_where_they_were_measured_alike(tmp_path):
+    about = {"protocol": {"width": 320, "seeds": (0,), "amplitudes": (1.0,), "frames": (2, 9)}, "figures": 2}
+    assert measured_before(tmp_path, about) == []
+    rows = [row("ours"), row("fixed", seed=1)]
+    (tmp_path / "recon.json").write_text(json.dumps({**about, "rows": rows}))
+    more = {**about, "protocol": {**about["protocol"], "seeds": (0, 1), "amplitudes": (3.0,)}}
+    assert measured_before(tmp_path, more) == rows
+    for other in ({"figures": 3}, {"protocol": {**about["protocol"], "width": 160}}):
+        with pytest.raises(ValueError, match=r"differs: .*now (3|160)"):
+            measured_before(tmp_path, {**about, **other})
+    for text in ("[]", '{"rows": 3}', '{"rows": [{"seed": 1}]}', "{"):
+        (tmp_path / "recon.json").write_text(text)
+        with pytest.raises(ValueError, match=r"recon\.json: expected"):
+            measured_before(tmp_path, about)
+
+
+def test_a_row_without_lpips_is_measured_again_once_there_are_weights():
+    rows = [row("ours"), row("fixed", lpips=0.1)]
+    assert find(rows, ("ours", 1.0, 0, 2500), lpips=False) is rows[0]
+    assert find(rows, ("ours", 1.0, 0, 2500), lpips=True) is None
+    assert find(rows, ("fixed", 1.0, 0, 2500), lpips=True) is rows[1]
+    assert find(rows, ("ours", 1.0, 1, 2500), lpips=False) is None
+    assert find(rows, ("ours", 1.0, 0, 300), lpips=False) is None
+
+
+def test_tables_in_the_papers_layout_average_seeds_and_say_why_lpips_lacks():
+    rows = [
+        row("ours", psnr=24.0, max=0.2),
+        row("ours", seed=1, psnr=25.0, max=0.7),
+        row("true time", psnr=27.5),
+        row("w/o spline"),
+        row("ours", amplitude=30.0, psnr=None, mean=None),
+    ]
+    small, large = paper_tables(rows, "tennis", "no weights given").split("errors of up to 30 frames")
+    views = next(line.split() for line in small.splitlines() if line.split()[:2] == ["tennis", "PSNR"])
+    assert views[2:] == ["26.41", "27.30", "27.50", "23.14", "26.32", "24.50"]
+    lpips = next(line.split() for line in small.splitlines() if "LPIPS   " in line)
+    assert lpips[-1] == "–" == lpips[4] and "LPIPS: no weights given." in small
+    offsets = next(line.split() for line in small.splitlines() if line.split()[:2] == ["tennis", "13.355"])
+    assert offsets[-4:] == ["0.500", "–", "0.100", "0.700"]
+    assert "w/o spline" in small and "2 seeds" in small and "27.50" not in large and "w/o spline" not in large
+    assert paper_tables([row("ours", lpips=0.123)], "kitchen").count("0.123") == 1
+
+
+def test_the_plot_has_a_line_a_configuration_and_a_point_a_length(tmp_path):
+    rows = [row("ours", steps=n, cpu_seconds=n / 25, mean=30 / n, seed=s) for n in (300, 1000, 3000) for s in (0, 1)]
+    rows += [row("fixed", mean=0.5), row("true time", mask_psnr=None, mean=0.0, start=0.0), row("ours", amplitude=9.0)]
+    np.testing.assert_allclose(curve(rows[:6], "mean"), [[12, 0.1], [40, 0.03], [120, 0.01]])
+    assert curve([rows[7]], "mask_psnr").shape == (0, 2)
+    assert held(rows[6]) and held(rows[7]) and not held(rows[0])
+    plot(rows, tmp_path / "recon.svg")
+    drawn = (tmp_path / "recon.svg").read_text()
+    assert all(name in drawn for name in ("ours", "fixed", "true time", "errors of up to 1 frames"))
+    assert ">CPU seconds of the fit<" in drawn and "GPU" not in drawn
+    again = tmp_path / "again.svg"
+    plot(rows, again)
+    assert again.read_text() == drawn
+
+
+def test_the_plot_of_fits_on_a_gpu_is_against_wall_seconds(tmp_path):
+    rows = [row("ours", steps=n, seconds=n / 100, gpu_gb=0.5, mean=30 / n) for n in (300, 3000)]
+    np.testing.assert_allclose(curve(rows, "mean", "seconds"), [[3, 0.1], [30, 0.01]])
+    plot(rows, tmp_path / "recon.svg")
+    drawn = (tmp_path / "recon.svg").read_text()
+    assert ">wall seconds of the fit, on a GPU<" in drawn and "CPU seconds" not in drawn
+    cpu = [{k: v for k, v in r.items() if k != "gpu_gb"} | {"cpu_seconds": r["seconds"]} for r in rows]
+    plot(cpu, tmp_path / "cpu.svg")
+    lines = [
+        re.findall(r'<path d="M[^"]*L[^"]*" clip-path', text) for text in (drawn, (tmp_path / "cpu.svg").read_text())
+    ]
+    assert lines[0] == lines[1] != []  # drawn at the seconds, not at the CPU's
+
+
+def test_tables_hold_the_longest_fits():
+    rows = [
+        row("ours", steps=300, psnr=11.11),
+        row("ours", steps=900, psnr=22.22),
+        row("w/o spline", psnr=33.33, steps=300),
+    ]
+    told = paper_tables(rows, "tennis")
+    assert "22.22" in told and "33.33" in told and "11.11" not in told

@@ -1,0 +1,503 @@
+"""fit(): gradients of the clocks, resuming, gauges, frozen groups, units; and the synthetic scene end to end (slow)."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from otsync.compute.threads import get_threads
+from otsync.types import Offsets
+from recon.fit.densify import Densify
+from recon.fit.optimize import RATES, without
+from recon.fit.problem import Problem
+from recon.fit.run import Diverged, Run
+from recon.fit.verb import LOSSES, fit
+from recon.losses.image import Mask, Photometric
+from recon.motion import HermiteSpline, PerGaussian, Scaffold, Static, build_scaffold
+from recon.observe.cameras import Clip, observer
+from recon.observe.effects import Gain, MotionBlur, RollingShutter, Shot, with_declared
+from recon.raster import set_threads
+from recon.scene.gaussians import Gaussians
+from recon.scene.gaussians4d import Gaussians4D
+from recon.simulate.capture import synthetic
+
+ROOT = Path(__file__).parents[3]
+
+
+@pytest.fixture(scope="module")
+def capture():
+    return synthetic(4, cameras=3, held_out=0, frames=8, size=(48, 32))
+
+
+def believed(capture, seconds=None) -> Offsets:
+    V = len(capture.footage)
+    known = Offsets.known([f.name for f in capture.footage], np.zeros(V) if seconds is None else seconds, 30.0)
+    return replace(known, sigma=np.full(V, np.nan))
+
+
+def true_scene(capture, n: int = 400, scale: float = 1.0) -> Gaussians4D:
+    """The world's own Gaussians, carried by a scaffold built from the tracks."""
+    world = capture.world
+    times = capture.footage[0].times
+    footprint = 2.6 / capture.footage[0].K[0, 0] * scale
+    tracks = [replace(t, xyz=scale * t.xyz, camera=None) for t in capture.tracks]
+    scaffold = build_scaffold(tracks, np.zeros(len(tracks)), footprint=footprint, frame_step=1 / 30)
+    pick = np.linspace(0, len(world.part) - 1, n).astype(int)
+    points = torch.as_tensor(scale * world.positions([times[4]])[pick, 0], dtype=torch.float32)
+    g = Gaussians.from_colors(
+        points,
+        torch.tensor([1.0, 0, 0, 0]).repeat(n, 1),
+        torch.full((n, 3), 0.04 * scale),
+        torch.full((n,), 0.8),
+        torch.as_tensor(world.colors[pick], dtype=torch.float32),
+    )
+    return Gaussians4D(
+        g, scaffold.bind(points, times[4]), footprint, 1 / 30, (times[0], times[-1]), None, near=0.6 * scale
+    )
+
+
+@pytest.fixture(scope="module")
+def scene(capture):
+    return true_scene(capture)
+
+
+def same(a, b) -> bool:
+    """Equal to the last bit, wall seconds apart."""
+    ga, gb = (
+        {
+            **vars(r.scene.dynamic),
+            **r.scene.motion.parameters(),
+            **r.parameters,
+            "o": torch.as_tensor(r.offsets.seconds),
+        }
+        for r in (a, b)
+    )
+    return all(torch.equal(ga[n], gb[n]) for n in ga) and np.array_equal(a.history.loss, b.history.loss)
+
+
+class Squared:
+    """A loss without kinks, which finite differences would stumble over."""
+
+    weight, needs = 1.0, frozenset()
+
+    def __call__(self, seen):
+        return (seen.rendered - seen.image).square().mean()
+
+
+def gradient_against_differences(problem, group, index, step):
+    run = Run(problem, dict(RATES), None, 10)
+    values = {n: v.detach() for n, v in run.values().items()}
+
+    def loss(shift: float) -> float:
+        moved = {n: v.clone() for n, v in values.items()}
+        moved[group][index] += shift
+        return run.image_gradient({**moved, group: moved[group].requires_grad_()}, [group], [(1, 4)], False).losses[0]
+
+    values[group] = values[group].clone().requires_grad_()
+    gradient = run.image_gradient(values, [group], [(1, 4)], False).gradients[0]
+    return float(gradient[index]), (loss(step) - loss(-step)) / (2 * step)
+
+
+@pytest.mark.parametrize(
+    "effects", [(), (MotionBlur(0.02),), (RollingShutter(0.02, 4),)], ids=["plain", "blur", "rolling"]
+)
+def test_the_clock_s_gradient_is_that_of_the_image(capture, scene, effects):
+    problem = Problem.of(scene, capture.footage, believed(capture), (Squared(),), effects, 1, 0)
+    found, expected = gradient_against_differences(problem, "offsets", 1, 3e-4)
+    assert found == pytest.approx(
+        expected, rel=0.1
+    )  # splats end where their alpha falls below 1/255, which differences see
+
+
+def test_the_sign_of_an_offset(capture, scene):
+    """A video that started later has a positive offset: t_world = t_own + offset."""
+    problem = Problem.of(scene, capture.footage, believed(capture, np.array([0, 0.05, 0])), LOSSES, (), 1, 0)
+    run = Run(problem, dict(RATES), None, 1)
+    later, now = (
+        run.look(run.values(), 1, 2),
+        run.look({**run.values(), "offsets": torch.zeros(3).double()}, 1, 2, 0.05),
+    )
+    assert torch.equal(later, now)
+
+
+def test_every_video_is_seen_through_its_own_readout(capture, scene):
+    readouts = [0.02, None, 0.06]
+
+    def losses(effects) -> list[float]:
+        problem = Problem.of(scene, capture.footage, believed(capture), (Squared(),), effects, 1, 0)
+        run = Run(problem, dict(RATES), None, 1)
+        return [run.image_gradient(run.values(), ["offsets"], [(v, 4)], False).losses[0] for v in range(3)]
+
+    alone = [losses((RollingShutter(r or 0.0),)) for r in readouts]  # every video through each
+    assert losses(with_declared((), readouts)) == [alone[v][v] for v in range(3)]
+    assert all(len({seen[v] for seen in alone}) == 3 for v in range(3))  # so that another video's would be noticed
+
+
+@pytest.mark.parametrize("batch", [1, 3])
+def test_a_fit_does_not_depend_on_threads(capture, scene, batch):
+    results = []
+    for threads in (1, 4):
+        before = get_threads()
+        set_threads(threads)
+        try:
+            results.append(fit(scene, capture.footage, believed(capture), steps=6, batch=batch, effects=(Gain(),)))
+        finally:
+            set_threads(before)
+    assert same(*results)
+
+
+@pytest.mark.parametrize(
+    "densify",
+    [
+        None,
+        Densify((0.3,), share=0.2),
+        Densify((0.8,), share=0.2),
+        Densify((0.6,), share=0.2),
+        Densify((0.3,), nodes=9),
+    ],
+    ids=["plain", "densified before", "densified after", "densified then", "nodes too"],
+)
+def test_a_stopped_fit_continues_with_the_same_bits(capture, scene, tmp_path, monkeypatch, densify):
+    options = {"steps": 10, "batch": 2, "densify": densify}
+    whole = fit(scene, capture.footage, believed(capture), **options)
+    path, step = tmp_path / "fit.npz", Run.one_step
+
+    def one_step(self, *args, **kwargs):
+        step(self, *args, **kwargs)
+        if self.step == 6:  # Ctrl-C in the middle of what follows a step
+            signal.raise_signal(signal.SIGINT)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Run, "one_step", one_step)
+        with pytest.raises(KeyboardInterrupt):
+            fit(scene, capture.footage, believed(capture), checkpoint=path, **options)
+    assert path.exists()
+    again = fit(scene, capture.footage, believed(capture), checkpoint=path, **options)
+    assert again.stats["steps"] == 10
+    assert same(whole, again)
+
+
+def test_view_dependent_colours_are_a_group_of_their_own(capture, scene, tmp_path):
+    sh = torch.cat([scene.dynamic.sh, scene.dynamic.sh.new_zeros(len(scene), 3, 3)], 1)
+    shiny = replace(scene, dynamic=replace(scene.dynamic, sh=sh))
+    found = fit(shiny, capture.footage, believed(capture), steps=6, densify=Densify((0.5,), share=0.2))
+    assert found.scene.dynamic.sh.shape[1:] == (4, 3) and found.scene.dynamic.sh[:, 1:].abs().max() > 0
+    held = fit(shiny, capture.footage, believed(capture), steps=6, rates=without(RATES, "sh_rest"))
+    assert not held.scene.dynamic.sh[:, 1:].any() and not torch.equal(held.scene.dynamic.sh[:, :1], sh[:, :1])
+    # as long as they are zero they change no bit of the rest
+    plain = fit(scene, capture.footage, believed(capture), steps=6)
+    np.testing.assert_allclose(held.offsets.seconds, plain.offsets.seconds, atol=1e-7)
+
+
+def test_a_finished_fit_is_read_back(capture, scene, tmp_path):
+    options = {"steps": 3, "checkpoint": tmp_path / "fit.npz"}
+    assert same(*(fit(scene, capture.footage, believed(capture), **options) for _ in range(2)))
+
+
+def test_a_checkpoint_of_other_options_is_refused(capture, scene, tmp_path):
+    path = tmp_path / "fit.npz"
+    fit(scene, capture.footage, believed(capture), steps=2, checkpoint=path)
+    with pytest.raises(ValueError, match="belongs to other"):
+        fit(scene, capture.footage, believed(capture), steps=3, checkpoint=path)
+
+
+def test_losses_and_effects_of_plain_classes_are_known_again(capture, scene, tmp_path):
+    """Objects without a repr of their own count by what they hold, not by where they lie in memory."""
+
+    def key(loss, effect=None, frame=0):
+        footage = [replace(f, depth={frame: np.ones(f.size[::-1], np.float32)}) for f in capture.footage]
+        problem = Problem.of(scene, footage, believed(capture), (loss,), (), 1, 0)
+        return problem.key((loss,), () if effect is None else (effect,))
+
+    class Effect:
+        def __init__(self, strength):
+            self.strength = strength
+
+    heavier = Squared()
+    heavier.weight = 2.0
+    keys = [key(Squared()), key(heavier), key(Squared(), frame=1), key(Squared(), Effect(1)), key(Squared(), Effect(2))]
+    assert len(set(keys)) == len(keys)
+    assert keys[0] == key(Squared()) and keys[3] == key(Squared(), Effect(1))
+    path = tmp_path / "fit.npz"
+    first, again = (
+        fit(scene, capture.footage, believed(capture), steps=2, checkpoint=path, losses=(Squared(),)) for _ in range(2)
+    )
+    assert same(first, again)
+
+
+def test_frozen_groups_stand_still(capture, scene):
+    result = fit(scene, capture.footage, believed(capture), steps=3, rates=without(RATES, "offsets", "means"))
+    assert torch.equal(result.scene.dynamic.means, scene.dynamic.means)
+    assert np.array_equal(result.offsets.seconds, np.zeros(3))
+    assert not torch.equal(result.scene.dynamic.sh, scene.dynamic.sh)
+
+
+def test_the_reference_keeps_its_place_and_the_motion_goes_with_it(capture, scene):
+    """The common shift that the fit drifts by is taken out of offsets and motion alike: the images stay."""
+    result = fit(scene, capture.footage, believed(capture), steps=5)
+    assert result.offsets.seconds[0] == 0 and result.stats["drift_frames"] != 0
+    drift = result.stats["drift_frames"] / 30
+    start = result.scene.motion.path.start
+    assert start == pytest.approx(scene.motion.path.start - drift, abs=1e-12)
+
+
+def test_a_change_of_units_changes_nothing_but_the_units(capture):
+    offsets = []
+    for scale in (1.0, 1000.0):
+        footage = []
+        for f in capture.footage:
+            w2c = f.w2c.copy()
+            w2c[:3, 3] *= scale
+            footage.append(replace(f, w2c=w2c))
+        result = fit(true_scene(capture, scale=scale), footage, believed(capture), steps=12)
+        offsets.append(result.offsets.seconds * 30)
+    assert offsets[0] == pytest.approx(offsets[1], abs=2e-3)
+    assert np.abs(offsets[0]).max() > 0.02
+
+
+@pytest.mark.parametrize("motion", ["per-gaussian", "static"])
+def test_other_motions_stand_in_the_slot(capture, scene, motion):
+    other = Static() if motion == "static" else PerGaussian.following(scene.motion, scene.dynamic.means)
+    result = fit(replace(scene, motion=other), capture.footage, believed(capture), steps=3)
+    assert isinstance(result.scene.motion, type(other)) and result.history.loss[-1] > 0
+
+
+def test_a_scaffold_per_video(capture, scene):
+    from recon.motion import ScaffoldOptions
+
+    per_video = build_scaffold(
+        capture.tracks,
+        np.zeros(3),
+        footprint=scene.footprint,
+        frame_step=1 / 30,
+        options=ScaffoldOptions(per_video=True),
+    )
+    bound = per_video.bind(scene.dynamic.means, capture.footage[0].times[4])
+    result = fit(replace(scene, motion=bound), capture.footage, believed(capture), steps=4)
+    assert torch.allclose(result.scene.motion.offsets, torch.as_tensor(result.offsets.seconds), atol=1e-12)
+
+
+def test_densification_splits_what_is_pulled_and_drops_what_is_faint(scene):
+    n = len(scene)
+    faint = scene.dynamic.opacity_logits.clone()
+    faint[:10] = -8.0
+    pull = torch.zeros(n)
+    pull[20:40] = 1.0
+    denser, old, new = Densify((0.5,), share=20 / (n - 10))(
+        replace(scene, dynamic=replace(scene.dynamic, opacity_logits=faint)), pull
+    )
+    assert len(denser) == n - 10 + 20 == len(denser.motion.binding)
+    assert not set(range(10)) & set(old.tolist())
+    assert sorted(old[new].unique().tolist()) == list(range(20, 40))
+    # halves stand either side of their parent
+    for parent in (20, 30):
+        rows = torch.nonzero(old == parent)[:, 0]
+        assert torch.allclose(denser.dynamic.means[rows].mean(0), scene.dynamic.means[parent], atol=1e-6)
+
+
+def test_a_scaffold_gains_nodes_where_it_is_pulled(capture, scene):
+    result = fit(scene, capture.footage, believed(capture), steps=6, densify=Densify((0.5,), nodes=5))
+    assert len(scene.motion) - 20 < len(result.scene.motion) <= len(scene.motion) + 5
+    assert len(result.scene.motion) != len(scene.motion) and np.isfinite(result.history.loss).all()
+
+
+def test_joint_rendering_where_no_background_is_cached(capture, scene):
+    """A camera without a cached background renders static and moving Gaussians together."""
+    footage = [replace(f, background=None) for f in capture.footage]
+    whole = replace(scene, static=capture.world.static)
+    rates = {**RATES, "static.sh": 0.02}
+    result = fit(whole, footage, believed(capture), steps=3, rates=rates)
+    assert not torch.equal(result.scene.static.sh, whole.static.sh)
+    assert torch.equal(result.scene.static.means, whole.static.means)
+
+
+def test_a_diverged_fit_names_step_group_and_frame(capture, scene):
+    class Broken(Mask):
+        def __call__(self, seen):
+            return seen.alpha.sum() * float("nan")
+
+    with pytest.raises(Diverged, match=r"step 0: .* is no number \(cam"):
+        fit(scene, capture.footage, believed(capture), losses=(Photometric(), Broken()), steps=2)
+
+
+def test_what_does_not_fit_together_is_refused(capture, scene):
+    off = believed(capture)
+    with pytest.raises(ValueError, match="footage: expected at least one"):
+        fit(scene, (), off)
+    with pytest.raises(ValueError, match="footage: expected unique names"):
+        fit(scene, [replace(capture.footage[0], name="elsewhere")], off)
+    with pytest.raises(ValueError, match="expected every video on one clock"):
+        fit(scene, capture.footage, believed(capture, np.array([0, np.nan, 0])))
+    with pytest.raises(ValueError, match="rates: expected groups"):
+        fit(scene, capture.footage, off, rates={"mean": 1.0}, steps=1)
+    with pytest.raises(ValueError, match="steps, budget"):
+        fit(scene, capture.footage, off, steps=1, budget=1.0)
+    empty = replace(
+        scene,
+        dynamic=Gaussians(*(t[:0] for t in vars(scene.dynamic).values())),
+        motion=scene.motion.take(np.zeros(0, int)),
+    )
+    with pytest.raises(ValueError, match="scene: expected moving Gaussians"):
+        fit(empty, capture.footage, off)
+    still = [replace(f, boxes=np.zeros_like(f.boxes)) for f in capture.footage]
+    with pytest.raises(ValueError, match="expected frames in which something moves"):
+        fit(scene, still, off)
+
+
+def test_one_camera_and_bad_frames_are_no_obstacle(capture, scene):
+    bad = capture.footage[0].bad.copy()
+    bad[3] = True
+    result = fit(scene, [replace(capture.footage[0], bad=bad)], believed(capture), steps=3)
+    assert np.isfinite(result.history.loss[-1]) and result.offsets.seconds[0] == 0
+
+
+def test_a_scene_on_disk_comes_back(scene, tmp_path):
+    scene.save(tmp_path / "scene.npz")
+    back = Gaussians4D.load(tmp_path / "scene.npz")
+    assert back.span == scene.span and back.footprint == scene.footprint
+    assert np.array_equal(back.tracks([0.05, 0.2]), scene.tracks([0.05, 0.2]))
+    (tmp_path / "scene.npz").write_bytes(b"PK\x03\x04" + bytes(40))
+    with pytest.raises(ValueError, match=r"scene\.npz"):
+        Gaussians4D.load(tmp_path / "scene.npz")
+
+
+def test_losses_on_what_is_given_beside_the_images(capture, scene):
+    """Depth, tracks and features change the fit where they are given, and are refused where they are not."""
+    from recon.losses.image import Depth, Feature, Sightings, Track
+
+    maps = [dict(enumerate(z)) for z in capture.depth]
+    some = torch.arange(4)[:, None]
+    points = Sightings(some, torch.zeros(4, 3), torch.full((4, 2), 20.0))
+    drawn = {k: np.full((*capture.footage[0].images.shape[1:3], 2), 0.5, np.float32) for k in range(8)}
+    given = [
+        replace(f, depth=z, tracks=dict.fromkeys(range(8), points), features=drawn)
+        for f, z in zip(capture.footage, maps, strict=True)
+    ]
+    whole = replace(scene, features=torch.rand(len(scene), 2))
+    plain = fit(whole, given, believed(capture), steps=3)
+    for loss in (Depth(1.0), Track(0.1), Feature(1.0)):
+        with pytest.raises(ValueError, match=f"losses: {type(loss).__name__} compares with"):
+            fit(scene, capture.footage, believed(capture), losses=(Photometric(), loss), steps=1)
+        rates = {**RATES, "features": 0.01}
+        with_it = fit(whole, given, believed(capture), losses=(*LOSSES, loss), steps=3, rates=rates)
+        assert not torch.equal(with_it.scene.dynamic.means, plain.scene.dynamic.means)
+    assert not torch.equal(with_it.scene.features, whole.features)
+
+
+def test_fitted_clock_rates_leave_the_reference_s_alone(capture, scene):
+    result = fit(scene, capture.footage, believed(capture), steps=3, rates={**RATES, "clock_rates": 1e-3})
+    assert result.offsets.rates[0] == 1 and (result.offsets.rates[1:] != 1).all()
+
+
+def test_a_budget_becomes_steps_that_decay_and_densify(capture, scene):
+    result = fit(scene, capture.footage, believed(capture), budget=0.01, densify=Densify((0.1, 0.6), share=0.1))
+    assert result.stats["steps"] == 120 and result.history.step[-1] == 120
+    assert len(result.scene) > len(scene)
+    with pytest.raises(ValueError, match="budget: expected"):
+        fit(scene, capture.footage, believed(capture), budget=float("inf"))
+
+
+def test_other_rates_and_frame_times(capture, scene):
+    """A video at another rate: t_world = rate * t_own + offset, so that slowed-down times with rate 2 are the same."""
+    slow = [capture.footage[0], *(replace(f, times=f.times / 2) for f in capture.footage[1:])]
+    offsets = replace(believed(capture), rates=np.array([1.0, 2.0, 2.0]))
+    a = fit(scene, capture.footage, believed(capture), steps=4)
+    b = fit(scene, slow, offsets, steps=4)
+    assert a.offsets.seconds == pytest.approx(b.offsets.seconds, abs=1e-9)
+
+
+def test_a_camera_that_moves_is_seen_from_its_pose_of_the_frame(capture, scene):
+    footage = [replace(f, w2c=np.repeat(f.w2c[None], len(f), 0)) for f in capture.footage]
+    a = fit(scene, capture.footage, believed(capture), steps=2)
+    assert same(a, fit(scene, footage, believed(capture), steps=2))
+    turned = [replace(f, w2c=f.w2c.copy()) for f in footage]
+    for f in turned:
+        f.w2c[1:, 0, 3] += 0.5
+    assert not same(a, fit(scene, turned, believed(capture), steps=2))
+
+
+def test_the_rows_of_a_camera_that_moves_are_seen_from_where_it_is_then(capture, scene):
+    """What is static is slanted too: every band of rows is what a camera in between would show."""
+    f, box = replace(capture.footage[0], background=None), (0, 0, *capture.footage[0].size)
+    path = np.repeat(f.w2c[None], len(f), 0)
+    path[:, 0, 3] += 0.6 * np.arange(len(f))
+    moving = Clip.of(replace(f, w2c=path))
+    readout, bands, k = 0.03, 4, 3
+    asked = Shot(0, torch.tensor(k / 30, dtype=torch.float64), box, box[3], k)
+    with torch.no_grad():
+        rolled = RollingShutter(readout, bands).wrap(observer(scene, [moving]), {})(asked).rgb
+        for b in range(bands):
+            later = readout * ((b + 0.5) / bands - 0.5)
+            there = Clip.of(replace(f, w2c=moving.footage.pose_after(k, later)))
+            rows = slice(box[3] * b // bands, box[3] * (b + 1) // bands)
+            seen = observer(scene, [there])(replace(asked, t=asked.t + later)).rgb
+            torch.testing.assert_close(rolled[rows], seen[rows], atol=1e-3, rtol=0)
+        assert not torch.allclose(rolled, observer(scene, [moving])(asked).rgb, atol=0.02)
+
+
+def test_a_spline_far_beyond_its_knots_still_renders(capture, scene):
+    lost = believed(capture, np.array([0, 100.0, 0]))
+    assert np.isfinite(fit(scene, capture.footage, lost, steps=2).history.loss[-1])
+
+
+def test_types_of_motion_are_scaffolds(scene):
+    assert isinstance(scene.motion, Scaffold) and isinstance(scene.motion.path, HermiteSpline)
+
+
+KILLED = """
+import sys
+sys.path.insert(0, {tests!r})
+from tests.recon.test_fit import believed, true_scene
+from recon.fit import fit
+from recon.simulate import synthetic
+capture = synthetic(4, cameras=3, held_out=0, frames=8, size=(48, 32))
+result = fit(true_scene(capture), capture.footage, believed(capture), steps=60, checkpoint={path!r}, save_every=0.0)
+result.offsets.save({out!r})
+"""
+
+
+@pytest.mark.slow
+def test_the_process_that_compiles_the_kernels_gives_the_same_bits_as_those_that_load_them(tmp_path):
+    code = KILLED.format(tests=str(ROOT), path=str(tmp_path / "fit.npz"), out=str(tmp_path / "{name}.json"))
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": str(tmp_path / "compiled")}
+    for name in ("compiled", "loaded"):
+        (tmp_path / "fit.npz").unlink(missing_ok=True)
+        subprocess.run(
+            [sys.executable, "-c", code.replace("{name}", name)], cwd=ROOT, env=environment, check=True, timeout=600
+        )
+    assert (tmp_path / "compiled.json").read_bytes() == (tmp_path / "loaded.json").read_bytes()
+
+
+@pytest.mark.slow
+def test_sigkill_at_random_moments_changes_nothing(tmp_path):
+    def start(name):
+        code = KILLED.format(tests=str(ROOT), path=str(tmp_path / f"{name}.npz"), out=str(tmp_path / f"{name}.json"))
+        return subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)})
+
+    assert start("whole").wait() == 0
+    rng, kills = np.random.default_rng(0), 0
+    for _ in range(40):
+        process = start("killed")
+        seen = (tmp_path / "killed.npz").exists()
+        deadline = time.monotonic() + 60
+        while not seen and process.poll() is None and time.monotonic() < deadline:
+            seen = (tmp_path / "killed.npz").exists()
+            time.sleep(0.01)
+        time.sleep(float(rng.uniform(0, 0.4)) if kills else 0.1)
+        if kills < 8 and process.poll() is None:
+            process.send_signal(signal.SIGKILL)
+            process.wait()
+            kills += 1
+        elif process.wait() == 0:
+            break
+    assert kills >= 3
+    assert (tmp_path / "killed.json").read_bytes() == (tmp_path / "whole.json").read_bytes()

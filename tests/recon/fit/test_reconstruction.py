@@ -1,0 +1,46 @@
+"""The fit end to end on the synthetic scene: what is promised of offsets and held-out views, on fresh seeds (slow)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from otsync.types import Clock, Offsets
+from recon.evaluate.figures import offset_error
+from recon.evaluate.views import view
+from recon.fit.optimize import RATES, without
+from recon.fit.verb import fit
+from recon.simulate.capture import synthetic
+from recon.simulate.recording import begun
+
+
+def refined(seed: int, steps: int, rates=RATES):
+    capture = synthetic(seed)
+    believed = Offsets.known([f.name for f in capture.footage], np.zeros(len(capture.footage)), 30)
+    result = fit(begun(capture, believed), capture.footage, believed, steps=steps, rates=rates)
+    error = offset_error(result.offsets.seconds, capture.offsets, capture.frame_step)
+    held = view(result.scene, capture.held_out[0], Clock(0.0), gain=np.ones(3)).score(most=24, pictures=0).mean
+    return error, held, result
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [101, 102, 103])
+def test_offsets_and_held_out_views(seed):
+    error, held, result = refined(seed, 3000)
+    print(
+        f"seed {seed}: mean {error.mean:.4f} max {error.max:.4f} held-out {held['psnr']:.2f} / {held['mask_psnr']:.2f} dB, "
+        f"{result.stats['seconds']:.0f} s, {result.stats['gaussians']:.0f} Gaussians"
+    )
+    assert error.mean <= 0.06 and error.max <= 0.12
+    assert held["psnr"] >= 33.5 and held["mask_psnr"] >= 28
+    fixed = refined(seed, 3000, without(RATES, "offsets"))[1]
+    print(f"seed {seed}: held fixed {fixed['psnr']:.2f} / {fixed['mask_psnr']:.2f} dB")
+    assert held["mask_psnr"] >= fixed["mask_psnr"] + 0.7
+
+
+def test_a_short_fit_finds_most_of_the_offsets():
+    """A few seconds of it, for the fast suite: two thirds of the error are gone."""
+    error, held, result = refined(7, 150)
+    start = np.abs(synthetic(7).offsets[1:] * 30).mean()
+    assert error.mean < start / 3
+    assert held["mask_psnr"] > 23 and np.isfinite(result.offsets.sigma).all()

@@ -1,0 +1,232 @@
+"""The other motions in the scaffold's slot, checkpoints of all of them, and changes to a scaffold's nodes."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import torch
+
+from otsync.types import TrackSet
+from recon.motion import HermiteSpline, PerGaussian, Sampled, Static, build_scaffold, density, motion_from_arrays
+from recon.motion.rotations import unit
+from recon.motion.solve import FRAME
+from recon.raster.projection import rotation_matrices
+from tests.recon.motion.worlds import FOOTPRINT, Bodies, filmed, leaves, random_gaussians, random_scaffold
+
+
+@pytest.fixture(scope="module")
+def carried():
+    """A scaffold of two bodies, and points bound to it at two moments."""
+    sets, offsets = filmed()
+    scaffold = build_scaffold(sets, offsets, footprint=FOOTPRINT, frame_step=FRAME)
+    bodies = Bodies(500, seed=9)
+    means = torch.from_numpy(np.concatenate([bodies.at(0.3), bodies.at(0.9)[:300]])).float()
+    quats = torch.tensor([1.0, 0, 0, 0]).repeat(800, 1)
+    return scaffold.bind(means[:500], 0.3).bind(means[500:], 0.9), means, quats, (sets, offsets)
+
+
+# --- motions per Gaussian, and none
+
+
+def test_paths_of_their_own_start_where_the_scaffold_carries(carried):
+    scaffold, means, quats, _ = carried
+    apart = PerGaussian.following(scaffold, means)
+    for t in scaffold.path.times[[1, 4, 7]]:
+        assert torch.allclose(apart.warp(means, quats, t)[0], scaffold.warp(means, quats, t)[0], atol=1e-5)
+    # between knots both are splines, of the places here and of the nodes' poses there
+    x, q = apart.warp(means, quats, 0.5)
+    assert (x - scaffold.warp(means, quats, 0.5)[0]).norm(dim=1).max() < 5e-3 and torch.equal(q, quats)
+    sampled = PerGaussian.following(scaffold, means, Sampled.of(0.0, 1.2, FRAME))
+    assert torch.allclose(sampled.warp(means, quats, 0.5)[0], scaffold.warp(means, quats, 0.5)[0], atol=1e-4)
+
+
+def test_paths_from_the_nearest_raw_tracks():
+    """Each Gaussian takes over its own track's displacement, which is held while the track is not seen."""
+    t = np.arange(20) / 30
+    xyz = np.zeros((3, 20, 3))
+    xyz[0, :, 0], xyz[1, :, 1] = t, 1 + 2 * t
+    xyz[2] = [5.0, 5.0, 5.0]
+    visible = np.ones((3, 20), bool)
+    visible[0, 10:] = False
+    visible[2, :15] = False  # near no one when the third is bound
+    tracks = TrackSet(np.where(visible[..., None], xyz, np.nan), visible, fps=30)
+    path = HermiteSpline.of(0.0, 19 / 30, 2 * FRAME, 2 * FRAME)
+    means = torch.tensor([[0.2, 0.01, 0], [0.0, 1.4, 0.1], [5.0, 4.9, 5.0]])
+    motion = PerGaussian.from_tracks([tracks], np.zeros(1), means, [5 / 30, 5 / 30, 5 / 30], path, frame_step=FRAME)
+    x, _ = motion.warp(means, torch.zeros(3, 4), 8 / 30)
+    assert torch.allclose(x[0], means[0] + torch.tensor([3 / 30, 0, 0]), atol=1e-5)
+    assert torch.allclose(x[1], means[1] + torch.tensor([0, 6 / 30, 0]), atol=1e-5)
+    assert torch.allclose(motion.warp(means, x, 5 / 30)[0], means, atol=1e-2)
+    late, _ = motion.warp(means, torch.zeros(3, 4), 18 / 30)
+    assert torch.allclose(late[0], means[0] + torch.tensor([4 / 30, 0, 0]), atol=1e-3)
+
+
+def test_paths_of_their_own_are_learnt_and_taken():
+    path = HermiteSpline(0.0, 0.1, 8)
+    motion = PerGaussian(path, torch.randn(8, 6, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)))
+    means = torch.randn(6, 3, dtype=torch.float64)
+    t = torch.tensor(0.33, dtype=torch.float64, requires_grad=True)
+    knots = motion.own_knots.clone().requires_grad_()
+    assert torch.autograd.gradcheck(
+        lambda k, s: motion.with_parameters({"own_knots": k}).warp(means, means, s)[0], (knots, t)
+    )
+    part = motion.take(torch.tensor([4, 4, 0]))
+    assert torch.equal(part.warp(means[[4, 4, 0]], means, 0.5)[0], motion.warp(means, means, 0.5)[0][[4, 4, 0]])
+
+
+def test_nothing_moves_and_nothing_is_computed():
+    means, quats = random_gaussians(5)
+    motion = Static()
+    assert motion.parameters() == {} and motion.take(np.arange(2)) is motion and motion.with_parameters({}) is motion
+    x, q = motion.warp(means, quats, 0.3)
+    assert x is means and q is quats
+
+
+# --- checkpoints
+
+
+@pytest.mark.parametrize("videos", [0, 2])
+def test_motions_survive_their_arrays(videos, tmp_path):
+    scaffold = random_scaffold(videos=videos, blend="dual-quaternion")
+    path = HermiteSpline(0.0, 0.1, 8)
+    for motion in (scaffold, scaffold.on(Sampled(0.0, FRAME, 30)), PerGaussian(path, torch.randn(8, 200, 3)), Static()):
+        np.savez(tmp_path / "motion.npz", **motion.arrays())
+        with np.load(tmp_path / "motion.npz", allow_pickle=False) as file:
+            again = motion_from_arrays(dict(file))
+        assert type(again) is type(motion)
+        gaussians = random_gaussians(200)
+        for a, b in zip(again.warp(*gaussians, 0.31), motion.warp(*gaussians, 0.31), strict=True):
+            assert torch.equal(a, b)
+        if motion is scaffold:
+            for f in fields(scaffold.binding):
+                assert torch.equal(getattr(again.binding, f.name), getattr(scaffold.binding, f.name))
+
+
+def test_arrays_that_are_no_motion_are_refused():
+    arrays = random_scaffold().arrays()
+    for broken in ({}, {"kind": np.array("os")}, {k: v for k, v in arrays.items() if k != "knots"}):
+        with pytest.raises(ValueError, match="arrays"):
+            motion_from_arrays(broken)
+    with pytest.raises(ValueError, match="knots"):
+        motion_from_arrays(arrays | {"knots": arrays["knots"][1:]})
+
+
+def test_learnable_tensors_are_replaced_not_copied():
+    scaffold = random_scaffold()
+    knots = leaves(scaffold.parameters())
+    other = scaffold.with_parameters(knots)
+    assert set(knots) == {"knots", "knot_quats"} and other.knots is knots["knots"]
+    assert other.binding is scaffold.binding  # its layout is computed once
+    assert other.to("cpu").knots is knots["knots"]
+
+
+# --- more nodes, fewer nodes
+
+
+def test_nodes_grow_where_gaussians_pull(carried):
+    scaffold, means, quats, _ = carried
+    pull = 0.1 + 0 * means[:, 0]
+    high = means[:, 1] > 0.45
+    pull[high] = 1.0
+    change = density.grow(scaffold, means, pull, most=20)
+    grown, new = change.scaffold, change.source < 0
+    assert 0 < int(new.sum()) <= 20 and torch.equal(change.source[~new], torch.arange(len(scaffold)))
+    assert torch.equal(grown.knots[:, ~new], scaffold.knots)
+    place = grown.nodes(0.3)[0][new]
+    assert (place[:, 1] > 0.3).all()  # about where it was asked for
+    nearest = torch.cdist(place, scaffold.nodes(0.3)[0]).amin(1)
+    assert (nearest > 0.3 * scaffold.unit).all()
+    # the others are carried on as before
+    for t, most in ((0.3, 2e-2), (0.6, 2e-2), (0.9, 2e-2)):
+        away = (grown.warp(means, quats, t)[0] - scaffold.warp(means, quats, t)[0]).norm(dim=1)
+        assert away.quantile(0.95) < most and away.median() < 2e-3
+    bound = grown.binding
+    assert (bound.weights.sum(1) - 1).abs().max() < 1e-5 and torch.equal(bound.rest, scaffold.binding.rest)
+    assert (bound.nodes[:, 0] >= len(scaffold)).any()
+    q = unit(grown.knot_quats)
+    assert ((q[1:] * q[:-1]).sum(-1) > 0).all()
+
+
+def test_a_rigid_motion_is_not_changed_by_growing():
+    from scipy.spatial.transform import Rotation
+
+    from recon.motion.rotations import continuous, quaternions
+
+    rng = np.random.default_rng(0)
+    scaffold = random_scaffold(gaussians=0, rests=(), dtype=torch.float64)
+    turns = Rotation.from_rotvec(0.3 * np.arange(8)[:, None] * np.array([0, 0.6, 0.8]))
+    cloud = rng.normal(size=(40, 3))
+    knots = torch.from_numpy(np.stack([r.apply(cloud) for r in turns]))
+    quats = torch.from_numpy(continuous(quaternions(turns.as_matrix())))[:, None].repeat(1, 40, 1)
+    scaffold = replace(scaffold, knots=knots, knot_quats=quats)
+    means = rng.normal(size=(300, 3))
+    bound = scaffold.bind(means[:150], 8 * FRAME).bind(means[150:], 20 * FRAME)
+    pull, points = torch.from_numpy(rng.exponential(size=300) ** 3), torch.from_numpy(means)
+    change = density.grow(bound, points, pull)
+    assert len(change.scaffold) > 40
+    upright = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).repeat(300, 1)
+    for t in (0.0, 12 * FRAME, 28 * FRAME):
+        a, b = bound.warp(points, upright, t), change.scaffold.warp(points, upright, t)
+        assert torch.allclose(a[0], b[0], atol=1e-9)
+        assert torch.allclose(rotation_matrices(unit(a[1])), rotation_matrices(unit(b[1])), atol=1e-9)
+
+
+def test_gradients_of_nodes_are_means_over_their_gaussians():
+    scaffold = random_scaffold()
+    pull = torch.rand(200)
+    found = density.node_gradients(scaffold, pull)
+    bound = scaffold.binding
+    for m in (0, 17):
+        share = (bound.weights * (bound.nodes == m)).sum(1)
+        assert float(found[m]) == pytest.approx(float((share * pull).sum() / share.sum()), rel=1e-4)
+    assert torch.equal(density.grow(scaffold, random_gaussians(200)[0], 0 * pull).source, torch.arange(len(scaffold)))
+    with pytest.raises(ValueError, match="gradients"):
+        density.grow(scaffold, random_gaussians(200)[0], pull[:5])
+
+
+def test_nodes_without_gaussians_are_pruned(carried):
+    scaffold, means, quats, _ = carried
+    left = np.flatnonzero(means[:, 0].numpy() < 0)
+    part = scaffold.take(left)
+    change = density.prune(part)
+    pruned = change.scaffold
+    assert len(pruned) < 0.8 * len(scaffold) and len(change.source) == len(pruned)
+    assert torch.equal(pruned.knots, scaffold.knots[:, change.source])
+    largest = torch.zeros(len(pruned)).scatter_reduce(
+        0, pruned.binding.nodes.ravel(), pruned.binding.weights.ravel(), "amax"
+    )
+    assert (largest >= 0.02).all() and (pruned.binding.weights.sum(1) - 1).abs().max() < 1e-5
+    away = pruned.warp(means[left], quats[left], 0.6)[0] - part.warp(means[left], quats[left], 0.6)[0]
+    assert away.norm(dim=1).max() < 5e-3
+    every = density.prune(pruned)
+    assert len(every.scaffold) == len(pruned)
+    assert len(density.prune(scaffold.take(left[:0])).scaffold) == len(scaffold)
+    with pytest.raises(ValueError, match="least"):
+        density.prune(scaffold, least=0.5)
+
+
+def test_a_change_of_one_videos_nodes_stays_with_it():
+    scaffold = random_scaffold(gaussians=0, rests=(), videos=2)
+    points = np.random.default_rng(0).normal(size=(200, 3))
+    bound = scaffold.bind(points[:100], 0.2, video=0).bind(points[100:], 0.2, video=1)
+    pull = torch.cat([torch.full((100,), 0.1), torch.full((100,), 1.0)])
+    pull[::7] *= 30
+    grown = density.grow(bound, torch.from_numpy(points).float(), pull).scaffold
+    assert len(grown) > len(scaffold)
+    owner = grown.clock[grown.binding.nodes]
+    assert (owner[:100] == 0).all() and (owner[100:] == 1).all()
+    tied = grown.edge_weights > 0
+    assert (grown.clock[grown.edges] == grown.clock[:, None])[tied].all()
+    assert len(density.prune(grown).scaffold.clock) == len(density.prune(grown).scaffold)
+
+
+def test_neighbours_found_anew_are_those_of_building(carried):
+    scaffold = carried[0]
+    again = density.retie(scaffold)
+    same = [len(set(a) & set(b)) for a, b in zip(again.edges.tolist(), scaffold.edges.tolist(), strict=True)]
+    assert np.mean(same) > 7.5
+    bound = density.rebind(scaffold, carried[1]).binding
+    assert torch.equal(bound.nodes, scaffold.binding.nodes)
+    assert torch.allclose(bound.weights, scaffold.binding.weights, atol=1e-5)
