@@ -12,11 +12,12 @@ The help of the commands, the benchmarks and the catalogue of hard cases then li
 
 from __future__ import annotations
 
+import ast
 import importlib
 import os
 import re
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, TypeVar
@@ -91,6 +92,43 @@ def load_files(paths: Iterable[str | os.PathLike[str]]) -> None:
 def load_environment() -> None:
     """Import the files that ``OTSYNC_PLUGINS`` names."""
     load_files(filter(None, os.environ.get(ENVIRONMENT, "").split(os.pathsep)))
+
+
+def made(text: str, choices: Mapping[str, Any], what: str) -> Any:
+    """The object that the shell spells ``name`` or ``name:field=value,field=value``.
+
+    Args:
+        choices: what there is, by name: as :func:`available` gives it. Classes are called with the fields, everything
+            else is taken as it is.
+        what: the option, for errors: ValueError names it, what was expected and what was found.
+
+    Example:
+        >>> made("mine:weight=0.5", {"mine": dict}, "--losses")
+        {'weight': 0.5}
+    """
+    name, _, rest = text.partition(":")
+    if name not in choices:
+        raise ValueError(f"{what}: expected some of {', '.join(choices)}; found {name!r}.")
+    thing, fields = choices[name], {}
+    for part in filter(None, rest.split(",")):
+        field, equals, value = part.partition("=")
+        if not equals:
+            raise ValueError(f"{what}: expected {name}:field=value,field=value; found {text!r}.")
+        fields[field.strip().replace("-", "_")] = _value(value.strip())
+    if not isinstance(thing, type) and not fields:
+        return thing
+    try:
+        return thing(**fields)
+    except TypeError as error:
+        raise ValueError(f"{what}: {text!r} cannot be made: {error}") from None
+
+
+def _value(text: str) -> Any:
+    """A number, a truth value, None, or the text itself."""
+    try:
+        return ast.literal_eval(text)
+    except (ValueError, SyntaxError):
+        return text
 
 
 def forget(*things: Any) -> None:
