@@ -27,7 +27,8 @@ from .match.dense import (
 )
 from .match.verb import match, matcher_for
 from .refine.splines import SplineRefine
-from .refine.verb import Unrefined, refine
+from .refine.unrefined import Unrefined
+from .refine.verb import refine
 from .sync.graph import Graph
 from .sync.verb import synchronize
 from .types import Alignment, Camera, Matches, Offsets, Refused, Status, TrackSet, Video

@@ -1,7 +1,8 @@
 """Alignment: ``align(a, b, matches, aligner)`` and the aligners that go in its slot (paper, Sec. 3.4)."""
 
 from .likelihood import LikelihoodScan
-from .verb import Aligner, align
+from .slot import Aligner
+from .verb import align
 from .warping import DTW, ConstantShift
 
 __all__ = ["ALIGNERS", "DTW", "Aligner", "ConstantShift", "LikelihoodScan", "align"]

@@ -13,6 +13,7 @@ from ..costs.linear import binary_scale, velocity
 from ..types import Alignment, Matches, Status, TrackSet, in_order
 from ..types.trust import Trust
 from .peaks import local_peaks, vertex
+from .slot import Aligner
 
 MIN_OVERLAP = 24 / 30
 """Seconds that two videos must share for an offset to be considered."""
@@ -37,7 +38,7 @@ RATE_MATCHES = 40
 
 
 @dataclass(frozen=True)
-class LikelihoodScan:
+class LikelihoodScan(Aligner):
     """Log-likelihood ratio of "these two tracks show the same motion" against "unrelated", at every shift.
 
     For match m, shift k and a signal of a and b over the n frames that both see (the mean over them removed)::

@@ -4,21 +4,15 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
-from typing import Protocol
 
 from ..clocks.shutter import at_frame_times
 from ..types import Alignment, Matches, Refused, TrackSet, check_same_world
 from .likelihood import LikelihoodScan
-
-
-class Aligner(Protocol):
-    """The ``aligner`` slot."""
-
-    def __call__(self, a: TrackSet, b: TrackSet, matches: Matches) -> Alignment: ...
+from .slot import Aligner, AlignerLike
 
 
 def align(
-    a: TrackSet, b: TrackSet, matches: Matches, aligner: Aligner | None = None, *, throw: bool = True
+    a: TrackSet, b: TrackSet, matches: Matches, aligner: AlignerLike | None = None, *, throw: bool = True
 ) -> Alignment:
     """When b happened on a's clock: ``offset(a, b)`` in seconds, positive when b started later.
 
@@ -28,16 +22,16 @@ def align(
         aligner: the algorithm; default :class:`LikelihoodScan`; the paper's is :class:`DTW`.
         throw: raise :class:`otsync.Refused` when the answer is flagged, instead of returning it.
     """
-    needs_xyz = getattr(aligner, "needs_xyz", True)  # the epipolar scan reads pixels
-    a.check("a", xyz=needs_xyz)
-    b.check("b", xyz=needs_xyz)
+    chosen = LikelihoodScan() if aligner is None else Aligner.of(aligner)
+    a.check("a", xyz=chosen.needs_xyz)
+    b.check("b", xyz=chosen.needs_xyz)
     check_same_world(a, b)
     matches.check("matches", len(a), len(b))
     a, b = at_frame_times(a), at_frame_times(b)
     started = time.perf_counter()
-    found = (aligner or LikelihoodScan())(a, b, matches)
-    seconds = found.stats.get("seconds", time.perf_counter() - started)
-    found = replace(found, stats=found.stats | {"seconds": seconds})
-    if throw and not found.status.ok:
-        raise Refused("align", found)
-    return found
+    alignment = chosen(a, b, matches)
+    seconds = alignment.stats.get("seconds", time.perf_counter() - started)
+    alignment = replace(alignment, stats=alignment.stats | {"seconds": seconds})
+    if throw and not alignment.status.ok:
+        raise Refused("align", alignment)
+    return alignment

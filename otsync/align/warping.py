@@ -16,13 +16,14 @@ from ..costs.linear import frame_cost, velocity
 from ..types import Alignment, Matches, Status, TrackSet
 from .likelihood import MIN_OVERLAP, unanswered
 from .peaks import is_constant, most_frequent, peak
+from .slot import Aligner
 
 VELOCITY_HALF = 3
 """Half window, in frames at 30 fps, of the velocities of the velocity cost."""
 
 
 @dataclass(frozen=True)
-class DTW:
+class DTW(Aligner):
     """The paper's coarse synchronisation: dynamic time warping over D_geo, then the most frequent offset of its path.
 
     D_geo is the mean L1 distance over the matches seen in both frames; cells without any get the median of the
@@ -71,7 +72,7 @@ class DTW:
 
 
 @dataclass(frozen=True)
-class ConstantShift:
+class ConstantShift(Aligner):
     """Best constant shift of the same cost: DTW without the freedom to warp, its first rival.
 
     The mean cost along every diagonal, the lowest one, and the vertex of a parabola through its neighbours.

@@ -8,10 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ..align.verb import Aligner, align
+from ..align.slot import AlignerLike
+from ..align.verb import align
 from ..align.warping import DTW, ConstantShift
 from ..match.dense import FusedGromovWasserstein, OptimalTransport
-from ..match.verb import Matcher, match
+from ..match.slot import MatcherLike
+from ..match.verb import match
 from ..metrics import match_quality
 from ..progress import counted
 from ..simulate import matching_world, simulate
@@ -21,8 +23,8 @@ from .record import run_python, table, write_rows
 
 CLASSES = ("boxes", "juggle", "softball", "tennis", "basketball", "football")
 BANDS = ((0, 10), (10, 30), (30, 50))
-MATCHERS: dict[str, Matcher] = {"EMD on features": OptimalTransport(), "FGW (CG)": FusedGromovWasserstein()}
-ALIGNERS: dict[str, Aligner] = {
+MATCHERS: dict[str, MatcherLike] = {"EMD on features": OptimalTransport(), "FGW (CG)": FusedGromovWasserstein()}
+ALIGNERS: dict[str, AlignerLike] = {
     "paper (DTW, mode)": DTW(),
     "open-end DTW": DTW(open_ends=True),
     "DTW on velocities": DTW(cost="velocity"),

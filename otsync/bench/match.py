@@ -20,7 +20,7 @@ from ..costs.linear import Cosine, total_cost
 from ..match.anchored import AnchoredFGW
 from ..match.dense import EntropicFGW, FusedGromovWasserstein, NearestNeighbor, OptimalTransport, PartialFGW
 from ..match.problem import from_plan, normalised_structure, uniform
-from ..match.verb import Matcher
+from ..match.slot import MatcherLike
 from ..metrics import match_quality
 from ..progress import counted, say
 from ..simulate import matching_world
@@ -50,7 +50,7 @@ class PotDefaults:
 
 
 #: name -> matcher, and the largest size it is tried at
-MATCHERS: dict[str, tuple[Matcher, int]] = {
+MATCHERS: dict[str, tuple[MatcherLike, int]] = {
     REFERENCE: (PotDefaults(), 5000),
     "NearestNeighbor": (NearestNeighbor(), 5000),
     "OptimalTransport": (OptimalTransport(), 5000),
@@ -62,7 +62,7 @@ MATCHERS: dict[str, tuple[Matcher, int]] = {
 }
 
 
-def rivals() -> dict[str, tuple[Matcher, int]]:
+def rivals() -> dict[str, tuple[MatcherLike, int]]:
     """Other packages' FGW, where they are installed."""
     from . import rivals
 

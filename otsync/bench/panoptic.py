@@ -37,10 +37,10 @@ from ..priors.stereo import Rig
 from ..progress import counted
 from ..recordings.routes import COLOUR, Stages, pairs_in_pixels, pairs_in_space
 from ..recordings.tracking import pixel_tracks
-from ..refine.verb import Unrefined
+from ..refine.unrefined import Unrefined
 from ..sync.graph import Graph
 from ..sync.verb import synchronize
-from ..types import Matches, Offsets, TrackSet
+from ..types import Clock, Matches, Offsets, TrackSet
 from .record import table, write_rows
 
 BANDS = ((1, 10), (11, 30), (31, 50))
@@ -253,7 +253,7 @@ def matching_table(material: Material, protocol: Protocol, map: MapLike) -> list
         "anchored FGW, best 100": best(AnchoredFGW(), 100),
         "anchored FGW with curve, best 100": best(AnchoredFGW(costs=both), 100),
         "two partners, features + curve, best 200": best(Candidates(2, 200, both), None),
-        "the same again at synchronised times": best(Candidates(2, 200, both).at(0.0), None),
+        "the same again at synchronised times": best(Candidates(2, 200, both).at(Clock()), None),
     }
     found: dict[str, list[tuple[float, float, int]]] = {name: [] for name in matchers}
 

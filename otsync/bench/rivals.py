@@ -9,7 +9,7 @@ import numpy as np
 
 from ..costs.linear import Cosine
 from ..match.problem import Problem, from_plan
-from ..match.verb import Matcher
+from ..match.slot import MatcherLike
 from ..types import Matches, TrackSet
 
 
@@ -36,6 +36,6 @@ class OttJax:
         return from_plan(plan, problem.gradient(plan), problem.p, problem.q, 1.0, stats, False)
 
 
-def installed() -> dict[str, tuple[Matcher, int]]:
+def installed() -> dict[str, tuple[MatcherLike, int]]:
     """name -> (matcher, largest size) of the packages found."""
     return {"ott-jax": (OttJax(), 2000)} if find_spec("ott") else {}

@@ -12,12 +12,15 @@ from pathlib import Path
 import numpy as np
 
 from ..align.likelihood import LikelihoodScan
-from ..align.verb import Aligner, align
+from ..align.slot import AlignerLike
+from ..align.verb import align
 from ..align.warping import DTW, ConstantShift
 from ..files.arrays import atomic_write
 from ..progress import counted, say
+from ..refine.slot import RefinerLike
 from ..refine.splines import SplineRefine
-from ..refine.verb import Refiner, Unrefined, refine
+from ..refine.unrefined import Unrefined
+from ..refine.verb import refine
 from ..sync.graph import Graph
 from ..sync.verb import synchronize
 from ..types import Status
@@ -27,7 +30,7 @@ from .sync_acceptance import WRONG, acceptance, pair_rows
 from .sync_shutter import READOUT, shutter_rows
 from .sync_worlds import BANDS, FPS, FRESH, MOVING, many, motions, pair_cases
 
-METHODS: dict[str, tuple[Aligner, Refiner]] = {
+METHODS: dict[str, tuple[AlignerLike, RefinerLike]] = {
     "paper (DTW, mode)": (DTW(), Unrefined()),
     "open-end DTW": (DTW(open_ends=True), Unrefined()),
     "DTW on velocities": (DTW(cost="velocity"), Unrefined()),

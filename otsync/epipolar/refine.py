@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 from ..clocks.common import nominal_fps, on_clock
 from ..clocks.splines import TrackSplines
 from ..geometry import fundamentals, seen_pixels
+from ..refine.slot import Refiner
 from ..types import Alignment, Matches, Status, TrackSet, in_order
 from ..types.trust import Trust
 from .scan import EpipolarScan, unit_of
@@ -21,7 +22,7 @@ LEAST_SIGMA = 0.03 / 30
 
 
 @dataclass(frozen=True)
-class EpipolarRefine:
+class EpipolarRefine(Refiner):
     """Continuous offset that flattens the epipolar residuals of the candidates which the scan's offset supports.
 
     Candidates are weighed at the start (their share of their track's mixture), then

@@ -14,6 +14,7 @@ from jaxtyping import Float, Int
 
 from ..align.likelihood import MIN_OVERLAP
 from ..align.peaks import peak, separate_peaks
+from ..align.slot import Aligner
 from ..clocks.common import nominal_fps, on_clock
 from ..geometry import fundamentals
 from ..types import Alignment, Matches, Status, TrackSet, in_order
@@ -23,7 +24,7 @@ MIXTURE_CAP, FLOOR, TRACK_CAP = 80.0, -1.0, 32.0
 
 
 @dataclass(frozen=True)
-class EpipolarScan:
+class EpipolarScan(Aligner):
     """Evidence of every lag from ``uv`` and the calibration alone.
 
     Per candidate pair and lag: -n/16 [log(1 + V/s²) - median over lags], n samples (at least ``min_overlap``), summed

@@ -1,6 +1,7 @@
 """Matching: ``match(a, b, matcher)`` and the matchers that go in its slot (paper, Sec. 3.3).
 
-verb.py         match(), and what a matcher is
+verb.py         match()
+slot.py         what a matcher is, and what it may declare
 problem.py      one FGW problem in the paper's units; from a plan to matches
 dense.py        the matchers over a full cost matrix: nearest neighbour, OT, FGW, GW, entropic and partial FGW
 sinkhorn.py     stabilised Sinkhorn
@@ -14,8 +15,9 @@ frontier.py     which matcher fits which time
 from .anchored import AnchoredFGW
 from .candidates import Candidates
 from .dense import EntropicFGW, FusedGromovWasserstein, GromovWasserstein, NearestNeighbor, OptimalTransport, PartialFGW
+from .slot import Matcher
 from .synchronous import SynchronousMatching
-from .verb import Matcher, match, matcher_for
+from .verb import match, matcher_for
 
 __all__ = [
     "AnchoredFGW",

@@ -8,12 +8,13 @@ import numpy as np
 
 from ..costs.linear import Cosine, Cost, total_cost
 from ..costs.positions import CurveDistance, MedianPosition, SynchronousDistance
-from ..types import Matches, TrackSet
+from ..types import Clock, Matches, TrackSet
 from .problem import by_score, is_flat, no_information
+from .slot import Matcher
 
 
 @dataclass(frozen=True)
-class Candidates:
+class Candidates(Matcher):
     """A matcher that keeps every track's ``k`` cheapest partners, as seen from both videos.
 
     Two videos rarely follow the same points, but a track has several neighbours on the same limb, each as good a
@@ -28,7 +29,7 @@ class Candidates:
     top: int | None = 200
     costs: tuple[Cost, ...] = (Cosine(center=False),)
 
-    def at(self, offset: float, rate: float = 1.0) -> Candidates:
+    def at(self, clock: Clock) -> Candidates:
         """The matcher to use once ``t_a = rate * t_b + offset`` is known: distance at equal times replaces the costs
         of position that need no time.
 
@@ -36,7 +37,7 @@ class Candidates:
         three partners a track leave 200 and .07.
         """
         timeless = tuple(c for c in self.costs if not isinstance(c, CurveDistance | MedianPosition))
-        return replace(self, k=self.k + 1, costs=(*timeless, SynchronousDistance(offset, rate=rate)))
+        return replace(self, k=self.k + 1, costs=(*timeless, SynchronousDistance(clock.offset, rate=clock.rate)))
 
     def __call__(self, a: TrackSet, b: TrackSet) -> Matches:
         cost = total_cost(self.costs, a, b)

@@ -18,6 +18,7 @@ from ..types import Matches, TrackSet
 from ..types.checks import positive
 from .problem import FLAT, Problem, by_score, from_plan, is_flat, linear_cost, no_information, uniform
 from .sinkhorn import sinkhorn
+from .slot import Matcher
 
 log = logging.getLogger("otsync")
 
@@ -26,7 +27,7 @@ LP_PIVOTS = 10_000_000
 
 
 @dataclass(frozen=True)
-class NearestNeighbor:
+class NearestNeighbor(Matcher):
     """Mutual nearest neighbours by the linear cost: what one does without transport."""
 
     costs: tuple[Cost, ...] = (Cosine(),)
@@ -42,7 +43,7 @@ class NearestNeighbor:
 
 
 @dataclass(frozen=True)
-class OptimalTransport:
+class OptimalTransport(Matcher):
     """Transport on features only: the paper's ablation.
 
     Args:
@@ -73,7 +74,7 @@ class OptimalTransport:
 
 
 @dataclass(frozen=True)
-class FusedGromovWasserstein:
+class FusedGromovWasserstein(Matcher):
     """The paper's FGW by POT's conditional gradient.
 
     F(γ) = Σ (C^a_ik - C^b_jl)² γ_ij γ_kl + α/2 <M, γ>, C divided by the common median of both videos.
@@ -122,7 +123,7 @@ class FusedGromovWasserstein:
 
 
 @dataclass(frozen=True)
-class GromovWasserstein:
+class GromovWasserstein(Matcher):
     """Structure only, no features: it cannot see mirror images, and shows what features add."""
 
     max_iter: int = 500
@@ -134,7 +135,7 @@ class GromovWasserstein:
 
 
 @dataclass(frozen=True)
-class EntropicFGW:
+class EntropicFGW(Matcher):
     """FGW by projected gradient with entropic steps (stabilised Sinkhorn).
 
     Args:
@@ -176,7 +177,7 @@ class EntropicFGW:
 
 
 @dataclass(frozen=True)
-class PartialFGW:
+class PartialFGW(Matcher):
     """FGW that transports only ``mass`` of both videos and leaves the rest unmatched.
 
     Balanced marginals force every outlier onto something; measured at N = 2000, mass .65 raises precision from

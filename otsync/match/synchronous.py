@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from ..clocks.splines import TrackSplines
 from ..costs.linear import Cosine, Cost, binary_scale, total_cost
 from ..types import Matches, Status, TrackSet
+from .slot import Matcher
 
 MOMENTS = 48
 """Synchronous moments that distances are averaged over."""
@@ -27,7 +28,7 @@ FARTHEST = 3.0
 
 
 @dataclass(frozen=True)
-class SynchronousMatching:
+class SynchronousMatching(Matcher):
     """Mutual nearest neighbours in features, place and motion at synchronised times: a matcher for one pair of videos.
 
     The cost of two tracks is the sum of their feature distance, the mean (each moment cut off at three units) of their

@@ -5,24 +5,19 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Protocol
 
 from ..clocks.shutter import at_frame_times
 from ..types import Matches, Refused, TrackSet
 from ..types.checks import positive
+from .anchored import AnchoredFGW
 from .dense import FusedGromovWasserstein, NearestNeighbor, OptimalTransport, PartialFGW, log
 from .frontier import ANCHORED_FROM, fitting
+from .slot import Matcher, MatcherLike
 from .vouch import vouch
 
 
-class Matcher(Protocol):
-    """The ``matcher`` slot."""
-
-    def __call__(self, a: TrackSet, b: TrackSet) -> Matches: ...
-
-
 def match(
-    a: TrackSet, b: TrackSet, matcher: Matcher | None = None, *, budget: float | None = None, throw: bool = True
+    a: TrackSet, b: TrackSet, matcher: MatcherLike | None = None, *, budget: float | None = None, throw: bool = True
 ) -> Matches:
     """Correspondences between the tracks of two videos.
 
@@ -42,18 +37,18 @@ def match(
     a, b = at_frame_times(a), at_frame_times(b)
     if matcher is not None and budget is not None:
         raise ValueError("matcher, budget: expected one of them; found both. A budget chooses the matcher.")
-    matcher = matcher or matcher_for(len(a), len(b), budget)
+    chosen = matcher_for(len(a), len(b), budget) if matcher is None else Matcher.of(matcher)
     if budget is not None:
-        log.info("match: %s fits %g s for %d x %d tracks", matcher, budget, len(a), len(b))
+        log.info("match: %s fits %g s for %d x %d tracks", chosen, budget, len(a), len(b))
     started = time.perf_counter()
-    found = matcher(a, b)
-    found.check("matcher", len(a), len(b))
-    found = vouch(found, a, b, getattr(matcher, "costs", ()))
-    seconds = found.stats.get("seconds", time.perf_counter() - started)
-    found = replace(found, stats=found.stats | {"seconds": seconds})
-    if throw and not found.status.ok:
-        raise Refused("match", found)
-    return found
+    matches = chosen(a, b)
+    matches.check("matcher", len(a), len(b))
+    matches = vouch(matches, a, b, chosen.costs)
+    seconds = matches.stats.get("seconds", time.perf_counter() - started)
+    matches = replace(matches, stats=matches.stats | {"seconds": seconds})
+    if throw and not matches.status.ok:
+        raise Refused("match", matches)
+    return matches
 
 
 def matcher_for(n_a: int, n_b: int, budget: float | None = None) -> Matcher:
@@ -63,8 +58,6 @@ def matcher_for(n_a: int, n_b: int, budget: float | None = None) -> Matcher:
     it is both faster and more precise than any dense solver. Seconds are those of one thread of the machine that the
     benchmark was measured on (:mod:`otsync.frontier`).
     """
-    from .anchored import AnchoredFGW
-
     known: dict[str, Callable[[], Matcher]] = {
         "NearestNeighbor": NearestNeighbor,
         "OptimalTransport": OptimalTransport,

@@ -26,7 +26,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ..align.likelihood import LikelihoodScan
-from ..align.verb import Aligner
+from ..align.slot import Aligner
 from ..clocks.shutter import check_within_a_frame
 from ..compute.threads import MapLike
 from ..costs.linear import Cosine, Labels
@@ -38,11 +38,11 @@ from ..files.digest import content_key
 from ..geometry import seen_pixels
 from ..io.scene import Scene
 from ..match.candidates import Candidates
-from ..match.verb import Matcher
+from ..match.slot import Matcher
 from ..priors.stereo import HullStereo, Rig
 from ..progress import Stopwatch, Tell
+from ..refine.slot import Refiner
 from ..refine.splines import SplineRefine
-from ..refine.verb import Refiner
 from ..sync.graph import Graph
 from ..sync.verb import synchronize
 from ..types import Offsets, Status, TrackSet, Video

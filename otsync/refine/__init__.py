@@ -1,7 +1,9 @@
 """Refinement: ``refine(a, b, matches, alignment, refiner)`` and the refiners that go in its slot."""
 
+from .slot import Refiner
 from .splines import SplineRefine
-from .verb import Refiner, Unrefined, refine
+from .unrefined import Unrefined
+from .verb import refine
 
 __all__ = ["REFINERS", "Refiner", "SplineRefine", "Unrefined", "refine"]
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Literal
 
 import numpy as np
 
@@ -15,8 +14,10 @@ from ..clocks.common import nominal_fps, strongest
 from ..clocks.splines import SMOOTHING, TrackSplines
 from ..costs.linear import binary_scale
 from ..types import Alignment, Clock, Matches, Status, TrackSet, in_order
+from ..types.checks import positive
 from ..types.trust import Trust
 from .gauss_newton import Fit, fit_clock, overlap_seconds, velocity_correlation
+from .slot import Rate, Refiner
 
 LEAST_SIGMA = 0.012 / 30
 """Seconds; no sigma is reported below this."""
@@ -33,7 +34,7 @@ VELOCITY = 5 / 30
 
 
 @dataclass(frozen=True)
-class SplineRefine:
+class SplineRefine(Refiner):
     """Offset of two sets of continuous curves by robust Gauss-Newton, with an honest sigma.
 
     Tracks become penalised cubic splines that never answer within a gap. The residual of a match is the difference of
@@ -54,7 +55,7 @@ class SplineRefine:
 
     windows: tuple[float, ...] = (14 / 30, 10 / 30, 28 / 30)
     smoothing: float = SMOOTHING
-    rate: Literal["fixed", "fit"] = "fixed"
+    rate: Rate = "fixed"
     limit: int = 500
     trust: Trust = field(default_factory=Trust)
 
@@ -97,6 +98,17 @@ class SplineRefine:
             flags=flags,
             stats=stats,
         )
+
+    def __post_init__(self) -> None:
+        if self.rate not in ("fixed", "fit"):
+            raise ValueError(f"SplineRefine.rate: expected 'fixed' or 'fit'; found {self.rate!r}.")
+        if not self.windows or not all(w > 0 for w in self.windows):
+            raise ValueError(f"SplineRefine.windows: expected seconds above 0, at least one; found {self.windows}.")
+        positive("SplineRefine.smoothing", self.smoothing, zero=True)
+        positive("SplineRefine.limit", self.limit)
+
+    def with_rate(self, rate: Rate) -> SplineRefine:
+        return replace(self, rate=rate)
 
     def splines(self, a: TrackSet, b: TrackSet, matches: Matches) -> tuple[TrackSplines, TrackSplines]:
         """Curves of the matched tracks, in units of a power of two near their size; repeated tracks are fitted once."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -88,19 +89,21 @@ class Solution:
 
 def components(n: int, edges: Sequence[Edge] | Sequence[Pair]) -> Int[np.ndarray, " V"]:
     """The smallest index of each video's connected component."""
-    root = list(range(n))
+    from scipy.sparse.csgraph import connected_components
 
-    def find(v: int) -> int:
-        while root[v] != v:
-            root[v] = root[root[v]]
-            v = root[v]
-        return v
+    labels = connected_components(_adjacency(n, edges), directed=False)[1]
+    smallest = np.full(n, n)
+    np.minimum.at(smallest, labels, np.arange(n))
+    return smallest[labels]
 
-    for e in edges:
-        a, b = (e.a, e.b) if isinstance(e, Edge) else e
-        i, j = find(a), find(b)
-        root[max(i, j)] = min(i, j)
-    return np.array([find(v) for v in range(n)])
+
+def _adjacency(n: int, edges: Sequence[Edge] | Sequence[Pair], weight: Any = None) -> Any:
+    """The graph as scipy's sparse matrix; weights must not be 0, which would be no edge."""
+    from scipy.sparse import coo_array
+
+    ends = np.array([(e.a, e.b) if isinstance(e, Edge) else e for e in edges], int).reshape(-1, 2)
+    values = np.ones(len(ends)) if weight is None else np.asarray(weight, float)
+    return coo_array((values, (ends[:, 0], ends[:, 1])), shape=(n, n)).tocsr()
 
 
 def solve(
@@ -239,24 +242,22 @@ def spanning_trees(
     n: int, edges: Sequence[Edge], weight: Sequence[float], anchor: int, count: int, seed: int
 ) -> list[Float[np.ndarray, " V"]]:
     """Offsets along maximum spanning trees of ``weight``: the first as it is, the others with random factors."""
+    from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
+
     rng = np.random.default_rng(seed)
-    found = []
+    offset = {(e.a, e.b): e.offset for e in edges} | {(e.b, e.a): -e.offset for e in edges}
+    starts = []
     for k in range(count):
         w = np.asarray(weight, float) * (1.0 if k == 0 else rng.uniform(0.2, 1.0, len(edges)))
-        x = np.full(n, np.nan)
-        x[anchor] = 0.0
-        while True:
-            known = np.isfinite(x)
-            crossing = [i for i, e in enumerate(edges) if known[e.a] != known[e.b]]
-            if not crossing:
-                break
-            e = edges[max(crossing, key=lambda i: (w[i], -i))]
-            if known[e.a]:
-                x[e.b] = x[e.a] + e.offset
-            else:
-                x[e.a] = x[e.b] - e.offset
-        found.append(np.where(np.isfinite(x), x, 0.0))
-    return found
+        place = np.empty(len(edges))  # 1 for the heaviest, ties in the given order: no weight is 0
+        place[np.lexsort((np.arange(len(edges)), -w))] = np.arange(1, len(edges) + 1)
+        tree = minimum_spanning_tree(_adjacency(n, edges, place))
+        order, parent = breadth_first_order(tree, anchor, directed=False)
+        x = np.zeros(n)
+        for v in order[1:].tolist():
+            x[v] = x[parent[v]] + offset[int(parent[v]), v]
+        starts.append(x)
+    return starts
 
 
 def cycle_errors(edges: Sequence[Edge]) -> Float[np.ndarray, " C"]:

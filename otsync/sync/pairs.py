@@ -1,4 +1,4 @@
-"""Offsets of all videos from their pairs: ``synchronize(tracks)`` (paper, Sec. 3.4, whose star becomes a graph)."""
+"""The work on one pair of videos: match, align, refine; and refine anew from elsewhere."""
 
 from __future__ import annotations
 
@@ -6,14 +6,15 @@ import dataclasses
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
-from ..align.verb import Aligner, align
-from ..match.verb import Matcher, match
-from ..refine.splines import SplineRefine
-from ..refine.verb import Refiner, refine
+from ..align.slot import Aligner
+from ..align.verb import align
+from ..match.slot import Matcher
+from ..match.verb import match
+from ..refine.slot import Rate, Refiner
+from ..refine.verb import refine
 from ..types import Alignment, Matches, Status, TrackSet
 from .graph import Pair
 from .verdict import Answer
@@ -29,7 +30,7 @@ class Job:
     a: TrackSet
     b: TrackSet
     matcher: Matcher | None
-    aligner: Aligner | None
+    aligner: Aligner
     refiner: Refiner
     matches: Matches | None
 
@@ -38,8 +39,8 @@ def run(job: Job) -> Answer:
     """Match, align and refine one pair. An exception becomes the status FAILED, told in the log."""
     matches = Matches(np.zeros((0, 2), int), flags=(Status.FAILED,))
     try:
-        found = job.matches if job.matches is not None else match(job.a, job.b, job.matcher, throw=False)
-        matches = found.without_plan()
+        given = job.matches if job.matches is not None else match(job.a, job.b, job.matcher, throw=False)
+        matches = given.without_plan()
         if not matches.status.ok:
             failed = Alignment(float("nan"), flags=matches.flags, stats=matches.stats)
             return Answer(job.pair, matches, failed, failed)
@@ -68,7 +69,13 @@ class Refit:
     def of(cls, answer: Answer, offset: float, rate: float, tracks: Sequence[TrackSet], refiner: Refiner) -> Refit:
         i, j = answer.pair
         start = dataclasses.replace(answer.scanned, offset=offset, rate=rate, stats=dict(answer.scanned.stats))
-        return cls(tracks[i], tracks[j], answer.matches, start, with_rate(refiner, "fixed"))
+        return cls(
+            tracks[i],
+            tracks[j],
+            answer.matches,
+            start,
+            refiner if refiner.rate == "fixed" else refiner.with_rate("fixed"),
+        )
 
 
 def run_refit(job: Refit) -> Alignment:
@@ -79,9 +86,12 @@ def run_refit(job: Refit) -> Alignment:
         return Alignment(float("nan"), flags=(Status.FAILED,))
 
 
-def with_rate(refiner: Refiner | None, rate: Literal["fixed", "fit"]) -> Refiner:
-    """The refiner (or the default) told how to treat rates, where it can be told."""
-    refiner = SplineRefine() if refiner is None else refiner
-    if dataclasses.is_dataclass(refiner) and hasattr(refiner, "rate"):
-        return dataclasses.replace(refiner, rate=rate)
-    return refiner
+def with_rate(refiner: Refiner, rate: Rate | None) -> Refiner:
+    """The refiner told how to treat rates; None: as it is. ValueError where it cannot, or was told otherwise."""
+    if rate is None or rate == refiner.rate:
+        return refiner
+    if rate == "fixed":
+        raise ValueError(
+            f"rate, refiner: expected one answer; found rate='fixed' and {refiner}. Leave one of them out."
+        )
+    return refiner.with_rate(rate)

@@ -9,31 +9,32 @@ from typing import Literal
 
 import numpy as np
 
-from ..align.verb import Aligner
+from ..align.likelihood import LikelihoodScan
+from ..align.slot import Aligner, AlignerLike
 from ..clocks.shutter import at_frame_times
 from ..compute.threads import MapLike
 from ..costs.linear import Cosine
+from ..match.slot import Matcher, MatcherLike
 from ..match.synchronous import SynchronousMatching
-from ..match.verb import Matcher
-from ..refine.verb import Refiner
-from ..types import Alignment, Matches, Offsets, TrackSet
-from ..types.trust import Trust
+from ..refine.slot import Rate, Refiner, RefinerLike
+from ..refine.splines import SplineRefine
+from ..types import Alignment, Clock, Matches, Offsets, TrackSet
 from .graph import Graph, Pair
 from .pairs import Job, Refit, run, run_refit, with_rate
-from .verdict import Answer, Settled, settle
+from .verdict import Answer, Verdict, judge
 
 
 def synchronize(
     tracks: Sequence[TrackSet],
     *,
     reference: int | Literal["auto"] = 0,
-    matcher: Matcher | None = None,
-    aligner: Aligner | None = None,
-    refiner: Refiner | None = None,
+    matcher: MatcherLike | None = None,
+    aligner: AlignerLike | None = None,
+    refiner: RefinerLike | None = None,
     matches: Mapping[Pair, Matches] | None = None,
     graph: Graph | None = None,
     rematch: int = 1,
-    rate: Literal["fixed", "fit"] = "fixed",
+    rate: Rate | None = None,
     map: MapLike = map,
 ) -> Offsets:
     """Put every video on the reference's clock.
@@ -53,75 +54,83 @@ def synchronize(
         rematch: how often pairs whose first answer is trusted are matched again with positions at the synchronised
             times (more than once adds nothing); matches of your own are left alone.
         rate: "fixed" takes frame rates as declared; "fit" frees them for pairs that overlap by 20 s and more, and
-            keeps what is significant.
+            keeps what is significant; None: as the refiner says, by default "fixed".
         map: any map-like callable: the builtin, an executor's, dask's. Results do not depend on it.
 
     A pair that fails gets a status and nan; the others live. Wrong input raises ValueError before any work.
     """
-    chosen = check_tracks(tracks, reference, xyz=getattr(aligner, "needs_xyz", True))
-    costs = (Cosine(),) if matcher is None else getattr(matcher, "costs", ())
-    if matches is None and any(isinstance(cost, Cosine) for cost in costs):
+    if rematch < 0:
+        raise ValueError(f"rematch: expected 0 or more; found {rematch}.")
+    if matches is not None and matcher is not None:
+        raise ValueError("matcher, matches: expected one of them; found both. Matches of your own need no matcher.")
+    matching = None if matcher is None else Matcher.of(matcher)
+    aligning = LikelihoodScan() if aligner is None else Aligner.of(aligner)
+    refining = with_rate(SplineRefine() if refiner is None else Refiner.of(refiner), rate)
+    chosen = check_tracks(tracks, reference, xyz=aligning.needs_xyz)
+    if matches is None and (matching is None or matching.needs_features):
         for v, t in enumerate(tracks):
             t.check(f"tracks[{v}]", xyz=False, features=True)
-    if rate not in ("fixed", "fit"):
-        raise ValueError(f"rate: expected 'fixed' or 'fit'; found {rate!r}.")
     started = time.perf_counter()
     tracks = [at_frame_times(t) for t in tracks]
     graph = graph or Graph()
-    refiner = with_rate(refiner, rate)
     centre = most_seen(tracks) if chosen is None else chosen
     pairs = given_pairs(matches, tracks) if matches is not None else graph.pairs(len(tracks), centre)
     jobs = [
-        Job(pair, tracks[pair[0]], tracks[pair[1]], matcher, aligner, refiner, matches[pair] if matches else None)
+        Job(pair, tracks[pair[0]], tracks[pair[1]], matching, aligning, refining, matches[pair] if matches else None)
         for pair in pairs
     ]
-    trust = getattr(refiner, "trust", None) or Trust()
 
     def refit(tasks: list[tuple[Answer, float, float]]) -> list[Alignment]:
-        return list(map(run_refit, [Refit.of(*task, tracks, refiner) for task in tasks])) if tasks else []
+        return list(map(run_refit, [Refit.of(*task, tracks, refining) for task in tasks])) if tasks else []
 
-    def settled(answers: Sequence[Answer]) -> Settled:
-        return settle(len(tracks), answers, chosen, centre, graph, trust, refit)
+    def judged(answers: Sequence[Answer]) -> Verdict:
+        return judge(len(tracks), answers, chosen, centre, graph, refining.trust, refit)
 
-    found = settled(list(map(run, jobs)))
+    verdict = judged(list(map(run, jobs)))
     for _ in range(rematch if matches is None else 0):
-        again = rematching(jobs, found)
+        again = rematching(jobs, verdict)
         if not again:
             break
         fresh = {answer.pair: answer for answer in map(run, again)}
-        found = settled([fresh.get(a.pair, a) for a in found.answers])
-    return to_offsets(tracks, found, time.perf_counter() - started)
+        verdict = judged([fresh.get(a.pair, a) for a in verdict.answers])
+    return to_offsets(tracks, verdict, time.perf_counter() - started)
 
 
-def rematching(jobs: list[Job], found: Settled) -> list[Job]:
+def rematching(jobs: list[Job], verdict: Verdict) -> list[Job]:
     """The pairs between trusted videos of one component, to be matched at their synchronised times."""
     again = []
     for job in jobs:
         i, j = job.pair
-        if found.flags[i] or found.flags[j] or found.component[i] != found.component[j]:
+        if verdict.flags[i] or verdict.flags[j] or verdict.component[i] != verdict.component[j]:
             continue
         # t_a = (r_b t_b + x_b - x_a) / r_a
-        offset, rate = (found.x[j] - found.x[i]) / found.rates[i], found.rates[j] / found.rates[i]
-        at = getattr(job.matcher, "at", None)  # a matcher may know better how to match at known times
-        costs = getattr(job.matcher, "costs", (Cosine(),))
-        matcher = at(float(offset), float(rate)) if at else SynchronousMatching(float(offset), float(rate), costs)
-        again.append(dataclasses.replace(job, matcher=matcher))
+        clock = Clock(
+            float((verdict.x[j] - verdict.x[i]) / verdict.rates[i]), float(verdict.rates[j] / verdict.rates[i])
+        )
+        again.append(dataclasses.replace(job, matcher=at_known_times(job.matcher, clock)))
     return again
 
 
-def to_offsets(tracks: Sequence[TrackSet], found: Settled, seconds: float) -> Offsets:
+def at_known_times(matcher: Matcher | None, clock: Clock) -> Matcher:
+    """What matches a pair once more: as the matcher says, else mutual nearest neighbours at equal times."""
+    told = None if matcher is None else matcher.at(clock)
+    costs = (Cosine(),) if matcher is None else matcher.costs
+    return told or SynchronousMatching(clock.offset, clock.rate, costs)
+
+
+def to_offsets(tracks: Sequence[TrackSet], verdict: Verdict, seconds: float) -> Offsets:
     return Offsets(
         names=unique_names(tracks),
         fps=np.array([t.fps for t in tracks], float),
-        seconds=found.x,
-        rates=found.rates,
-        sigma=found.sigma,
-        reference=found.reference,
-        component=found.component,
-        flags=found.flags,
-        alignments={a.pair: a.refined for a in found.answers},
-        matches={a.pair: a.matches for a in found.answers},
-        stats=found.stats | {"seconds": seconds},
+        seconds=verdict.x,
+        rates=verdict.rates,
+        sigma=verdict.sigma,
+        reference=verdict.reference,
+        component=verdict.component,
+        flags=verdict.flags,
+        alignments={a.pair: a.refined for a in verdict.answers},
+        matches={a.pair: a.matches for a in verdict.answers},
+        stats=verdict.stats | {"seconds": seconds},
     )
 
 
@@ -151,12 +160,12 @@ def most_seen(tracks: Sequence[TrackSet]) -> int:
 
 def given_pairs(matches: Mapping[Pair, Matches], tracks: Sequence[TrackSet]) -> list[Pair]:
     """Sorted pairs that the caller brought matches for; ValueError when they do not fit the tracks."""
-    for (i, j), found in matches.items():
+    for (i, j), given in matches.items():
         if not (0 <= i < len(tracks) and 0 <= j < len(tracks)) or i == j:
             raise ValueError(f"matches: expected pairs of two of the {len(tracks)} videos; found {(i, j)}.")
         if (j, i) in matches:
             raise ValueError(f"matches: expected each pair once; found both {(i, j)} and {(j, i)}.")
-        found.check(f"matches[{(i, j)}]", len(tracks[i]), len(tracks[j]))
+        given.check(f"matches[{(i, j)}]", len(tracks[i]), len(tracks[j]))
     return sorted(matches)
 
 

@@ -1,13 +1,14 @@
-"""From the answers of pairs to the clocks of videos: robust solution, contradictions settled, trust decided."""
+"""From the answers of pairs to the clocks of videos: a robust solution, its contradictions resolved, and whom to trust."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ..types import Alignment, Matches, Stats, Status, in_order
 from ..types.trust import Trust
@@ -58,7 +59,7 @@ NOTHING_COMMON = frozenset(
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """What one pair came to: its matches, the aligner's answer, and the refiner's."""
+    """The outcome of one pair: its matches, the aligner's answer, and the refiner's."""
 
     pair: Pair
     matches: Matches
@@ -67,7 +68,13 @@ class Answer:
 
     @property
     def finite(self) -> bool:
+        """Whether there is an offset at all."""
         return math.isfinite(self.refined.offset)
+
+    @property
+    def sound(self) -> bool:
+        """Whether the fit shows a common motion at all, whatever else is flagged."""
+        return not NOTHING_COMMON & set(self.refined.flags)
 
 
 Refit = Callable[[list[tuple[Answer, float, float]]], list[Alignment]]
@@ -75,8 +82,8 @@ Refit = Callable[[list[tuple[Answer, float, float]]], list[Alignment]]
 
 
 @dataclass(frozen=True, eq=False)
-class Settled:
-    """The clocks: fields as of :class:`otsync.Offsets`; ``answers`` with what the last solution used."""
+class Verdict:
+    """The clocks: fields as of :class:`otsync.Offsets`; ``answers`` with the residual that the solution left each."""
 
     x: Float[np.ndarray, " V"]
     rates: Float[np.ndarray, " V"]
@@ -88,9 +95,61 @@ class Settled:
     stats: Stats
 
 
-def settle(
+@dataclass(frozen=True, eq=False)
+class Network:
+    """Videos and the pairs that link them.
+
+    Args:
+        n: number of videos. links: the pairs with an offset. rates: (n,) of the videos' clocks.
+        anchor: the video that the search holds at 0; the reference unless one is to be chosen.
+        graph: how pairs are combined. trust: the thresholds behind flags.
+    """
+
+    n: int
+    links: tuple[Answer, ...]
+    rates: Float[np.ndarray, " V"]
+    anchor: int
+    graph: Graph
+    trust: Trust
+
+    @cached_property
+    def edges(self) -> list[Edge]:
+        """The links in world seconds; the sigma of a pair that does not vouch for its answer counts three times."""
+        edges = []
+        for link in self.links:
+            (a, b), pair = link.pair, link.refined
+            sigma = pair.sigma if math.isfinite(pair.sigma) else UNKNOWN_SIGMA
+            scale = 1.0 if pair.status.ok else FLAGGED
+            offset = float(self.rates[a] * pair.offset)
+            edges.append(Edge(a, b, offset, scale * sigma, pair.status.ok, link.scanned.curve))
+        return edges
+
+    @cached_property
+    def vouches(self) -> Bool[np.ndarray, " E"]:
+        """The links that vouch for themselves."""
+        return np.array([e.trusted for e in self.edges], bool)
+
+    def residual(self, x: Float[np.ndarray, " V"]) -> Float[np.ndarray, " E"]:
+        """Seconds by which the solution contradicts each link."""
+        return np.array([x[e.b] - x[e.a] - e.offset for e in self.edges])
+
+    def of(self, links: Iterable[Answer]) -> Network:
+        """The same videos linked by other pairs."""
+        return replace(self, links=tuple(links))
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """A solution in which every component of the network has an anchor of its own: x, sigma, and the anchors, (V,)."""
+
+    x: Float[np.ndarray, " V"]
+    sigma: Float[np.ndarray, " V"]
+    component: Int[np.ndarray, " V"]
+
+
+def judge(
     n: int, answers: Sequence[Answer], reference: int | None, centre: int, graph: Graph, trust: Trust, refit: Refit
-) -> Settled:
+) -> Verdict:
     """Offsets of ``n`` videos from the answers of pairs.
 
     Args:
@@ -100,45 +159,39 @@ def settle(
     """
     anchor = centre if reference is None else reference
     answers, rates = _rates(n, list(answers), anchor, trust, refit)
-    linked = [a for a in answers if a.finite]
-    x = _first_guess(n, linked, anchor, rates, graph)
-    lone = n == 2
+    network = Network(n, tuple(a for a in answers if a.finite), rates, anchor, graph, trust)
+    x = _first_guess(network)
     for _ in range(ROUNDS):
-        linked = _relocate(linked, x, rates, refit)
-        x = _by_component(n, linked, rates, anchor, x)[0]
-    by_pair = {a.pair: a for a in answers} | {a.pair: a for a in linked}
-    links = linked if lone else _links(n, linked, x, rates, anchor, trust)
-    chosen = _best_tied(n, links, rates) if reference is None else reference
-    rates = rates / rates[chosen]  # they were fitted relative to the anchor; the reference's clock is the world's
-    x, sigma, component = _by_component(n, links, rates, chosen, None if chosen != anchor else x)
-    final = tuple(by_pair[a.pair] for a in answers)
-    return _judge(n, final, links, x, sigma, rates, component, chosen, graph, trust)
+        network = _relocated(network, x, refit)
+        x = solve_components(network, anchor, x).x
+    by_pair = {a.pair: a for a in answers} | {a.pair: a for a in network.links}
+    if n > 2:  # two videos have no third to say whether a flagged pair agrees
+        network = _linked(network, x)
+    chosen = _best_tied(network) if reference is None else reference
+    # rates were fitted relative to the anchor; the reference's clock is the world's
+    network = replace(network, rates=rates / rates[chosen])
+    solved = solve_components(network, chosen, None if chosen != anchor else x)
+    return _verdict(network, tuple(by_pair[a.pair] for a in answers), solved, chosen)
 
 
-def _links(n: int, answers: list[Answer], x: np.ndarray, rates: np.ndarray, anchor: int, trust: Trust) -> list[Answer]:
-    """The pairs that link videos: those that vouch for themselves, and flagged ones between videos that stand out.
+def _linked(network: Network, x: np.ndarray) -> Network:
+    """Only the pairs that link videos: those that vouch for themselves, and flagged ones between videos that stand out.
 
-    A flagged pair must agree with the solution. A video stands out when the sum of all its pairs' curves peaks at its place as an undoubted pair's curve would. That
-    keeps an estimate for videos that no pair vouches for, on the clock of the anchor's group. Groups of three and more held
-    together by pairs that vouch are never joined by flagged ones: the curves of strangers with the views of one scene add up too.
+    A flagged pair must agree with the solution. A video stands out when the sum of all its pairs' curves peaks at its
+    place as an undoubted pair's curve would. That keeps an estimate for videos that no pair vouches for, on the clock of
+    the anchor's group. Groups of three and more held together by pairs that vouch are never joined by flagged ones: the
+    curves of strangers with the views of one scene add up too.
     """
-    edges = [as_edge(a, rates) for a in answers]
+    n, edges, vouches = network.n, network.edges, network.vouches
     curves = CurveSum(n, edges, FRAME)
-    stands = np.array([undoubted(curves, v, x, trust, STANDING_MARGIN) for v in range(n)])
-    sound = np.array([e.trusted for e in edges], bool)
-    group = components(n, [a.pair for a, ok in zip(answers, sound, strict=True) if ok])
+    stands = np.array([undoubted(curves, v, x, network.trust, STANDING_MARGIN) for v in range(n)])
+    group = components(n, [a.pair for a, ok in zip(network.links, vouches, strict=True) if ok])
     size = np.bincount(group, minlength=n)[group]
-    main = group[anchor] if size[anchor] > 1 else group[int(np.argmax(size))]
+    main = group[network.anchor] if size[network.anchor] > 1 else group[int(np.argmax(size))]
     welcome = stands & ((size == 1) | (group == main))
-    residual = np.array([x[e.b] - x[e.a] - e.offset for e in edges])
-    agrees = agreeing(edges, residual, CONFIRMED)
-    kept = zip(answers, edges, sound, agrees, strict=True)
-    return [a for a, e, good, ok in kept if good or (ok and welcome[e.a] and welcome[e.b])]
-
-
-def is_sound(answer: Answer) -> bool:
-    """Whether the fit shows a common motion at all, whatever else is flagged."""
-    return not NOTHING_COMMON & set(answer.refined.flags)
+    agrees = agreeing(edges, network.residual(x), CONFIRMED)
+    kept = zip(network.links, edges, vouches, agrees, strict=True)
+    return network.of(a for a, e, good, ok in kept if good or (ok and welcome[e.a] and welcome[e.b]))
 
 
 def undoubted(curves: CurveSum, v: int, x: np.ndarray, trust: Trust, margin: float) -> bool:
@@ -147,15 +200,6 @@ def undoubted(curves: CurveSum, v: int, x: np.ndarray, trust: Trust, margin: flo
         return True  # aligners without curves: nothing to doubt by
     here, rival = curves.standing(v, x)
     return here >= trust.evidence and (here - rival) >= margin * here
-
-
-def as_edge(answer: Answer, rates: np.ndarray) -> Edge:
-    """The pair in world seconds."""
-    a, b = answer.pair
-    found = answer.refined
-    sigma = found.sigma if math.isfinite(found.sigma) else UNKNOWN_SIGMA
-    scale = 1.0 if found.status.ok else FLAGGED
-    return Edge(a, b, float(rates[a] * found.offset), scale * sigma, found.status.ok, answer.scanned.curve)
 
 
 def _rates(
@@ -175,62 +219,56 @@ def _rates(
     significant = np.abs(solution.x) > trust.rate_sigmas * solution.sigma
     rates[significant] = np.exp(solution.x[significant])
     tasks = [(a, a.refined.offset, rates[a.pair[1]] / rates[a.pair[0]]) for a in answers if a.finite]
-    fresh = {t[0].pair: found for t, found in zip(tasks, refit(tasks), strict=True)}
+    fresh = {t[0].pair: refitted for t, refitted in zip(tasks, refit(tasks), strict=True)}
     return [replace(a, refined=fresh.get(a.pair, a.refined)) for a in answers], rates
 
 
-def _first_guess(n: int, answers: list[Answer], anchor: int, rates: np.ndarray, graph: Graph) -> np.ndarray:
+def _first_guess(network: Network) -> Float[np.ndarray, " V"]:
     """Robust solution; by the summed curves where pairs are flagged or contradict it, and cycles can tell."""
-    edges = [as_edge(a, rates) for a in answers]
-    x, _, component = _by_component(n, answers, rates, anchor, None)
+    n, graph = network.n, network.graph
+    solved = solve_components(network, network.anchor, None)
+    x, component = solved.x, solved.component
     if not graph.curves:
         return x
     for root in np.unique(component):
-        own = [k for k, e in enumerate(edges) if component[e.a] == root]
-        inside = [edges[k] for k in own]
-        members = int((component == root).sum())
-        residual = np.array([x[e.b] - x[e.a] - e.offset for e in inside])
-        settled = agreeing(inside, residual, ASTRAY) & np.array([e.trusted for e in inside], bool)
-        if len(inside) < members or settled.all():
+        inside = network.of(a for a, e in zip(network.links, network.edges, strict=True) if component[e.a] == root)
+        edges, members = inside.edges, int((component == root).sum())
+        agrees = agreeing(edges, inside.residual(x), ASTRAY) & inside.vouches
+        if len(edges) < members or agrees.all():
             continue
-        weight = [
-            answers[k].refined.stats.get("evidence", 1.0) * answers[k].refined.stats.get("margin", 1.0) for k in own
-        ]
-        fps = max(answers[k].refined.fps for k in own)
+        weight = [a.refined.stats.get("evidence", 1.0) * a.refined.stats.get("margin", 1.0) for a in inside.links]
+        fps = max(a.refined.fps for a in inside.links)
         y = np.where(component == root, x, 0.0)
         star = y.copy()
-        for e in inside:
+        for e in edges:
             if root in (e.a, e.b):
                 star[e.b if e.a == root else e.a] = e.offset if e.a == root else -e.offset
-        trees = spanning_trees(n, inside, weight, int(root), graph.starts, graph.seed)
-        best = CurveSum(n, inside, 1 / fps).search([y, star, *trees], int(root))
+        trees = spanning_trees(n, edges, weight, int(root), graph.starts, graph.seed)
+        best = CurveSum(n, edges, 1 / fps).search([y, star, *trees], int(root))
         moved = (component == root) & (np.abs(best - y) > MOVED)
         x = np.where(moved, best, x)
     return x
 
 
-def _relocate(answers: list[Answer], x: np.ndarray, rates: np.ndarray, refit: Refit) -> list[Answer]:
+def _relocated(network: Network, x: np.ndarray, refit: Refit) -> Network:
     """Pairs astray are fitted anew from the solution's prediction; those that do not stay near it are left out."""
-    tasks, kept = [], []
-    for answer in answers:
-        e = as_edge(answer, rates)
+    tasks, kept, rates = [], [], network.rates
+    for link, e in zip(network.links, network.edges, strict=True):
         predicted = x[e.b] - x[e.a]
         if abs(predicted - e.offset) <= max(ASTRAY, min(4 * e.sigma, CAPTURED)):
-            kept.append(answer)
+            kept.append(link)
         else:
-            tasks.append((answer, predicted / rates[e.a], rates[e.b] / rates[e.a]))
-    for (answer, start, _), found in zip(tasks, refit(tasks), strict=True):
-        if abs(found.offset - start) <= CAPTURED:
-            moved = {"relocated": found.offset - answer.scanned.offset}
-            kept.append(replace(answer, refined=replace(found, stats=found.stats | moved)))
-    return sorted(kept, key=lambda a: a.pair)
+            tasks.append((link, predicted / rates[e.a], rates[e.b] / rates[e.a]))
+    for (link, start, _), again in zip(tasks, refit(tasks), strict=True):
+        if abs(again.offset - start) <= CAPTURED:
+            moved = {"relocated": again.offset - link.scanned.offset}
+            kept.append(replace(link, refined=replace(again, stats=again.stats | moved)))
+    return network.of(sorted(kept, key=lambda a: a.pair))
 
 
-def _by_component(
-    n: int, answers: list[Answer], rates: np.ndarray, reference: int, start: np.ndarray | None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """x, sigma and each video's anchor: ``reference`` in its component, the best tied video in others."""
-    edges = [as_edge(a, rates) for a in answers]
+def solve_components(network: Network, reference: int, start: np.ndarray | None) -> Solved:
+    """Every component solved on its own: around ``reference`` in its component, the best tied video in others."""
+    n, edges = network.n, network.edges
     near = components(n, edges)
     x, sigma, anchor = np.full(n, np.nan), np.full(n, np.nan), np.arange(n)
     for root in np.unique(near):
@@ -238,18 +276,17 @@ def _by_component(
         own = [e for e in edges if near[e.a] == root]
         middle = reference if inside[reference] else _most_tied(np.flatnonzero(inside), own)
         began = None if start is None or not np.isfinite(start[inside]).all() else start
-        found = solve(n, own, middle, began, INFLATION)
-        x[inside], sigma[inside], anchor[inside] = found.x[inside], found.sigma[inside], middle
-    return x, sigma, anchor
+        solution = solve(n, own, middle, began, INFLATION)
+        x[inside], sigma[inside], anchor[inside] = solution.x[inside], solution.sigma[inside], middle
+    return Solved(x, sigma, anchor)
 
 
-def _best_tied(n: int, links: list[Answer], rates: np.ndarray) -> int:
+def _best_tied(network: Network) -> int:
     """The video with the surest pairs within the largest component."""
-    edges = [as_edge(a, rates) for a in links]
-    near = components(n, edges)
+    near = components(network.n, network.edges)
     roots, counts = np.unique(near, return_counts=True)
     inside = np.flatnonzero(near == roots[np.argmax(counts)])
-    return _most_tied(inside, [e for e in edges if near[e.a] == near[inside[0]]])
+    return _most_tied(inside, [e for e in network.edges if near[e.a] == near[inside[0]]])
 
 
 def _most_tied(videos: np.ndarray, edges: list[Edge]) -> int:
@@ -261,45 +298,41 @@ def _most_tied(videos: np.ndarray, edges: list[Edge]) -> int:
     return max(sorted(tie), key=tie.__getitem__)
 
 
-def _judge(
-    n: int,
-    answers: tuple[Answer, ...],
-    links: list[Answer],
-    x: np.ndarray,
-    sigma: np.ndarray,
-    rates: np.ndarray,
-    component: np.ndarray,
-    reference: int,
-    graph: Graph,
-    trust: Trust,
-) -> Settled:
+def _verdict(network: Network, answers: tuple[Answer, ...], solved: Solved, reference: int) -> Verdict:
     """Flags of every video, residuals of every pair."""
-    edges = [as_edge(a, rates) for a in links]
-    residual = np.array([x[e.b] - x[e.a] - e.offset for e in edges])
+    n, edges, component = network.n, network.edges, solved.component
+    residual = network.residual(solved.x)
     agrees = agreeing(edges, residual, ASTRAY) if edges else np.zeros(0, bool)
-    sound = agrees & np.array([is_sound(a) for a in links], bool)
-    trusted = _trusted(n, edges, sound, x, component, graph, trust)
-    x = x.copy()
-    alone = np.bincount(component, minlength=n)[component] == 1
-    x[alone & (np.arange(n) != reference)] = sigma[alone & (np.arange(n) != reference)] = np.nan
+    trusted = _trusted(network, solved, agrees)
+    x, sigma = solved.x.copy(), solved.sigma.copy()
+    alone = (np.bincount(component, minlength=n)[component] == 1) & (np.arange(n) != reference)
+    x[alone] = sigma[alone] = np.nan
+    own = [[(a, bool(ok)) for a, ok in zip(network.links, agrees, strict=True) if v in a.pair] for v in range(n)]
     flags = tuple(
-        _flags(v, answers, links, agrees, bool(trusted[v]), component[v] == reference, v == reference) for v in range(n)
+        () if v == reference else _flags(v, answers, own[v], bool(trusted[v]), component[v] == reference)
+        for v in range(n)
     )
-    used = {a.pair: float(r) for a, r in zip(links, residual, strict=True)}
+    used = {a.pair: float(r) for a, r in zip(network.links, residual, strict=True)}
     answers = tuple(_with_residual(a, used.get(a.pair)) for a in answers)
-    cycles = cycle_errors(edges)
+    stats = _stats(network, answers, residual, component)
+    return Verdict(x, network.rates, sigma, reference, component, flags, answers, stats)
+
+
+def _stats(network: Network, answers: tuple[Answer, ...], residual: np.ndarray, component: np.ndarray) -> Stats:
+    """What the report says of the whole network."""
     stats: Stats = {
         "pairs": float(len(answers)),
-        "pairs_used": float(len(links)),
-        "pairs_relocated": float(sum("relocated" in a.refined.stats for a in links)),
+        "pairs_used": float(len(network.links)),
+        "pairs_relocated": float(sum("relocated" in a.refined.stats for a in network.links)),
         "components": float(len(np.unique(component))),
     }
     if len(residual):
         stats["residual_median"] = float(np.median(np.abs(residual)))
         stats["residual_max"] = float(np.abs(residual).max())
+    cycles = cycle_errors(network.edges)
     if len(cycles):
         stats["cycle_median"], stats["cycle_max"] = float(np.median(cycles)), float(cycles.max())
-    return Settled(x, rates, sigma, reference, component, flags, answers, stats)
+    return stats
 
 
 def _with_residual(answer: Answer, residual: float | None) -> Answer:
@@ -309,60 +342,55 @@ def _with_residual(answer: Answer, residual: float | None) -> Answer:
     return replace(answer, refined=replace(answer.refined, stats=stats))
 
 
-def _trusted(
-    n: int, edges: list[Edge], agrees: np.ndarray, x: np.ndarray, component: np.ndarray, graph: Graph, trust: Trust
-) -> np.ndarray:
+def _trusted(network: Network, solved: Solved, agrees: np.ndarray) -> Bool[np.ndarray, " V"]:
     """Videos that hang on their reference by pairs that vouch, or by summed curves that leave no doubt.
 
     Trust grows from the reference: a video joins by one agreeing pair that vouches for itself, or by two sound agreeing
     pairs, at least half of all its pairs, with trusted videos, whose summed curves pass the limits for evidence and
     ambiguity.
     """
+    n, edges, trust = network.n, network.edges, network.trust
+    agrees = agrees & np.array([a.sound for a in network.links], bool)
     degree = np.zeros(n, int)
     for e in edges:
         degree[[e.a, e.b]] += 1
-    trusted = component == np.arange(n)
+    trusted = solved.component == np.arange(n)
     growing = True
     while growing:
         growing = False
         for v in np.flatnonzero(~trusted):
             near = [
-                k
-                for k, e in enumerate(edges)
-                if agrees[k] and ((e.a == v and trusted[e.b]) or (e.b == v and trusted[e.a]))
+                e
+                for e, ok in zip(edges, agrees, strict=True)
+                if ok and ((e.a == v and trusted[e.b]) or (e.b == v and trusted[e.a]))
             ]
-            joined = any(edges[k].trusted for k in near)
-            if not joined and graph.curves and len(near) >= max(2, degree[v] / 2):
-                joined = undoubted(CurveSum(n, [edges[k] for k in near], FRAME), int(v), x, trust, trust.margin)
+            joined = any(e.trusted for e in near)
+            if not joined and network.graph.curves and len(near) >= max(2, degree[v] / 2):
+                joined = undoubted(CurveSum(n, near, FRAME), int(v), solved.x, trust, trust.margin)
             if joined:
                 trusted[v] = growing = True
     return trusted
 
 
 def _flags(
-    v: int,
-    answers: tuple[Answer, ...],
-    links: list[Answer],
-    agrees: np.ndarray,
-    trusted: bool,
-    in_reach: bool,
-    is_reference: bool,
+    v: int, answers: tuple[Answer, ...], own: list[tuple[Answer, bool]], trusted: bool, in_reach: bool
 ) -> tuple[Status, ...]:
-    """What the user should know about video v."""
-    if is_reference:
-        return ()
-    own = [(a, bool(ok)) for a, ok in zip(links, agrees, strict=True) if v in a.pair]
+    """What the user should know about video v.
+
+    Args:
+        own: its links, and whether each agrees with the solution. in_reach: whether it is on the reference's clock.
+    """
     vouching = [ok for a, ok in own if a.refined.status.ok]
     contradicted = len(vouching) > 0 and sum(vouching) <= len(vouching) / 2
     mismatch = sum(Status.RATE_MISMATCH in a.refined.flags for a, _ in own) > len(own) / 2
-    found: list[Status] = []
+    flags: list[Status] = []
     if contradicted:
-        found.append(Status.INCONSISTENT)
+        flags.append(Status.INCONSISTENT)
     if mismatch:
-        found.append(Status.RATE_MISMATCH)
+        flags.append(Status.RATE_MISMATCH)
     if not in_reach:
-        found.append(Status.DISCONNECTED)
+        flags.append(Status.DISCONNECTED)
     if not trusted or (not in_reach and not own):
         pairs = [a for a, ok in own if ok] or [a for a in answers if v in a.pair]
-        found += [f for a in pairs for f in a.refined.flags] or [Status.INCONSISTENT]
-    return in_order(found)
+        flags += [f for a in pairs for f in a.refined.flags] or [Status.INCONSISTENT]
+    return in_order(flags)

@@ -240,7 +240,7 @@ def test_a_pair_survives_the_cache():
 def test_kept_pairs_compute_once_and_tell_algorithms_apart(tmp_path):
     from otsync.epipolar.scan import EpipolarScan
     from otsync.match.candidates import Candidates
-    from otsync.refine.verb import Unrefined
+    from otsync.refine.unrefined import Unrefined
 
     a, b = world(5.0)
     calls = []
