@@ -36,7 +36,7 @@ lint: $(VENV)/.test
 	$(BIN)/mypy
 
 stability: $(VENV)/.test  ## docs/stability.md, from the catalogue of hard cases
-	$(BIN)/python -m tests.hard_cases.stability
+	$(BIN)/python -m otsync.bench.hard_cases.page
 
 format: $(VENV)/.test
 	$(BIN)/ruff check --fix .

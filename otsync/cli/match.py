@@ -9,9 +9,10 @@ from pathlib import Path
 import tyro
 
 from ..match import MATCHERS, match
+from ..progress import tell
 from ..types import TrackSet
 from .slots import slot
-from .tables import refusal
+from .tables import finite, print_json, refusal
 
 
 @dataclass
@@ -27,22 +28,28 @@ class Match:
     """CSV file for the pairs (index in a, index in b, score)."""
     budget: float | None = None
     """Seconds: takes the most accurate matcher that is predicted to fit."""
+    json: bool = False
+    """Print the pairs (index in a, index in b, score), flags and statistics as JSON."""
     matcher: slot("matchers", MATCHERS, optional=True) = None
     """Default: by size, fused Gromov-Wasserstein below 200 tracks and its anchored form above."""
 
     def run(self) -> int:
         a, b = TrackSet.load(self.a), TrackSet.load(self.b)
         if sys.stderr.isatty():  # one solve has no steps to count
-            print(f"matching {len(a)} x {len(b)} tracks ...", file=sys.stderr)
-        found = match(a, b, self.matcher, budget=self.budget, throw=False)
-        print(f"{len(found)} matches between {len(a)} and {len(b)} tracks")
-        print("  ".join(f"{name} {value:.6g}" for name, value in found.stats.items()))
+            tell(f"matching {len(a)} x {len(b)} tracks ...")
+        matches = match(a, b, self.matcher, budget=self.budget, throw=False)
+        assert matches.score is not None
+        if self.json:
+            pairs = [[*pair, score] for pair, score in zip(matches.pairs.tolist(), matches.score.tolist(), strict=True)]
+            print_json({"pairs": pairs, "flags": [f.code for f in matches.flags], "stats": finite(matches.stats)})
+        else:
+            print(f"{len(matches)} matches between {len(a)} and {len(b)} tracks")
+            print("  ".join(f"{name} {value:.6g}" for name, value in matches.stats.items()))
         if self.out is not None:
             from ..files.arrays import atomic_write
 
-            assert found.score is not None
             with atomic_write(self.out, "w") as stream:
                 stream.write("a,b,score\n")
-                stream.writelines(f"{i},{j},{s:.9g}\n" for (i, j), s in zip(found.pairs, found.score, strict=True))
-            print(f"wrote {self.out}")
-        return refusal("match", found.status, found.flags)
+                stream.writelines(f"{i},{j},{s:.9g}\n" for (i, j), s in zip(matches.pairs, matches.score, strict=True))
+            tell(f"wrote {self.out}")
+        return refusal("match", matches.status, matches.flags)

@@ -11,6 +11,8 @@ from typing import Literal
 
 import tyro
 
+from ..progress import tell
+
 
 @dataclass
 class Init:
@@ -89,7 +91,13 @@ class RecordingOptions:
 
 
 def sync_recording(
-    path: Path, out: Path, options: RecordingOptions, *, reference: str | None = None, truth: Path | None = None
+    path: Path,
+    out: Path,
+    options: RecordingOptions,
+    *,
+    reference: str | None = None,
+    truth: Path | None = None,
+    as_json: bool = False,
 ) -> int:
     """``otsync sync SCENE``: offsets.json, run.json and report.html in ``out``. Exit code 1 when an answer is flagged."""
     from ..files.arrays import write_json
@@ -97,7 +105,7 @@ def sync_recording(
     from ..io import open_scene
     from ..recordings.routes import synchronize_scene
     from ..report.frames import write_recording_report
-    from .tables import table, true_offsets
+    from .tables import flagged, print_json, table, true_offsets, with_errors
 
     scene = open_scene(path, allow_outside=options.allow_outside)
     if options.cameras:
@@ -111,7 +119,7 @@ def sync_recording(
     if known is not None:
         known = known - known[chosen]
     for note in scene.notes:
-        print(f"note: {note}", file=sys.stderr)
+        tell(f"note: {note}")
     with ThreadPoolExecutor(options.workers or os.cpu_count() or 1) as pool:
         found = synchronize_scene(
             scene,
@@ -119,14 +127,14 @@ def sync_recording(
             reference=chosen,
             cache=Cache(options.cache or out / "stages"),
             map=pool.map,
-            tell=lambda text: print(text, file=sys.stderr, flush=True),
+            tell=tell,
         )
-    print(table(found.offsets, known))
     found.offsets.save(out / "offsets.json")
     write_json(out / "run.json", {"route": found.route, "why": list(found.why), "seconds": found.seconds})
     write_recording_report(out / "report.html", scene, found, truth=None if known is None else list(known))
-    print(f"route {found.route}; wrote {out / 'offsets.json'}, {out / 'run.json'} and {out / 'report.html'}")
-    for name, flags in zip(found.offsets.names, found.offsets.flags, strict=True):
-        for flag in flags:
-            print(f"{name}: {flag.code}: {flag}", file=sys.stderr)
-    return 0 if found.offsets.ok else 1
+    if as_json:
+        print_json({"route": found.route, "why": list(found.why), **with_errors(found.offsets, known)})
+    else:
+        print(table(found.offsets, known))
+        print(f"route {found.route}; wrote {out / 'offsets.json'}, {out / 'run.json'} and {out / 'report.html'}")
+    return flagged(found.offsets)

@@ -11,12 +11,16 @@ import tyro
 from ..align import ALIGNERS, LikelihoodScan
 from ..match import MATCHERS
 from ..refine import REFINERS, SplineRefine
+from ..refine.slot import Rate
 from ..sync.graph import Graph
 from ..sync.verb import unique_names
 from ..types import TrackSet
 from .recordings import RecordingOptions, sync_recording
 from .slots import slot
-from .tables import report, true_offsets, with_progress
+from .tables import refuse_unused, report, true_offsets, with_progress
+
+RECORDING_BRINGS = ("matcher", "aligner", "refiner", "graph", "rematch", "rate", "workers")
+"""Options that the route of a recording decides by itself."""
 
 
 @dataclass
@@ -42,8 +46,8 @@ class Sync:
     """Name of the reference video, or "auto" for the one with the surest pairs; default: the first."""
     truth: Path | None = None
     """truth.json of a simulated world: adds errors to the table."""
-    rate: Literal["fixed", "fit"] = "fixed"
-    """Frame rates as declared, or fitted on long clips and kept where significant."""
+    rate: Rate | None = None
+    """Frame rates as declared, or fitted on long clips and kept where significant; default: as the refiner says."""
     rematch: int = 1
     """How often trusted pairs are matched again at the synchronised times."""
     workers: int = 1
@@ -57,14 +61,21 @@ class Sync:
     """From the frame to a fraction of it."""
     recording: RecordingOptions = field(default_factory=RecordingOptions)
 
+    json: bool = False
+    """Print the content of offsets.json instead of the table."""
+
     def run(self) -> int:
         if len(self.tracks) == 1 and self.tracks[0].suffix != ".npz":
-            return sync_recording(self.tracks[0], self.out, self.recording, reference=self.reference, truth=self.truth)
+            refuse_unused(self, RECORDING_BRINGS, f"a recording ({self.tracks[0]}), whose route brings its own,")
+            return sync_recording(
+                self.tracks[0], self.out, self.recording, reference=self.reference, truth=self.truth, as_json=self.json
+            )
+        refuse_unused(self, ("recording",), "synchronising track sets")
         if len(self.tracks) < 2:
             raise ValueError(f"tracks: expected at least two .npz files; found {len(self.tracks)}.")
         tracks = [TrackSet.load(path) for path in self.tracks]
         names = unique_names(tracks)
-        reference: int | str = 0
+        reference: int | Literal["auto"] = 0
         if self.reference is not None:
             if self.reference not in (*names, "auto"):
                 raise ValueError(f"--reference: expected auto or one of {', '.join(names)}; found {self.reference!r}.")
@@ -84,4 +95,4 @@ class Sync:
             rate=self.rate,
         )
         truth = None if known is None else known - known[offsets.component]
-        return report(offsets, tracks, truth, self.out, "Synchronisation report")
+        return report(offsets, tracks, truth, self.out, "Synchronisation report", as_json=self.json)

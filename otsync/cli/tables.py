@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
+import math
 import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -47,19 +50,65 @@ def with_progress(tracks: list[TrackSet], what: str, workers: int = 1, **options
         return synchronize(tracks, map=progress(pool.map), **options)
 
 
-def report(offsets: Offsets, tracks: list[TrackSet], truth: Any, out: Path, title: str) -> int:
-    """Print the table, write offsets.json and report.html; exit code 1 when an answer was refused."""
+def refuse_unused(options: Any, names: Iterable[str], why: str) -> None:
+    """ValueError when one of a command's options is set although this way of the command does not use it.
+
+    Args:
+        options: the command's dataclass. names: of its fields that are not used. why: "a recording", in the error.
+    """
+    for field in dataclasses.fields(options):
+        default = field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
+        if field.name in names and getattr(options, field.name) != default:
+            raise ValueError(
+                f"--{field.name.replace('_', '-')}: {why} does not use it; found {getattr(options, field.name)}. "
+                "Leave it out."
+            )
+
+
+def print_json(document: dict[str, Any]) -> None:
+    """One line on standard output; numbers that are none become null."""
+    print(json.dumps(document, allow_nan=False))
+
+
+def finite(stats: dict[str, float]) -> dict[str, float | None]:
+    """Statistics as JSON has them: null for what is no number."""
+    return {name: value if math.isfinite(value) else None for name, value in stats.items()}
+
+
+def with_errors(offsets: Offsets, truth: Any = None) -> dict[str, Any]:
+    """The content of offsets.json, and each video's error in frames where the truth is known."""
+    import numpy as np
+
+    document = offsets.to_dict()
+    if truth is not None:
+        errors = offsets.frames - np.asarray(truth) * offsets.fps[offsets.component]
+        for video, error in zip(document["videos"], errors, strict=True):
+            video["error_frames"] = float(error) if np.isfinite(error) else None
+    return document
+
+
+def report(
+    offsets: Offsets, tracks: list[TrackSet], truth: Any, out: Path, title: str, *, as_json: bool = False
+) -> int:
+    """Print the table (or JSON), write offsets.json and report.html; exit code 1 when an answer was refused."""
     from ..report import write_report
 
-    print(table(offsets, truth))
     offsets.save(out / "offsets.json")
     write_report(out / "report.html", offsets, tracks, truth=truth, title=title)
-    print(f"wrote {out / 'offsets.json'} and {out / 'report.html'}")
-    doubtful = [n for n, s in zip(offsets.names, offsets.status, strict=True) if not s.ok]
+    if as_json:
+        print_json(with_errors(offsets, truth))
+    else:
+        print(table(offsets, truth))
+        print(f"wrote {out / 'offsets.json'} and {out / 'report.html'}")
+    return flagged(offsets)
+
+
+def flagged(offsets: Offsets) -> int:
+    """Say what is flagged, with its remedy, on stderr; 1 when anything is, else 0."""
     for name, flags in zip(offsets.names, offsets.flags, strict=True):
         for flag in flags:
             print(f"{name}: {flag.code}: {flag}", file=sys.stderr)
-    return 1 if doubtful else 0
+    return 0 if offsets.ok else 1
 
 
 def table(offsets: Offsets, truth: Any = None) -> str:

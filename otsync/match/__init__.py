@@ -42,6 +42,5 @@ MATCHERS = (
     GromovWasserstein,
     OptimalTransport,
     NearestNeighbor,
-    Candidates,
 )
 """Matchers that the shell, the benchmarks and the catalogue of hard cases offer; plugins come on top."""

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from otsync import Matches, TrackSet
-from tests.hard_cases.case import FLAGGED, REFUSED, RIGHT, SOUND, Case, cloud, near
+from ...types import Matches, TrackSet
+from .case import FLAGGED, REFUSED, RIGHT, SOUND, Case, cloud, near
 
 N = 30
 ALL = Matches(np.stack([np.arange(N)] * 2, 1))

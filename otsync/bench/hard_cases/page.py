@@ -1,16 +1,16 @@
-"""Writes docs/stability.md from the catalogue: ``python -m tests.hard_cases.stability``."""
+"""Writes docs/stability.md from the catalogue: ``python -m otsync.bench.hard_cases.page``."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from tests.hard_cases import aligning, matching
-from tests.hard_cases.case import Case
+from . import aligning, matching
+from .case import Case
 
 HEAD = """# Hard cases
 
 What a plain solver (POT called directly, or the paper's method) does, and what otsync does instead. Generated from the
-table in `tests/hard_cases` by `make stability`; the tests run every row on every solver of its slot, each within a
+table in `otsync/bench/hard_cases` by `make stability`; the tests run every row on every solver of its slot, each within a
 time limit: it answers rightly, flags its answer, or refuses the input with a ValueError.
 """
 

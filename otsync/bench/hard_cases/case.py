@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from otsync import Alignment, Matches, TrackSet
+from ...types import Alignment, Matches, TrackSet
 
 RIGHT, FLAGGED, REFUSED = "right", "flagged", "refused"
 SOUND = (RIGHT, FLAGGED, REFUSED)

@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from otsync import Labels, TrackSet
-from tests.hard_cases.case import FLAGGED, REFUSED, RIGHT, SOUND, Case, changed, cloud, mostly_identity, pair
+from ...costs.linear import Labels
+from ...types import TrackSet
+from .case import FLAGGED, REFUSED, RIGHT, SOUND, Case, changed, cloud, mostly_identity, pair
 
 DENSE = ("FusedGromovWasserstein", "EntropicFGW", "PartialFGW", "GromovWasserstein")
 FEATURES_ONLY = ("NearestNeighbor", "OptimalTransport", "Sinkhorn")

@@ -1,0 +1,75 @@
+"""``otsync bench hard-cases``: every solver through the catalogue, or the named ones."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from ...progress import counted
+from ..record import table, write_rows
+from . import aligning, matching
+from .case import Case
+from .solvers import (
+    SPECIAL,
+    Solver,
+    accepted,
+    aligners,
+    aligning_solver,
+    matchers,
+    matching_solver,
+    outcome,
+    refiners,
+    refining_solver,
+    watchdog,
+)
+
+LONGEST = 600
+"""Seconds that a solver may take on a row: more is a hang, even on a slow and busy machine (usual: below one)."""
+
+
+def rows() -> Iterator[tuple[Case, str, Solver]]:
+    """(case, name of the solver, solver) for every row of the catalogue and every solver that it is for."""
+    to_match = {name: matching_solver(m) for name, m in (matchers() | SPECIAL).items()}
+    to_align = {name: aligning_solver(a) for name, a in aligners().items()}
+    to_align |= {name: refining_solver(r) for name, r in refiners().items()}
+    for cases, solvers in ((matching.CASES, to_match), (aligning.CASES, to_align)):
+        for case in cases:
+            for name in case.solvers or [n for n in solvers if n not in SPECIAL]:
+                yield case, name, solvers[name]
+
+
+def run(out: Path, *, only: Sequence[str] = ()) -> int:
+    """Run the catalogue, print what each solver made of it, write CSV and JSON; 1 when an answer is not accepted.
+
+    Args:
+        only: names of solvers; default: all.
+    """
+    chosen = [row for row in rows() if not only or row[1] in only]
+    unknown = sorted(set(only) - {name for _, name, _ in rows()})
+    if unknown:
+        names = dict.fromkeys(name for _, name, _ in rows())
+        raise ValueError(f"--only: expected some of {', '.join(names)}; found {', '.join(unknown)}.")
+    lines: list[dict[str, Any]] = []
+    for case, name, solver in counted(chosen, "hard cases", "row", len(chosen)):
+        started = time.perf_counter()
+        try:
+            with watchdog(LONGEST):
+                kind, detail = outcome(case, solver)
+            fine = accepted(case, name, kind, detail)
+        except Exception as error:  # a solver of somebody else's may raise anything
+            kind, fine = f"{type(error).__name__}: {error}", False
+        seconds = time.perf_counter() - started
+        lines.append({"solver": name, "case": case.name, "outcome": kind, "accepted": fine, "seconds": seconds})
+    write_rows(out, "hard_cases", lines)
+    summary = []
+    for name in dict.fromkeys(line["solver"] for line in lines):
+        own = [line for line in lines if line["solver"] == name]
+        kinds = {kind: sum(line["outcome"] == kind for line in own) for kind in ("right", "flagged", "refused")}
+        summary.append({"solver": name, "rows": len(own), **kinds, "not accepted": sum(not x["accepted"] for x in own)})
+    print(table(summary))
+    for line in lines:
+        if not line["accepted"]:
+            print(f"{line['solver']}: {line['case']}: {line['outcome']}")
+    return 0 if all(line["accepted"] for line in lines) else 1
