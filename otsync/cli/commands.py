@@ -13,6 +13,7 @@ OWN = {
     "check": "otsync.cli.recordings:Check",
     "sync": "otsync.cli.sync:Sync",
     "bench": "otsync.cli.bench:Bench",
+    "plugins": "otsync.cli.plugins:Plugins",
 }
 
 
