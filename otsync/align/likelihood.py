@@ -11,6 +11,7 @@ from ..clocks.common import CommonClock, common_clock, strongest
 from ..clocks.splines import TrackSplines
 from ..costs.linear import binary_scale, velocity
 from ..types import Alignment, Matches, Status, TrackSet, in_order
+from ..types.checks import positive
 from ..types.trust import Trust
 from .peaks import local_peaks, vertex
 from .slot import Aligner
@@ -35,6 +36,10 @@ COMMON_RATES = (4 / 5, 5 / 6, 24 / 25, 25 / 24, 6 / 5, 5 / 4)
 """Clock ratios of the frame rates 24, 25 and 30, by which a container's fps may be wrong."""
 
 RATE_MATCHES = 40
+
+
+READS = ("evidence", "margin", "disagreement", "alias", "overlap", "matches", "motion", "rate_gain")
+"""The limits of :class:`otsync.Trust` that the scan's flags are raised by."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +68,13 @@ class LikelihoodScan(Aligner):
     peaks: int = 5
     limit: int = 500
     trust: Trust = field(default_factory=Trust)
+
+    def __post_init__(self) -> None:
+        if self.max_lag is not None:
+            positive("LikelihoodScan.max_lag", self.max_lag, zero=True)
+        for name in ("min_overlap", "peaks", "limit"):
+            positive(f"LikelihoodScan.{name}", getattr(self, name))
+        self.trust.check("LikelihoodScan.trust", READS)
 
     def __call__(self, a: TrackSet, b: TrackSet, matches: Matches) -> Alignment:
         matches = strongest(matches, self.limit)

@@ -14,6 +14,9 @@ RefinerLike = Callable[[TrackSet, TrackSet, Matches, Alignment], Alignment]
 
 Rate = Literal["fixed", "fit"]
 
+JUDGED_BY = ("evidence", "margin", "rate_sigmas")
+"""The limits of a refiner's ``trust`` that the graph of pairs reads."""
+
 
 class Refiner:
     """Base of otsync's refiners. A callable of your own needs none of it; what it lacks has these defaults.

@@ -17,7 +17,7 @@ from ..types import Alignment, Clock, Matches, Status, TrackSet, in_order
 from ..types.checks import positive
 from ..types.trust import Trust
 from .gauss_newton import Fit, fit_clock, overlap_seconds, velocity_correlation
-from .slot import Rate, Refiner
+from .slot import JUDGED_BY, Rate, Refiner
 
 LEAST_SIGMA = 0.012 / 30
 """Seconds; no sigma is reported below this."""
@@ -31,6 +31,10 @@ LONG = 600 / 30
 
 VELOCITY = 5 / 30
 """Half window, s, of the velocities whose correlation judges the fit."""
+
+
+READS = ("moved", "spread", "correlation", "blur", "overlap", "matches", "rate_sigmas")
+"""The limits of :class:`otsync.Trust` that the fit's flags are raised by."""
 
 
 @dataclass(frozen=True)
@@ -106,6 +110,7 @@ class SplineRefine(Refiner):
             raise ValueError(f"SplineRefine.windows: expected seconds above 0, at least one; found {self.windows}.")
         positive("SplineRefine.smoothing", self.smoothing, zero=True)
         positive("SplineRefine.limit", self.limit)
+        self.trust.check("SplineRefine.trust", (*READS, *JUDGED_BY))
 
     def with_rate(self, rate: Rate) -> SplineRefine:
         return replace(self, rate=rate)

@@ -5,7 +5,8 @@ Lengths of time are seconds (the designs' frame counts at 30 fps); nothing has a
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, fields
 
 
 @dataclass(frozen=True)
@@ -45,3 +46,19 @@ class Trust:
     blur: float = 5.6 / 30
     rate_sigmas: float = 6.0
     rate_gain: float = 1.3
+
+    def check(self, owner: str, reads: tuple[str, ...]) -> None:
+        """ValueError for a limit that is set although its owner does not read it, or that is no number.
+
+        Args:
+            owner: "LikelihoodScan.trust", in the error. reads: names of the limits that the owner reads.
+        """
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not math.isfinite(value):
+                raise ValueError(f"{owner}.{field.name}: expected a finite number; found {value}.")
+            if field.name not in reads and value != field.default:
+                raise ValueError(
+                    f"{owner}.{field.name}: expected one of {', '.join(reads)}, which are what it reads; found {value:g}. "
+                    "Leave it out, or set it where it is read (the scan's limits in the aligner, the fit's in the refiner)."
+                )
