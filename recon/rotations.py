@@ -1,4 +1,4 @@
-"""Quaternions wxyz: what splining, blending and fitting node rotations needs of them."""
+"""Rotations: quaternions wxyz and matrices, in torch and numpy. Their twins in kernels: :mod:`otsync.compute.quaternions`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from otsync.compute.quaternions import LEAST_NORM
+LEAST_NORM = 1e-12  # as in the kernels, which are not imported here: the renderer works without numba
 
 
 def unit(quats: Tensor) -> Tensor:
@@ -35,8 +35,19 @@ def product(p: Tensor, q: Tensor) -> Tensor:
     )
 
 
+def rotation_matrices(quats: Tensor) -> Tensor:
+    """Rotations [...,3,3] of *unit* quaternions wxyz [...,4]."""
+    w, x, y, z = quats.unbind(-1)
+    entries = [
+        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    ]
+    return torch.stack(entries, -1).reshape(*quats.shape[:-1], 3, 3)
+
+
 def rotation_vectors(quats: Tensor) -> Tensor:
-    """Logarithms of *unit* quaternions [...,4]: axis times angle, radians in -pi..pi, [...,3]. Smooth at no rotation."""
+    """Logarithms [...,3] of *unit* quaternions [...,4]: axis times angle, radians in -pi..pi. Smooth at no rotation."""
     q = torch.where(quats[..., :1] < 0, -quats, quats)
     sine2 = (q[..., 1:] ** 2).sum(-1, keepdim=True)
     small = sine2 < 1e-12
