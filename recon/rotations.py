@@ -1,4 +1,7 @@
-"""Rotations: quaternions wxyz and matrices, in torch and numpy. Their twins in kernels: :mod:`otsync.compute.quaternions`."""
+"""Rotations as quaternions wxyz and matrices, in torch and numpy; and the pose of a camera that looks at a point.
+
+Inside kernels: :mod:`otsync.compute.quaternions`.
+"""
 
 from __future__ import annotations
 
@@ -73,3 +76,22 @@ def continuous(quats: Float[np.ndarray, "P *B 4"]) -> Float[np.ndarray, "P *B 4"
     steps = np.einsum("p...i,p...i->p...", quats[1:], quats[:-1])
     flips = np.cumprod(np.where(steps < 0, -1.0, 1.0), axis=0)
     return np.concatenate([quats[:1], quats[1:] * flips[..., None]])
+
+
+def look_at(
+    eye: Float[np.ndarray, " 3"], focus: Float[np.ndarray, " 3"], up: Float[np.ndarray, " 3"]
+) -> Float[np.ndarray, "4 4"]:
+    """World to camera (OpenCV axes) of a camera at ``eye`` that looks at ``focus``, its rows along the horizon.
+
+    ValueError where it looks along ``up``.
+    """
+    z = focus - eye
+    z = z / np.linalg.norm(z)
+    x = np.cross(z, up)
+    if np.linalg.norm(x) < 1e-6 * np.linalg.norm(up):
+        raise ValueError("up: expected an axis across the line of sight; found it along it. Move the eye aside.")
+    x /= np.linalg.norm(x)
+    w2c = np.eye(4)
+    w2c[:3, :3] = np.stack([x, np.cross(z, x), z])
+    w2c[:3, 3] = -w2c[:3, :3] @ eye
+    return w2c
