@@ -21,7 +21,7 @@ from recon.observe.effects import MotionBlur, optics, with_declared
 from recon.scene.seed import Seeding
 from recon.simulate.capture import Capture, synthetic
 from recon.simulate.effects import Blur, Rolling, Sheen
-from recon.simulate.recording import begun
+from recon.simulate.recording import initial_scene
 
 FILMED = {"none": (), "rolling": (Rolling(0.025),), "blur": (Blur(0.025),), "sheen": (Sheen(0.4),)}
 
@@ -46,7 +46,7 @@ def main() -> None:
         capture = synthetic(seed, effects=FILMED[args.effect])
         believed = Offsets.known([f.name for f in capture.footage], np.zeros(len(capture.footage)), 30.0)
         for name, (effects, seeding) in {"with": modelled(args.effect, capture), "without": ((), Seeding())}.items():
-            scene = begun(capture, believed, seeding=seeding)
+            scene = initial_scene(capture, believed, seeding=seeding)
             started = time.process_time()
             found = fit(scene, capture.footage, believed, effects=effects, steps=args.steps)
             seconds = time.process_time() - started

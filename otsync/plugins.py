@@ -89,6 +89,11 @@ def load_files(paths: Iterable[str | os.PathLike[str]]) -> None:
         _files[path] = None
 
 
+def loaded_files() -> tuple[Path, ...]:
+    """The files that :func:`load_files` imported: for processes that are to know the same plugins."""
+    return tuple(_files)
+
+
 def load_environment() -> None:
     """Import the files that ``OTSYNC_PLUGINS`` names."""
     load_files(filter(None, os.environ.get(ENVIRONMENT, "").split(os.pathsep)))

@@ -25,8 +25,8 @@ report bench cli
 """Floors of otsync, ground first: a folder (or file) knows what stands on floors below, and what ``BESIDE`` allows."""
 
 RECON = """
-raster footage
-motion
+rotations
+raster footage motion
 scene
 losses observe
 backdrop fit evaluate simulate
@@ -48,7 +48,7 @@ BESIDE = {
         "cli": {"report", "bench"},
     },
     "recon": {
-        "backdrop": {"evaluate"},
+        "backdrop": {"fit"},
         "simulate": {"fit"},
     },
 }

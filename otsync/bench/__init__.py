@@ -1,1 +1,52 @@
-"""What accuracy costs in time: benchmarks that write CSV, JSON and a plot, with machine and versions."""
+"""Benchmarks: accuracy against time, as tables, CSV, JSON and plots, with machine and versions.
+
+core.py    the paper's ablation and its DTW, import time, the cost of no effect
+match.py   every matcher at every size; match_limits.py: what matching promises
+sync.py    aligners, refiners and graphs; sync_acceptance.py: what synchronisation promises
+panoptic.py  the paper's protocol on a truly synchronised recording
+record.py  tables on disk, machine and versions, the gate against a committed baseline
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from functools import partial
+from importlib.metadata import EntryPoint
+from typing import Any
+
+from ..plugins import entries, registered
+
+OWN = ("core", "match", "sync")
+"""Suites that need nothing but this package."""
+
+
+def suites() -> dict[str, Callable[[], Any]]:
+    """Benchmark suites by name, ours first, then plugins': call one to load it.
+
+    What is loaded is a module, or an object, with ``run(out, *, gate=False, rebase=False, ...)`` -> exit code.
+    ValueError names two suites of one name; a call raises it where a plugin does not import.
+    """
+    loaders: dict[str, Callable[[], Any]] = {
+        name: partial(importlib.import_module, f"{__name__}.{name}") for name in OWN
+    }
+    others = [(name, partial(_load, point)) for name, point in entries("benchmarks").items()]
+    others += [(name, partial(_given, suite)) for name, suite in registered("benchmarks").items()]
+    for name, loader in others:
+        if name in loaders:
+            raise ValueError(f"benchmarks: expected a name for each suite; found two named {name!r}. Rename one.")
+        loaders[name] = loader
+    return loaders
+
+
+def _load(point: EntryPoint) -> Any:
+    try:
+        return point.load()
+    except ImportError as error:
+        raise ValueError(
+            f"benchmark {point.name}: expected {point.value} to import; found {error}. Install what it needs."
+        ) from error
+
+
+def _given(suite: Any) -> Any:
+    return suite

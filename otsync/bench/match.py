@@ -1,11 +1,13 @@
-"""What matching accuracy costs in time: every matcher at every size that it can take, with POT's own solver beside it.
+"""Accuracy of matching against time: every matcher at every size that it can take, with POT's own solver beside it.
 
-Each cell runs in a process of its own, warmed up on a small world, so that peak memory is that cell's.
+Each cell runs in a process of its own, warmed up on a small world, so that its peak memory is that of the cell.
 """
 
 from __future__ import annotations
 
 import json
+import math
+import os
 import resource
 import subprocess
 import sys
@@ -17,11 +19,13 @@ from typing import Any
 import numpy as np
 
 from ..costs.linear import Cosine, total_cost
+from ..match import MATCHERS as OFFERED
 from ..match.anchored import AnchoredFGW
 from ..match.dense import EntropicFGW, FusedGromovWasserstein, NearestNeighbor, OptimalTransport, PartialFGW
 from ..match.problem import from_plan, normalised_structure, uniform
 from ..match.slot import MatcherLike
 from ..metrics import match_quality
+from ..plugins import ENVIRONMENT, available, loaded_files
 from ..progress import counted, say
 from ..simulate import matching_world
 from ..types import Matches, TrackSet
@@ -35,7 +39,7 @@ FIGURES = ("precision", "recall", "flips", "p50")
 
 @dataclass(frozen=True)
 class PotDefaults:
-    """POT called directly with its own defaults on prepared matrices; its time is that of the call alone."""
+    """POT called directly, with its own defaults, on prepared matrices; the time is that of this call alone."""
 
     def __call__(self, a: TrackSet, b: TrackSet) -> Matches:
         import ot
@@ -49,7 +53,7 @@ class PotDefaults:
         return from_plan(plan, linear, p, q, 1.0, stats | {"objective": float(log["fgw_dist"])}, False)
 
 
-#: name -> matcher, and the largest size it is tried at
+#: rows of the table: name -> matcher, and the largest size at which it is tried
 MATCHERS: dict[str, tuple[MatcherLike, int]] = {
     REFERENCE: (PotDefaults(), 5000),
     "NearestNeighbor": (NearestNeighbor(), 5000),
@@ -62,11 +66,27 @@ MATCHERS: dict[str, tuple[MatcherLike, int]] = {
 }
 
 
+OTHERS_LARGEST = 2000
+"""Largest size at which a matcher without a row of its own is tried: a dense one takes a minute there."""
+
+
 def rivals() -> dict[str, tuple[MatcherLike, int]]:
     """Other packages' FGW, where they are installed."""
     from . import rivals
 
     return rivals.installed()
+
+
+def others() -> dict[str, tuple[MatcherLike, int]]:
+    """Matchers of the slot that have no row above, at their defaults: ours and plugins'. No gate watches them."""
+    listed = {type(matcher) for matcher, _ in MATCHERS.values()}
+    found = {name: thing for name, thing in available("matchers", OFFERED).items() if thing not in listed}
+    return {name: (thing() if isinstance(thing, type) else thing, OTHERS_LARGEST) for name, thing in found.items()}
+
+
+def contenders() -> dict[str, tuple[MatcherLike, int]]:
+    """Every row of the table: name -> matcher, and the largest size at which it is tried."""
+    return MATCHERS | rivals() | others()
 
 
 def run(
@@ -83,18 +103,21 @@ def run(
     """Measure every matcher at every size; print the table, write CSV, JSON and the plot.
 
     Args:
-        seeds: worlds a cell; fixed, and nothing is tuned on them.
-        limit: CPU seconds a world; a matcher is not tried at sizes where it is expected to take longer.
-        only: names of matchers; default: all.
-        gate: compare with the committed baseline, 1 when something got worse. rebase: make this the baseline.
+        seeds: worlds per cell; fixed, and nothing is tuned on them.
+        limit: CPU seconds per world; a matcher is not tried at sizes where it is expected to take longer.
+        only: names of matchers; default: all of :func:`contenders`.
+        gate: compare with the committed baseline, 1 when something got worse. rebase: make this run the baseline.
+            Neither looks at matchers without a row in :data:`MATCHERS`, or at other packages' without one there.
     """
-    rows: list[dict[str, Any]] = []
-    for name, (_, largest) in (MATCHERS | rivals()).items():
+    every, rows = contenders(), []  # type: dict[str, tuple[MatcherLike, int]], list[dict[str, Any]]
+    if not set(only) <= set(every):
+        raise ValueError(f"only: expected some of {', '.join(every)}; found {', '.join(set(only) - set(every))}.")
+    for name, (_, largest) in every.items():
         if only and name not in only:
             continue
         for n in counted([s for s in sizes if s <= largest], name, "size"):
             last = rows[-1] if rows and rows[-1]["matcher"] == name else None
-            if last and last.get("cpu_seconds", limit) * (n / last["n"]) ** GROWTH.get(name, 1.0) > limit:
+            if last and last.get("cpu_seconds", limit) * (n / last["n"]) ** growth(name) > limit:
                 break
             row = cell(name, n, range(first_seed, first_seed + seeds), limit)
             rows.append(row)
@@ -110,22 +133,25 @@ def run(
     from .match_plot import plot
 
     plot(rows, out / "match_frontier.svg")
-    figures = figures_of(rows)
+    watched = MATCHERS | rivals()
+    figures = figures_of([row for row in rows if row["matcher"] in watched])
     if rebase:
         record.save_baseline("match", figures)
     return record.gate("match", figures, worse) if gate else 0
 
 
-#: seconds grow with this power of the number of tracks; 1 where not named
-GROWTH = {name: 2.0 for name in MATCHERS if not name.startswith("Anchored")}
+def growth(name: str) -> float:
+    """The power of the number of tracks with which seconds are expected to grow: dense matchers fill a matrix."""
+    return 1.0 if name.startswith("Anchored") or name in rivals() else 2.0
+
 
 COLUMNS = ("matcher", "n", "status", *FIGURES, "objective", "seconds", "cpu_seconds", "speedup", "peak_gb", "front")
 
 
 def figures_of(rows: list[dict[str, Any]]) -> dict[str, float]:
-    """What the gate compares: accuracy, and times as ratios to POT's own solver at 2000 tracks in the same run.
+    """The figures that the gate compares: accuracy, and times as ratios to POT's own solver at 2000 tracks in this run.
 
-    Ratios of sizes below 1000 are left out: what takes milliseconds varies too much.
+    Ratios of sizes below 1000 are left out: times of milliseconds vary too much.
     """
     done = [r for r in rows if r["status"] == "ok"]
     figures = {f"{r['matcher']} {r['n']} p50": r["p50"] for r in done}
@@ -147,7 +173,11 @@ def cell(name: str, n: int, seeds: range, limit: float) -> dict[str, Any]:
     row: dict[str, Any] = {"matcher": name, "n": n}
     try:
         done = subprocess.run(
-            [sys.executable, "-c", code], capture_output=True, text=True, timeout=60 + 4 * limit * len(seeds)
+            [sys.executable, "-c", code],
+            capture_output=True,
+            text=True,
+            timeout=60 + 4 * limit * len(seeds),
+            env=os.environ | {ENVIRONMENT: os.pathsep.join(map(str, loaded_files()))},
         )
     except subprocess.TimeoutExpired:
         return row | {"status": "over the time limit"}
@@ -158,8 +188,8 @@ def cell(name: str, n: int, seeds: range, limit: float) -> dict[str, Any]:
 
 
 def measure(name: str, n: int, seeds: list[int]) -> None:
-    """What :func:`cell` runs; prints one line of JSON."""
-    matcher = (MATCHERS | rivals())[name][0]
+    """The work of :func:`cell`, in its process; prints one line of JSON."""
+    matcher = contenders()[name][0]
     matcher(*matching_world(60, seed=1)[:2])
     if isinstance(matcher, AnchoredFGW):
         matcher(*matching_world(3 * matcher.cells // 2 + 300, seed=1, frames=20)[:2])
@@ -167,16 +197,17 @@ def measure(name: str, n: int, seeds: list[int]) -> None:
     for seed in seeds:
         a, b, truth = matching_world(n, seed=seed)
         wall, cpu = time.perf_counter(), time.process_time()
-        found = matcher(a, b)
+        matches = matcher(a, b)
         spent = {"seconds": time.perf_counter() - wall, "cpu_seconds": time.process_time() - cpu}
-        if "solver_cpu" in found.stats:
-            spent = {"seconds": found.stats["solver_seconds"], "cpu_seconds": found.stats["solver_cpu"]}
-        objective = found.stats.get("objective", float("nan"))
-        runs.append(match_quality(found, truth) | spent | {"objective": objective})
+        if "solver_cpu" in matches.stats:
+            spent = {"seconds": matches.stats["solver_seconds"], "cpu_seconds": matches.stats["solver_cpu"]}
+        objective = matches.stats.get("objective", float("nan"))
+        runs.append(match_quality(matches, truth) | spent | {"objective": objective})
     row = {key: float(np.mean([r[key] for r in runs])) for key in (*FIGURES, "objective")}
     row |= {key: float(np.median([r[key] for r in runs])) for key in ("seconds", "cpu_seconds")}
     row["peak_gb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-    print(json.dumps(row))
+    # not every matcher tells its objective, and files hold no NaN
+    print(json.dumps({key: value if math.isfinite(value) else None for key, value in row.items()}))
 
 
 def mark_front(rows: list[dict[str, Any]]) -> None:

@@ -1,7 +1,8 @@
-"""The plot of :mod:`otsync.bench.match`: accuracy against seconds, one line a matcher, the front marked."""
+"""The plot of :mod:`otsync.bench.match`: accuracy against seconds, a line for each matcher, the front marked."""
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,8 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
     names = list(dict.fromkeys(r["matcher"] for r in done))
     with plt.rc_context({"svg.hashsalt": "otsync", "svg.fonttype": "none", "font.size": 9}):
         figure, axes = plt.subplots(figsize=(8, 4.6))
-        for name, color in zip(names, color_sequences["tab10"], strict=False):
+        colors = itertools.cycle((*color_sequences["tab10"], *color_sequences["tab20b"]))
+        for name, color in zip(names, colors, strict=False):
             own = sorted((r for r in done if r["matcher"] == name), key=lambda r: r["n"])
             x, y = [r["cpu_seconds"] for r in own], [r["p50"] for r in own]
             axes.plot(x, y, "-", color=color, lw=1.2, alpha=0.7)

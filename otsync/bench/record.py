@@ -1,4 +1,4 @@
-"""What every benchmark shares: machine and versions, tables on disk, the gate against a committed baseline."""
+"""Shared by all benchmarks: machine and versions, tables on disk, the gate against a committed baseline."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ PACKAGES = ("otsync", "numpy", "scipy", "POT", "tslearn", "numba", "torch")
 
 
 def machine() -> dict[str, Any]:
-    """Processor, cores, memory, Python and package versions: what a figure means nothing without."""
+    """Processor, cores, memory, Python and package versions: without them a figure means nothing."""
     return {
         "processor": _processor(),
         "cores": os.cpu_count(),
@@ -60,34 +60,33 @@ def table(rows: Sequence[Row], columns: Sequence[str] | None = None) -> str:
 
 
 def gate(name: str, measured: Mapping[str, float], worse: Callable[[str, float, float], bool]) -> int:
-    """Compare figures with the committed baseline; print what got worse; 0 when nothing did, else 1.
+    """Compare figures with the committed baseline and print what got worse; 0 when nothing did, else 1.
+
+    Figures that the baseline does not have are not compared; those of it that were not measured fail.
 
     Args:
         worse: ``worse(key, measured, baseline)``, with the tolerance that the figure's kind calls for.
     """
     baseline = read_json(baseline_path(name))["figures"]
     missing = sorted(set(baseline) - set(measured))
-    failed = [
-        key
-        for key, value in measured.items()
-        if key in baseline and not (math.isfinite(value) and not worse(key, value, baseline[key]))
-    ]
+    compared = {key: value for key, value in measured.items() if key in baseline}
+    failed = [key for key, value in compared.items() if not math.isfinite(value) or worse(key, value, baseline[key])]
     for key in failed:
         print(f"gate {name}: {key}: {measured[key]:.4g}, baseline {baseline[key]:.4g}", file=sys.stderr)
     for key in missing:
         print(f"gate {name}: {key} is in the baseline and was not measured", file=sys.stderr)
     if not failed and not missing:
-        print(f"gate {name}: {len(measured)} figures no worse than the baseline")
+        print(f"gate {name}: {len(compared)} figure{'s'[: len(compared) != 1]} no worse than the baseline")
     return 1 if failed or missing else 0
 
 
 def save_baseline(name: str, figures: Mapping[str, float]) -> None:
-    """Make the figures the baseline that the gate compares with; commit the file."""
+    """Make the figures the baseline of the gate; commit the file."""
     write_json(baseline_path(name), {"machine": machine(), "figures": dict(figures)})
 
 
 def baseline_path(name: str) -> Path:
-    """Baselines stand beside the code that they judge, in an installed package too."""
+    """The file of a suite's baseline, beside the code that it judges: in an installed package too."""
     return Path(__file__).parent / "baselines" / f"{name}.json"
 
 

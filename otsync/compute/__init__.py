@@ -1,1 +1,1 @@
-"""What is compiled: how (jit), on which threads, SIMD lanes, and quaternions inside kernels."""
+"""How numbers are crunched: compiled kernels (jit, simd, quaternions), threads, and evenly spread indices."""

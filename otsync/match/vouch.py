@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from ..compute.indices import evenly
 from ..costs.linear import Cost, total_cost, track_distance
 from ..types import Matches, Status, TrackSet
 
@@ -109,7 +110,7 @@ def side(points: Float[np.ndarray, "M F 3"], quads: Int[np.ndarray, "Q 4"]) -> I
 def poses(xyz: Float[np.ndarray, "M T 3"], seen: Bool[np.ndarray, "M T"], frames: int) -> Float[np.ndarray, "M F 3"]:
     """Positions at some frames, of each track at the nearest one where it is seen."""
     T = seen.shape[1]
-    at = np.unique(np.linspace(0, T - 1, frames).round().astype(int))
+    at = evenly(T, frames)
     away = np.abs(np.arange(T)[None] - at[:, None])
     nearest = np.where(seen[:, None], away[None], 2 * T).argmin(2)
     return np.take_along_axis(xyz, nearest[..., None], 1)

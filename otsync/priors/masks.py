@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Bool
 
+from ..compute.indices import evenly
 from ..types import Camera
 from .flow import DISFlow
 from .working import WorkingFrames
@@ -36,7 +37,7 @@ class MedianBackground:
     def __call__(self, frames: WorkingFrames, camera: Camera) -> Bool[np.ndarray, "T h w"]:
         import cv2
 
-        picks = np.unique(np.linspace(0, len(frames) - 1, min(self.samples, len(frames))).round().astype(int))
+        picks = evenly(len(frames), self.samples)
         background = np.median(np.stack([frames[int(k)] for k in picks]), 0).astype(np.uint8)
         out = np.zeros((len(frames), frames.size[1], frames.size[0]), bool)
         for k in range(len(frames)):

@@ -1,1 +1,1 @@
-"""What stands still: pictures of it, seeds for it, and its own fit."""
+"""The backdrop, which stands still: pictures of it, seeds for it, and its own fit."""

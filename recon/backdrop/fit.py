@@ -1,7 +1,7 @@
 """The static part of a scene: Gaussians fitted once to what fixed cameras see behind the things that move.
 
 The background needs no synchronisation, so it is fitted before any motion and then stays as it is. Seeds come from
-depth where it is given, else from a floor and a shell (:mod:`recon.surroundings`).
+depth where it is given, else from a floor and a shell (:mod:`recon.backdrop.surroundings`).
 """
 
 from __future__ import annotations
@@ -19,22 +19,24 @@ from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 from tqdm import tqdm
 
+from otsync.compute.indices import evenly
 from recon.backdrop.seeds import seed_discs, surface_of
 from recon.backdrop.stills import Still, stills_of
-from recon.backdrop.surroundings import Floor, View, surroundings
+from recon.backdrop.surroundings import Floor, Lookup, surroundings
+from recon.fit.optimize import Adam, Decay
 from recon.footage.depth import Depths
 from recon.footage.footage import Footage
 from recon.losses.ssim import photometric
 from recon.losses.window import SMALL
-from recon.raster import render, sh
+from recon.observe.cameras import draw
 from recon.scene.device import device_of
 from recon.scene.gaussians import Gaussians
 
 log = logging.getLogger("recon.backdrop")
 
-NEAR = 0.22
-"""Near plane, as a share of the cameras' distance from the scene: what is seen from one side only must not stand before
-the eyes of another camera (with .01 m a held-out camera was blacked out: 6 dB)."""
+NEAR_SHARE = 0.22
+"""Near plane, as a share of the cameras' distance from the scene: what only one side saw must not stand just in front of
+another camera (with .01 m a held-out camera was blacked out: 6 dB)."""
 
 RATES: Mapping[str, float] = {
     "means": 0.2,
@@ -44,14 +46,37 @@ RATES: Mapping[str, float] = {
     "sh": 0.018,
     "gains": 2e-3,
 }
-"""Adam's steps at the start; means in footprints. Slower means stay on the seeds' surface, which is only a guess."""
+"""Adam's steps at the start; of means in footprints. Slower means would stay on the seeds' surface, which is a guess."""
 
-HOLD, LAST = 0.3, 0.03
-"""Rates are constant for this share of the steps, then fall exponentially to this factor at the end."""
+DECAY = Decay(hold=0.3, last=0.03)
+"""How the rates fall over the steps."""
 
 OPAQUE, EVERY = 0.05, 4
-"""Weight of the loss that asks for an opaque background in views between the cameras, and the steps between two of
-them: without it new views see cracks where no camera looked (24 instead of 31 dB in the synthetic room)."""
+"""Weight of the loss that asks for an opaque background in views between the cameras, and steps from one such view to
+the next. Without it new views see cracks where no camera looked (24 instead of 31 dB in the synthetic room)."""
+
+DSSIM = 0.2
+"""Weight of structural dissimilarity in the photometric loss, as in 3DGS."""
+
+GAUGE = 0.01
+"""Weight that keeps the mean gain near 1: gains and colours share one freedom."""
+
+STEPS = 1500
+"""Steps where neither steps nor a budget are given."""
+
+WARM, TIMED = 10, 30
+"""With a budget in seconds: the step at which compilation is over, and the one up to which the pace is measured."""
+
+GAIN_POINTS, GAIN_ROUNDS = 4000, 20
+"""Surface points that the first gains compare at most, and rounds of medians in which they settle."""
+
+MEDIAN_FRAMES, CHANGED, RARELY = 50, 14, 0.02
+"""A fixed camera without masks: frames of its median image; levels of 255 by which a changed pixel differs from it; and
+the share of frames in which an unchanging pixel may."""
+
+
+SEARCHED = 32
+"""Stills that floor and shell are searched with, at most; all of them are fitted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,10 +85,10 @@ class StaticFit:
 
     Args:
         gaussians: on the CPU, without a graph.
-        gains: (V,3) factors of every video's colours relative to the Gaussians'; 1 for videos that took no part.
+        gains: (V,3) factors from the Gaussians' colours to every video's; 1 for videos that took no part.
         near: near plane to render with, world units.
         psnr: (V,) dB over the seen background of every video, gains applied; nan for videos that took no part.
-        floor: found or given, or None.
+        floor: as given or as found; None where there is none.
         stats: seconds, steps, seeds, loss.
     """
 
@@ -92,11 +117,11 @@ def fit_backdrop(
     """Fit static Gaussians to the backgrounds of the videos.
 
     Args:
-        depth: per video, maps that include the background, of some frames at least; None: not known.
-        points: some positions of what moves, (N,3): scale and floor of a scene that cameras alone do not tell.
-        floor: the ground plane, when it is known; else it is searched for.
-        steps, budget: how long: a number of steps, or wall seconds. Default: 1500 steps.
-        sh_degree: of the view-dependent colour. With 14 cameras degree 1 fits them better, new views worse.
+        depth: per video, maps that include the background, of some frames at least; None: unknown.
+        points: (N,3) some positions of what moves: they tell scale and floor where the cameras alone do not.
+        floor: the ground plane, where it is known; else it is searched for.
+        steps, budget: a number of steps, or wall seconds. Default: 1500 steps.
+        sh_degree: of the view-dependent colour. With 14 cameras degree 1 fits them better, but new views worse.
         rates: a group without one is frozen.
 
     The result depends on the seed, not on the number of threads (with ``budget`` on the machine's speed as well).
@@ -112,13 +137,13 @@ def fit_backdrop(
             "footage: expected a video whose background shows; found none. Give masks, which tell it from what moves."
         )
     started = time.perf_counter()
-    around = surroundings(_some(stills, 32), points, floor)
-    near = NEAR * around.distance
+    around = surroundings([stills[i] for i in evenly(len(stills), SEARCHED)], points, floor)
+    near = NEAR_SHARE * around.distance
     surfaces = [surface_of(s, around, near) for s in stills]
     gains = first_gains(stills, np.concatenate([s.at for s in surfaces]), len(footage))
     start, sharpest = seed_discs(stills, surfaces, around, near, gains).gaussians(sh_degree)
     log.info("backdrop: %d seeds, near plane %.3g", len(start), near)
-    fit = _Fit(start, sharpest.to(device), stills, gains, near, around.distance, rates, seed, device)
+    fit = _BackdropFit(start, sharpest.to(device), stills, gains, near, around.distance, rates, seed, device)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # torch's pool would compete with the rasterizer's
     try:
@@ -131,17 +156,17 @@ def fit_backdrop(
 
 
 def first_gains(stills: Sequence[Still], points: Float[np.ndarray, "N 3"], videos: int) -> Float[np.ndarray, "V 3"]:
-    """Gains of the videos by the colours that they show of the same surface points, of geometric mean 1.
+    """Gains of the videos, of geometric mean 1, from the colours in which they show the same surface points.
 
-    Occlusion and points that are in the wrong place change colours too, but not all one way: medians are taken.
+    Occlusion and misplaced points change colours too, but not all in one direction: medians are taken.
     """
-    looks = [View.of(still).look(points[:: max(1, len(points) // 4000)]) for still in stills]
+    looks = [Lookup.of(still).look(points[:: max(1, len(points) // GAIN_POINTS)]) for still in stills]
     colors = np.where(np.stack([k for _, k in looks])[..., None], np.stack([c for c, _ in looks]), np.nan)
     twice = np.isfinite(colors[..., 0]).sum(0) >= 2
     shift, video = np.zeros((videos, 3)), np.array([s.video for s in stills])
     if not twice.any():
         return np.ones((videos, 3))
-    for _ in range(20):
+    for _ in range(GAIN_ROUNDS):
         apart = colors[:, twice] - shift[video][:, None]
         apart = apart - np.nanmean(apart, 0)
         for v in np.unique(video):
@@ -155,9 +180,9 @@ def first_gains(stills: Sequence[Still], points: Float[np.ndarray, "N 3"], video
 def colour_gain(
     rendered: Float[np.ndarray, "h w 3"], image: Float[np.ndarray, "h w 3"], mask: np.ndarray | None = None
 ) -> Float[np.ndarray, " 3"]:
-    """The factor per channel by which ``rendered`` is nearest to ``image`` (least squares), both uint8 or 0..1.
+    """The factor per channel that brings ``rendered`` nearest to ``image`` (least squares), both uint8 or 0..1.
 
-    mask: (h,w) weights of pixels. For a camera that no fit saw give its static part only, never people.
+    mask: (h,w) weights of pixels. For a held-out camera give its static part only, never people.
     """
     x, y = (_unit(a) for a in (rendered, image))
     w = np.ones(x.shape[:2]) if mask is None else np.asarray(mask, float)
@@ -184,7 +209,7 @@ def with_backdrop(
 
     Args:
         gain: of the camera; None: fitted on the part of its background that was seen.
-        everywhere: take nothing from the video itself: how a held-out camera is rendered.
+        everywhere: take nothing from the video itself, as for a held-out camera.
     """
     if footage.w2c.ndim != 2:
         raise ValueError(f"footage {footage.name!r}: expected a fixed camera; found a moving one. Render it jointly.")
@@ -200,17 +225,17 @@ def with_backdrop(
     )
 
 
-def unchanging(footage: Footage, threshold: int = 14) -> tuple[UInt8[np.ndarray, "h w 3"], np.ndarray]:
-    """(median image, where at most 2 % of the frames differ from it by ``threshold``) of a fixed camera without masks."""
+def unchanging(footage: Footage, threshold: int = CHANGED) -> tuple[UInt8[np.ndarray, "h w 3"], np.ndarray]:
+    """(median image, where at most 2 % of the frames differ from it by ``threshold``) of a fixed camera."""
     good = np.flatnonzero(~footage.bad)
-    images = footage.images[good[np.unique(np.linspace(0, len(good) - 1, min(50, len(good))).round().astype(int))]]
+    images = footage.images[good[evenly(len(good), MEDIAN_FRAMES)]]
     median = np.median(images, 0).astype(np.int16)
     changed = np.stack([np.abs(image - median).max(-1) > threshold for image in images])
-    return median.astype(np.uint8), changed.mean(0) <= 0.02
+    return median.astype(np.uint8), changed.mean(0) <= RARELY
 
 
-class _Fit:
-    """A background fit under way."""
+class _BackdropFit:
+    """A fit under way: its parameters, their optimiser, and the pictures that it looks at."""
 
     def __init__(
         self,
@@ -227,16 +252,10 @@ class _Fit:
         self.sharpest, self.near, self.stills, self.seed, self.step = sharpest, near, stills, seed, 0
         footprint = distance / float(np.median([s.K[0, 0] for s in stills]))
         values = {**vars(start), "gains": torch.as_tensor(gains - 1, dtype=torch.float32)}
-        self.groups = {name: value.to(device).clone() for name, value in values.items()}
-        self.rates = {n: r * (footprint if n == "means" else 1.0) for n, r in rates.items() if self.groups[n].numel()}
-        for name in self.rates:
-            self.groups[name].requires_grad_()
-        self.adam = torch.optim.Adam(
-            [{"params": [self.groups[n]], "lr": r, "name": n} for n, r in self.rates.items()],
-            betas=(0.9, 0.99),
-            eps=1e-15,
-            fused=True,
-        )
+        groups = {name: value.to(device) for name, value in values.items()}
+        learned = {name: rate for name, rate in rates.items() if groups[name].numel()}
+        self.adam = Adam(groups, learned, footprint, frame_step=1.0)
+        self.groups = {**groups, **self.adam.groups}
         self.views = [
             (
                 *(torch.as_tensor(a, dtype=torch.float32, device=device)[None] for a in (s.w2c, s.K)),
@@ -268,9 +287,8 @@ class _Fit:
         w2c[:3, :3] = Slerp([0, 1], Rotation.from_matrix(np.stack([e.w2c[:3, :3] for e in ends])))(share).as_matrix()
         w2c[:3, 3] = -w2c[:3, :3] @ ((1 - share) * ends[0].center + share * ends[1].center)
         g = self.gaussians()
-        splats = (g.means, g.quats, g.scales, g.opacities, torch.ones_like(g.means[:, :1]))
-        view = torch.as_tensor(w2c[None]).to(g.means)
-        return render(*splats, view, self.views[a][1], *ends[0].size, near_plane=self.near, depth=None).alphas
+        view, nothing = torch.as_tensor(w2c[None]).to(g.means), torch.ones_like(g.means[:, :1])
+        return draw(g, view, self.views[a][1], ends[0].size, self.near, colors=nothing).alphas
 
     def run(self, total: int | None, budget: float | None, progress: bool) -> float:
         """All steps; the mean loss of the last tenth."""
@@ -284,11 +302,11 @@ class _Fit:
                     order = rng.permutation(len(self.views)).tolist()
                 recent.append(self.one_step(order.pop(), 0.0 if total is None else self.step / total))
                 bar.update()
-                if total is None and self.step == 10:
-                    began = time.perf_counter()  # what comes before is compilation and warming up
-                if total is None and self.step == 30:
+                if total is None and self.step == WARM:
+                    began = time.perf_counter()  # the steps before compile and warm up
+                if total is None and self.step == TIMED:
                     assert budget is not None
-                    total = max(30, int(20 * budget / (time.perf_counter() - began)))
+                    total = max(TIMED, int((TIMED - WARM) * budget / (time.perf_counter() - began)))
                     bar.total = total
                 if self.step % 50 == 0:
                     bar.set_postfix_str(f"loss {np.mean(recent[-50:]):.4f}", refresh=False)
@@ -297,23 +315,20 @@ class _Fit:
     def one_step(self, i: int, progress: float) -> float:
         """One picture, one step of Adam; the loss."""
         seen, image, where = self.see(i)
-        loss = photometric(seen, image, where, 0.2, SMALL)
+        loss = photometric(seen, image, where, DSSIM, SMALL)
         if loss is None:  # nothing of the background shows in this picture
             self.step += 1
             return 0.0
-        # gains and colours share one freedom: keep the mean gain near 1
-        total = loss + 0.01 * self.groups["gains"].square().sum()
+        total = loss + GAUGE * self.groups["gains"].square().sum()
         if len(self.stills) > 1 and self.step % EVERY == 0:
             total = total + OPAQUE * (1 - self.cover()).mean()
         value = float(total.detach())
         if not math.isfinite(value):
-            raise FloatingPointError(f"backdrop: the loss is no number at step {self.step}: lower the rates")
-        self.adam.zero_grad(set_to_none=True)
-        total.backward()
-        factor = LAST ** max(0.0, (progress - HOLD) / (1 - HOLD))
-        for group in self.adam.param_groups:
-            group["lr"] = self.rates[group["name"]] * factor
-        self.adam.step()
+            raise FloatingPointError(
+                f"backdrop: expected a finite loss; found {value} at step {self.step}. Lower the rates."
+            )
+        gradients = torch.autograd.grad(total, list(self.adam.groups.values()), allow_unused=True)
+        self.adam.step(dict(zip(self.adam.groups, gradients, strict=True)), DECAY(progress))
         self.step += 1
         return value
 
@@ -335,15 +350,7 @@ class _Fit:
 
 def _render(gaussians: Gaussians, w2c: Tensor, K: Tensor, size: tuple[int, int], near: float) -> Tensor:
     """Colours [1,h,w,3]."""
-    degree = gaussians.sh_degree or None
-    colors = gaussians.sh if degree else (sh.C0 * gaussians.sh[:, 0] + 0.5).clamp_min(0)
-    splats = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, colors)
-    return render(*splats, w2c, K, *size, near_plane=near, depth=None, sh_degree=degree).colors
-
-
-def _some(stills: list[Still], most: int) -> list[Still]:
-    """At most so many, spread over all."""
-    return [stills[i] for i in np.unique(np.linspace(0, len(stills) - 1, min(most, len(stills))).round().astype(int))]
+    return draw(gaussians, w2c, K, size, near).colors
 
 
 def _unit(image: np.ndarray) -> np.ndarray:
@@ -358,4 +365,4 @@ def _total(steps: int | None, budget: float | None) -> int | None:
         raise ValueError(f"budget: expected seconds above 0; found {budget}.")
     if steps is not None and steps < 0:
         raise ValueError(f"steps: expected 0 or more; found {steps}.")
-    return None if budget is not None else 1500 if steps is None else steps
+    return None if budget is not None else STEPS if steps is None else steps

@@ -1,4 +1,4 @@
-"""Seeds of a background: flat discs where the pictures show a surface, and coarse ones behind for the gaps."""
+"""Seeds of a backdrop: flat discs on the surfaces that the pictures show, and coarse ones behind their gaps."""
 
 from __future__ import annotations
 
@@ -17,20 +17,28 @@ from recon.raster import sh
 from recon.scene.gaussians import Gaussians
 
 RAYS, SPACING = 80, 2.6
-"""Rays per image width along which seeds are cast; spacing of the seeds in pixels of the camera that is nearest."""
+"""Rays per image width along which seeds are cast; spacing of the seeds, in pixels of the nearest camera."""
 
 WIDTH, THICKNESS, OPACITY = 0.45, 0.2, 0.82
-"""Of a seed: standard deviation along the surface in spacings; across it, relative to that."""
+"""Of a seed: standard deviation along the surface, in spacings; across it, relative to that; and its opacity."""
 
-COARSE, BEHIND = 5.0, 0.15
-"""The layer below seeds of known depth: its spacing in theirs, and how far behind it lies in its own spacings."""
+COARSE, BEHIND, BROAD = 5.0, 0.15, 0.6
+"""The layer below seeds of known depth: its spacing, in theirs; how far behind them it lies and the standard deviation of
+its discs, in its own spacings."""
+
+SOLID = 0.98
+"""Opacity of that layer and of fillers: nothing lies behind them."""
 
 FILLERS = 1500
-"""Discs that would cover all directions; those are taken where no camera looked."""
+"""Discs that would cover all directions; only those are taken where no camera looked."""
+
+BEYOND, ALONE, BLENDED = 1.05, 1.5, 8
+"""Fillers: how far out they stand, in distances of floor and shell; widths to the nearest seed from which one is needed;
+seeds whose colours it blends."""
 
 SHARPEST = 0.4
-"""Least standard deviation of a Gaussian, in pixels of the nearest camera: a held-out camera may come closer, and would
-see the gaps between finer ones (the smoothing filter of Mip-Splatting, Yu et al. 2024)."""
+"""Least standard deviation of a Gaussian, in pixels of the nearest camera: a held-out camera that comes closer would see
+gaps between finer ones (the smoothing filter of Mip-Splatting, Yu et al. 2024)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,8 +47,8 @@ class Discs:
 
     Args:
         at, normal, color: (N,3). width: (N,) standard deviation along the surface.
-        pixel: (N,) world size of a pixel of the camera that sees it largest.
-        opacity: (N,). measured: (N,) whether its depth was given rather than guessed.
+        pixel: (N,) world size of a pixel of the camera that shows it largest.
+        opacity: (N,). measured: (N,) whether the depth was given rather than guessed.
     """
 
     at: Float[np.ndarray, "N 3"]
@@ -68,7 +76,7 @@ class Discs:
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """What one picture shows, ray by ray: points, normals and colours [N,3], and whether their depth was given [N]."""
+    """The surface in one picture, ray by ray: points, normals and colours [N,3], and whether their depth was given [N]."""
 
     at: Float[np.ndarray, "N 3"]
     normal: Float[np.ndarray, "N 3"]
@@ -77,9 +85,9 @@ class Surface:
 
 
 def surface_of(still: Still, around: Surroundings, near: float) -> Surface:
-    """A pixel's surface is at its depth where that is known, else on the floor or the shell.
+    """Where the pixels of a picture lie: at their depth where it is known, else on the floor or the shell.
 
-    What is nearer than ``near`` (along z) is left out.
+    Points nearer than ``near`` (along z) are left out.
     """
     u, v = still.pixels(max(1, round(still.size[0] / RAYS)))
     rays = still.rays(u, v)
@@ -103,21 +111,21 @@ def seed_discs(
     near: float,
     gains: Float[np.ndarray, "V 3"] | None = None,
 ) -> Discs:
-    """Discs on the surfaces of all pictures, one a voxel, and what lies behind them.
+    """Discs on the surfaces of all pictures, one per voxel, and coarser ones behind them.
 
-    gains: factors of the videos' colours, which are taken out.
+    gains: factors of the videos' colours, which are divided out.
     """
     at, normal, given = (np.concatenate([getattr(s, n) for s in surfaces]) for n in ("at", "normal", "measured"))
     if not len(at):
         raise ValueError(
-            f"footage: expected background farther than the near plane ({near:.3g}); found none. Check that depth and "
-            "poses are in the same unit."
+            f"footage: expected background beyond the near plane ({near:.3g}); found none. Check that depth and poses "
+            "have one unit."
         )
     color = np.concatenate(
         [s.color if gains is None else s.color / gains[t.video] for s, t in zip(surfaces, stills, strict=True)]
     ).clip(0, 1)
     pixel = _nearest_pixel(stills, at, near)
-    # voxels of a power of two times the smallest, so that far things are not seeded finer than they are seen
+    # sides of voxels are the smallest one times a power of two: far things are seeded no finer than they are seen
     base = np.percentile(pixel, 1)
     level = np.maximum(np.floor(np.log2(pixel / base) + 0.5), 0)
     side = SPACING * base * 2.0**level
@@ -129,10 +137,11 @@ def seed_discs(
 
 
 def underlay(fine: Discs) -> Discs:
-    """Coarse opaque discs a little behind the fine ones, where these are in their true place.
+    """Coarse opaque discs a little behind the fine ones whose depth was measured.
 
-    New views look through gaps that the cameras did not see: into black, without these. (+2 to 3 dB in the synthetic
-    room. Behind seeds on a guessed surface they take the place that the seeds should move to: -.2 to -.8 dB.)
+    New views look through gaps that the cameras did not see; without these discs they would look into black (+2 to 3 dB
+    in the synthetic room). Behind seeds on a guessed surface they would stand where the seeds should move: -.2 to
+    -.8 dB.
     """
     known = np.flatnonzero(fine.measured)
     side = COARSE * np.median(fine.width[known]) / WIDTH if len(known) else 1.0
@@ -156,24 +165,24 @@ def underlay(fine: Discs) -> Discs:
         mean(fine.at) - BEHIND * side * normal,
         normal,
         mean(fine.color),
-        np.full(n, 0.6 * side),
+        np.full(n, BROAD * side),
         np.full(n, np.median(fine.pixel)),
-        np.full(n, 0.98),
+        np.full(n, SOLID),
         np.ones(n, bool),
     )
 
 
 def fillers(fine: Discs, around: Surroundings) -> Discs:
-    """Large discs on floor and shell, in the colours of the nearest seeds, in the directions where there are none."""
+    """Large discs on floor and shell in the directions without seeds, in the colours of the nearest seeds."""
     k = np.arange(FILLERS) + 0.5
     polar, turn = np.arccos(1 - 2 * k / FILLERS), np.pi * (1 + 5**0.5) * k
     rays = np.stack([np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)], 1)
     away, normal = around.cast(np.broadcast_to(around.focus, rays.shape), rays)
     hit = np.isfinite(away)
-    at = around.focus + (1.05 * away[hit])[:, None] * rays[hit]
+    at = around.focus + (BEYOND * away[hit])[:, None] * rays[hit]
     width = away[hit] * (4 * np.pi / FILLERS) ** 0.5
-    far, which = cKDTree(fine.at).query(at, k=np.arange(1, min(8, len(fine.at)) + 1))
-    empty = far[:, 0] > 1.5 * width
+    far, which = cKDTree(fine.at).query(at, k=np.arange(1, min(BLENDED, len(fine.at)) + 1))
+    empty = far[:, 0] > ALONE * width
     weight = 1 / (far[empty] + 1e-9)[..., None]
     color = (fine.color[which[empty]] * weight).sum(1) / weight.sum(1)
     n = int(empty.sum())
@@ -183,13 +192,13 @@ def fillers(fine: Discs, around: Surroundings) -> Discs:
         color,
         width[empty],
         np.full(n, np.median(fine.pixel)),
-        np.full(n, 0.98),
+        np.full(n, SOLID),
         np.zeros(n, bool),
     )
 
 
 def normals_of_depth(still: Still, u: np.ndarray, v: np.ndarray) -> Float[np.ndarray, "N 3"]:
-    """Surface normals from the depths around pixels, on the camera's side; the pixel's own ray where they do not tell."""
+    """Surface normals, towards the camera, from the depths around pixels; where these do not tell, along the pixel's ray."""
     assert still.depth is not None
     depth, (width, height) = still.depth, still.size
     reach = max(2, width // 80)

@@ -1,4 +1,4 @@
-"""Pictures of what stands still: the median background of a fixed camera, or masked frames of a moving one."""
+"""Stills: pictures of the background, which are a fixed camera's median image or masked frames of a moving one."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy.ndimage import maximum_filter
 
+from otsync.compute.indices import evenly
 from recon.footage.depth import Depths, background_depth, depth_at
 from recon.footage.footage import FOREGROUND, GROWTH, Footage
 
@@ -19,9 +20,9 @@ class Still:
 
     Args:
         video: index of the video it is from.
-        image: RGB; where: which pixels show what stands still.
+        image: RGB. where: the pixels that show what stands still.
         K, w2c: of the working image.
-        depth: z in world units, 0 where unknown; None: not known anywhere.
+        depth: z in world units, 0 where unknown; None: unknown everywhere.
     """
 
     video: int
@@ -54,7 +55,7 @@ class Still:
         return world / np.linalg.norm(world, axis=1, keepdims=True)
 
     def lift(self, u: np.ndarray, v: np.ndarray, z: np.ndarray) -> Float[np.ndarray, "N 3"]:
-        """World points at depth ``z`` behind pixels."""
+        """World points at depth ``z`` along the rays of pixels."""
         return self.center + self._directions(u, v) * z[:, None]
 
     def _directions(self, u: np.ndarray, v: np.ndarray) -> Float[np.ndarray, "N 3"]:
@@ -71,7 +72,7 @@ def stills_of(
         depth: per video, of some of its frames; None where there is none.
         frames: of a moving camera, spread over the clip.
 
-    A fixed camera without masks has none, since its background is not told from what moves; nor has a moving one.
+    A camera without masks, fixed or moving, has none: nothing tells its background from what moves.
     """
     out = []
     for v, f in enumerate(footage):
@@ -82,7 +83,7 @@ def stills_of(
         elif f.masks is not None:
             good = np.flatnonzero(~f.bad)
             grow = 2 * max(1, round(GROWTH * f.size[0] / 320)) + 1
-            for k in good[np.unique(np.linspace(0, len(good) - 1, min(frames, len(good))).round().astype(int))]:
+            for k in good[evenly(len(good), frames)]:
                 where = maximum_filter(f.masks[k], size=grow) <= 255 * FOREGROUND
                 z = None if maps is None else depth_at(maps, f, int(k))
                 out.append(Still(v, f.images[k], where, f.K, f.pose(int(k)), z))

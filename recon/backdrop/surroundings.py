@@ -1,8 +1,8 @@
-"""Where the background is when no depth tells: a floor and a shell around the scene, found by what cameras agree on.
+"""Where the background lies without depth: a floor and a shell around the scene, searched for by photo-consistency.
 
-A surface that is where it is believed to be has the same colours in all cameras that see it. So the height and the tilt
-of the floor, and the centre and radius of the shell (the dome that cameras hang on, the walls of a hall, or just
-"far away"), are those for which the cameras' backgrounds agree best. Nothing assumes which axis points up.
+A surface in its true place has the same colours in all cameras that see it. So the height and the tilt of the floor, and
+the centre and radius of the shell (the dome that cameras hang on, the walls of a hall, or just "far away"), are those at
+which the cameras' backgrounds agree best. Nothing assumes which axis points up.
 """
 
 from __future__ import annotations
@@ -17,8 +17,12 @@ from scipy.optimize import minimize
 
 from recon.backdrop.stills import Still
 
+UPRIGHT = 0.1
+"""Weight of the images' vertical against the cameras' horizontals in the search for up: it decides only where they do
+not."""
+
 AGREEMENT = 0.75
-"""A surface is believed when colours on it differ by less than this share of what they differ overall."""
+"""A surface is believed where the colours on it differ by less than this share of how much they differ overall."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +33,7 @@ class Floor:
     height: float
 
     def hit(self, origin: Float[np.ndarray, "N 3"], direction: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, " N"]:
-        """How far along each ray it lies; infinite where the ray does not come down on it."""
+        """Distance to it along each ray; infinite where the ray does not come down on it."""
         falling = direction @ self.normal
         with np.errstate(divide="ignore", invalid="ignore"):
             away = (self.height - origin @ self.normal) / falling
@@ -47,7 +51,7 @@ class Shell:
     radius: float
 
     def hit(self, origin: Float[np.ndarray, "N 3"], direction: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, " N"]:
-        """How far along each ray (unit direction) it lies; infinite for rays that miss it."""
+        """Distance to it along each ray (unit direction); infinite for rays that miss it."""
         apart = origin - self.center
         b = (direction * apart).sum(1)
         inside = b**2 - (apart**2).sum(1) + self.radius**2
@@ -61,11 +65,11 @@ class Shell:
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """What lies behind the scene.
+    """The surfaces behind the scene.
 
     Args:
-        floor: or None where no plane below the cameras agrees.
-        shell: everything that is not floor.
+        floor: None where the cameras agree on no plane below them.
+        shell: stands for everything that is not floor.
         focus: the point that the cameras look at.
         distance: median distance of the cameras from it, world units: the scale of the scene.
     """
@@ -97,21 +101,21 @@ def surroundings(
     points: Float[np.ndarray, "N 3"] | None = None,
     floor: Floor | None = None,
 ) -> Surroundings:
-    """Find floor and shell from pictures of the background.
+    """Find floor and shell in pictures of the background.
 
     Args:
-        points: of what moves, anywhere in time: they tell the scale of a scene that one camera filmed, and what the
-            floor lies under.
-        floor: when it is known.
+        points: of what moves, at any time: they tell the scale of a scene that one camera filmed, and the floor lies
+            under them.
+        floor: where it is known.
     """
-    focus, distance = look_at(stills, points)
-    views = [View.of(s) for s in stills]
+    focus, distance = common_focus(stills, points)
+    lookups = [Lookup.of(s) for s in stills]
     if floor is None and len(stills) > 1:
-        floor = find_floor(views, up_axis(stills), focus, distance, points)
-    return Surroundings(floor, find_shell(views, focus, distance, floor), focus, distance)
+        floor = find_floor(lookups, up_axis(np.stack([s.w2c for s in stills])), focus, distance, points)
+    return Surroundings(floor, find_shell(lookups, focus, distance, floor), focus, distance)
 
 
-def look_at(
+def common_focus(
     stills: Sequence[Still], points: Float[np.ndarray, "N 3"] | None = None
 ) -> tuple[Float[np.ndarray, " 3"], float]:
     """The point that is nearest to all optical axes, and the cameras' median distance from it.
@@ -138,21 +142,20 @@ def look_at(
     return focus, float(np.median(np.linalg.norm(focus - centers, axis=1)))
 
 
-def up_axis(stills: Sequence[Still]) -> Float[np.ndarray, " 3"]:
-    """The direction that is up in the images of most cameras, at right angles to their horizontals as far as can be.
+def up_axis(poses: Float[np.ndarray, "V 4 4"]) -> Float[np.ndarray, " 3"]:
+    """The world's up, unit: as far as can be at right angles to the horizontals of the cameras ``poses`` (w2c).
 
-    Cameras around a scene are pitched towards it, which the horizontals do not show; a few that stand side by side
-    have but one horizontal, and the images' vertical decides.
+    Cameras around a scene are pitched towards it, which their horizontals do not show. A few that stand side by side
+    have but one horizontal; then the vertical of their images decides.
     """
-    w2c = np.stack([s.w2c for s in stills])
-    across, up = w2c[:, 0, :3], -w2c[:, 1, :3].mean(0)
-    moment = across.T @ across / len(stills) - 0.1 * np.outer(up, up)
+    across, up = poses[:, 0, :3], -poses[:, 1, :3].mean(0)
+    moment = across.T @ across / len(poses) - UPRIGHT * np.outer(up, up)
     axis = np.linalg.eigh(moment)[1][:, 0]
-    return axis * np.sign(axis @ up)
+    return axis * (np.sign(axis @ up) or 1.0)
 
 
 def find_floor(
-    views: Sequence[View],
+    lookups: Sequence[Lookup],
     up: Float[np.ndarray, " 3"],
     focus: Float[np.ndarray, " 3"],
     distance: float,
@@ -167,7 +170,7 @@ def find_floor(
         lowest = np.percentile(points @ up, 0.5)
         low, high = lowest - 0.1 * distance, lowest + 0.05 * distance
     # a direction of the scene, not of its axes: a turned scene gets the turned floor
-    sides = np.cross(up, np.stack([v.center for v in views]) - focus)
+    sides = np.cross(up, np.stack([v.center for v in lookups]) - focus)
     side = max(sides, key=np.linalg.norm)
     side = side / np.linalg.norm(side)
     frame = np.stack([side, np.cross(up, side)])
@@ -180,42 +183,46 @@ def find_floor(
         return level + (height + spots @ tilt)[:, None] * up
 
     heights = np.linspace(low, high, 41)
-    scores = [disagreement(views, at(h, np.zeros(2))) for h in heights]
+    scores = [disagreement(lookups, at(h, np.zeros(2))) for h in heights]
     best = int(np.argmin(scores))
     step = heights[1] - heights[0]
 
     def cost(x: np.ndarray) -> float:
-        """Of a height and a tilt; few cameras would else agree on a tilt that suits a stain."""
-        return disagreement(views, at(heights[best] + x[0] * step, x[1:] * 0.01)) + 0.02 * float((x[1:] ** 2).sum()) / 9
+        """Of a height and a tilt, which costs something: a few cameras would agree on one that suits a stain."""
+        return (
+            disagreement(lookups, at(heights[best] + x[0] * step, x[1:] * 0.01)) + 0.02 * float((x[1:] ** 2).sum()) / 9
+        )
 
     start = np.vstack([np.zeros(3), np.eye(3)])
-    found = minimize(cost, start[0], method="Nelder-Mead", options={"maxfev": 160, "initial_simplex": start})
-    height, tilt = heights[best] + found.x[0] * step, found.x[1:] * 0.01
-    if not disagreement(views, at(height, tilt)) < AGREEMENT:
+    tilted = minimize(cost, start[0], method="Nelder-Mead", options={"maxfev": 160, "initial_simplex": start})
+    height, tilt = heights[best] + tilted.x[0] * step, tilted.x[1:] * 0.01
+    if not disagreement(lookups, at(height, tilt)) < AGREEMENT:
         return None
     normal = up - tilt @ frame
     normal /= np.linalg.norm(normal)
     return Floor(normal, float(at(height, tilt)[0] @ normal))
 
 
-def find_shell(views: Sequence[View], focus: Float[np.ndarray, " 3"], distance: float, floor: Floor | None) -> Shell:
-    """The sphere on which the cameras agree best about what is not floor; a wide one where none convinces.
+def find_shell(
+    lookups: Sequence[Lookup], focus: Float[np.ndarray, " 3"], distance: float, floor: Floor | None
+) -> Shell:
+    """The sphere on which the cameras agree best about what is not floor; a wide one where they agree on none.
 
     Centres tried: that of the sphere through the cameras (they hang on a dome), the focus, and the cameras' own middle
     (they stand side by side).
     """
-    centers = np.stack([v.center for v in views])
-    origin = np.concatenate([np.broadcast_to(v.center, v.rays.shape) for v in views])
-    rays = np.concatenate([v.rays for v in views])
+    centers = np.stack([v.center for v in lookups])
+    origin = np.concatenate([np.broadcast_to(v.center, v.rays.shape) for v in lookups])
+    rays = np.concatenate([v.rays for v in lookups])
     below = np.full(len(rays), np.inf) if floor is None else floor.hit(origin, rays)
     wide = Shell(focus, 2.5 * distance)
-    if len(views) < 2:
+    if len(lookups) < 2:
         return wide
 
     def cost(shell: Shell) -> float:
         away = shell.hit(origin, rays)
         ok = np.isfinite(away) & (away < below)
-        return disagreement(views, origin[ok] + away[ok, None] * rays[ok]) if ok.mean() > 0.02 else 1.0
+        return disagreement(lookups, origin[ok] + away[ok, None] * rays[ok]) if ok.mean() > 0.02 else 1.0
 
     tried: list[tuple[float, Shell]] = []
     for middle in (_sphere(centers, focus, distance), focus, centers.mean(0)):
@@ -231,8 +238,8 @@ def find_shell(views: Sequence[View], focus: Float[np.ndarray, " 3"], distance: 
 
 
 @dataclass(frozen=True, eq=False)
-class View:
-    """One camera's background, blurred a little, as colours to compare: log RGB, and where it was seen."""
+class Lookup:
+    """Colours of one camera's background at points of the world: log RGB, blurred a little, and where it was seen."""
 
     colors: Float[np.ndarray, "h w 3"]
     seen: Bool[np.ndarray, "h w"]
@@ -242,13 +249,13 @@ class View:
     rays: Float[np.ndarray, "N 3"]
 
     @classmethod
-    def of(cls, still: Still) -> View:
+    def of(cls, still: Still) -> Lookup:
         blurred = uniform_filter(still.image.astype(np.float32) / 255, (5, 5, 0))
         u, v = still.pixels(max(1, still.size[0] // 32))
         return cls(np.log(blurred + 0.02), still.where, still.K, still.w2c, still.center, still.rays(u, v))
 
     def look(self, points: Float[np.ndarray, "N 3"]) -> tuple[Float[np.ndarray, "N 3"], Bool[np.ndarray, " N"]]:
-        """(log colours, which are in view) of points."""
+        """(log colours of points, which of them are in view)."""
         cam = points @ self.w2c[:3, :3].T + self.w2c[:3, 3]
         h, w = self.seen.shape
         z = np.maximum(cam[:, 2], 1e-9)
@@ -259,13 +266,13 @@ class View:
         return self.colors[v, u], inside & self.seen[v, u]
 
 
-def disagreement(views: Sequence[View], points: Float[np.ndarray, "N 3"]) -> float:
-    """How much cameras differ about the colours of surface points, as a share of how much colours differ at all.
+def disagreement(lookups: Sequence[Lookup], points: Float[np.ndarray, "N 3"]) -> float:
+    """How much cameras differ in the colours of surface points, as a share of how much colours differ overall.
 
-    0: they agree; about 1: they see unrelated things. Gains of the cameras are taken out. 1 where too few points are
-    seen twice to tell.
+    0: they agree; about 1: they see unrelated things. The cameras' gains are taken out. 1 where too few points are seen
+    twice.
     """
-    looks = [view.look(points) for view in views]
+    looks = [lookup.look(points) for lookup in lookups]
     colors, ok = np.stack([c for c, _ in looks]), np.stack([k for _, k in looks])
     twice = ok.sum(0) >= 2
     if twice.sum() < max(30, 0.05 * len(points)):
@@ -276,7 +283,7 @@ def disagreement(views: Sequence[View], points: Float[np.ndarray, "N 3"]) -> flo
         mean = (colors * weight).sum(0) / count
         colors = colors - (((colors - mean) * weight).sum(1) / np.maximum(weight.sum(1), 1))[:, None]
     mean = (colors * weight).sum(0) / count
-    # n samples stay nearer to their own mean than to the truth: correct for it, or pairs would seem to agree
+    # n samples lie nearer to their own mean than to the truth: without the correction pairs would seem to agree
     within = (np.abs(colors - mean) * weight * np.sqrt(count / (count - 1))).sum()
     overall = np.median(colors[ok[:, twice]], 0)
     return float(within / max((np.abs(colors - overall) * weight).sum(), 1e-12))
@@ -294,7 +301,7 @@ def _lifted(still: Still) -> Float[np.ndarray, "N 3"]:
 def _sphere(
     centers: Float[np.ndarray, "V 3"], focus: Float[np.ndarray, " 3"], distance: float
 ) -> Float[np.ndarray, " 3"]:
-    """Centre of the sphere nearest to the cameras; where they leave it open (a ring does), towards the focus."""
+    """Centre of the sphere nearest to the cameras; drawn towards the focus where they leave it open, as a ring does."""
     x = (centers - focus) / distance
     lhs = np.concatenate([np.c_[2 * x, np.ones(len(x))], np.c_[0.1 * np.eye(3), np.zeros(3)]])
     rhs = np.concatenate([(x**2).sum(1), np.zeros(3)])

@@ -1,4 +1,4 @@
-"""How good a reconstruction is: images against held-out ones, offsets against the truth, tracks against tracks.
+"""Figures of a reconstruction: images against held-out ones, offsets against the truth, tracks against tracks.
 
 Figures of images are those of the literature's tables: PSNR for colours in 0..1 clipped as in a file, SSIM with the
 11 x 11 Gaussian window (sigma 1.5) over the pixels whose window lies inside the image, as scikit-image and torchmetrics
@@ -22,7 +22,7 @@ from recon.evaluate.lpips import Lpips
 from recon.losses.ssim import ssim_map
 from recon.losses.window import STANDARD
 
-SMALLEST_MASK = 50  # pixels: below, a frame has no figure for what moves
+SMALLEST_MASK = 50  # pixels: with fewer, a frame has no figures for what moves
 
 
 def psnr(image: Any, reference: Any, mask: Any = None) -> float:
@@ -45,16 +45,18 @@ def ssim(image: Any, reference: Any, mask: Any = None) -> float:
     x, y, w = _pair(image, reference, mask)
     r = STANDARD.radius
     if min(x.shape[:2]) <= 2 * r:
-        raise ValueError(f"image: expected more than {2 * r} pixels on a side, got {list(x.shape[:2])}")
+        raise ValueError(
+            f"image: expected more than {2 * r} pixels on a side; found {list(x.shape[:2])}. Score a larger image."
+        )
     inside = slice(r, -r)
     w = w[inside, inside]
     return float((ssim_map(x, y, STANDARD).mean(-1)[inside, inside] * w).sum() / w.sum())
 
 
 def score_image(image: Any, reference: Any, mask: Any = None, lpips: Lpips | None = None) -> dict[str, float]:
-    """All figures of one frame: psnr, ssim, lpips, mask_psnr, mask_ssim; nan for what there is not.
+    """All figures of one frame: psnr, ssim, lpips, mask_psnr, mask_ssim; nan for those that cannot be had.
 
-    mask: [h,w] of what moves; at least 50 pixels, else it has no figures.
+    mask: [h,w] of what moves; with fewer than 50 pixels there are no figures for it.
     """
     x, y, _ = _pair(image, reference, None)
     scores = {"psnr": psnr(x, y), "ssim": ssim(x, y), "lpips": (lpips or Lpips())(x, y)}
@@ -89,7 +91,7 @@ class OffsetError:
 
 
 def offset_error(
-    found: Any,
+    estimated: Any,
     true: Any,
     frame_step: float,
     gauge: Literal["reference", "median"] = "reference",
@@ -100,23 +102,25 @@ def offset_error(
     Offsets are known up to a common shift only. gauge: "reference": the ``reference`` video is right by definition;
     "median": the median error is zero, for comparing methods that hold different videos.
     """
-    est, truth = np.asarray(found, float), np.asarray(true, float)
+    est, truth = np.asarray(estimated, float), np.asarray(true, float)
     if est.ndim != 1 or est.shape != truth.shape:
-        raise ValueError(f"found, true: expected one number a video each, got shapes {est.shape}, {truth.shape}")
+        raise ValueError(
+            f"estimated, true: expected one number per video in both; found shapes {est.shape} and {truth.shape}."
+        )
     if not (math.isfinite(frame_step) and frame_step > 0):
-        raise ValueError(f"frame_step: expected seconds > 0, got {frame_step}")
+        raise ValueError(f"frame_step: expected seconds > 0; found {frame_step}.")
     errors = (est - truth) / frame_step
     counted = np.isfinite(errors)
     if gauge == "reference":
         if not 0 <= reference < len(errors):
-            raise ValueError(f"reference: expected the index of one of {len(errors)} videos, got {reference}")
+            raise ValueError(f"reference: expected the index of one of {len(errors)} videos; found {reference}.")
         errors = errors - errors[reference]
         counted[reference] = False
         counted &= np.isfinite(errors)
     elif gauge == "median":
         errors = errors - (np.median(errors[counted]) if counted.any() else np.nan)
     else:
-        raise ValueError(f"gauge: expected 'reference' or 'median', got {gauge!r}")
+        raise ValueError(f"gauge: expected 'reference' or 'median'; found {gauge!r}.")
     size = np.abs(errors[counted])
     return OffsetError(*((float(size.mean()), float(size.max())) if len(size) else (math.nan, math.nan)), errors)
 
@@ -129,7 +133,9 @@ def coherence(tracks: Float[np.ndarray, "N T 3"], neighbours: int = 3, moment: i
     """
     n, frames = tracks.shape[:2]
     if n <= neighbours or frames < 1:
-        raise ValueError(f"tracks: expected more than {neighbours} of them and a frame, got {n} x {frames}")
+        raise ValueError(
+            f"tracks: expected more than {neighbours} tracks of at least one frame; found {n} of {frames}."
+        )
     moment = frames // 2 if moment is None else moment
     _, near = cKDTree(tracks[:, moment]).query(tracks[:, moment], k=neighbours + 1)
     apart = np.linalg.norm(tracks[near[:, 1:]] - tracks[:, None], axis=-1)
@@ -138,7 +144,7 @@ def coherence(tracks: Float[np.ndarray, "N T 3"], neighbours: int = 3, moment: i
 
 @dataclass(frozen=True)
 class Following:
-    """How far points get from held-out tracks: median and 90th percentile, in units of the tracks, and how many."""
+    """How far predicted points end from held-out tracks: median, 90th percentile (units of the tracks), and the count."""
 
     median: float
     p90: float
@@ -154,7 +160,7 @@ def following_error(
     every: int = 4,
     neighbours: int = 3,
 ) -> dict[int, Following]:
-    """Error of predicting held-out tracks by their nearest reconstructed ones, by horizon in frames.
+    """Errors of held-out tracks that are predicted by the nearest reconstructed ones, by horizon in frames.
 
     From every ``every``-th frame t, a held-out point seen at t and t + h is moved by the mean displacement of the
     ``neighbours`` tracks nearest to it at t. Points whose nearest track is ``reach`` or further away do not count.
@@ -165,7 +171,8 @@ def following_error(
     """
     if held_out.shape[1:] != tracks.shape[1:] or len(tracks) < neighbours:
         raise ValueError(
-            f"held_out, tracks: expected (M,T,3) and (N,T,3) with N >= {neighbours}, got {held_out.shape} and {tracks.shape}"
+            f"held_out, tracks: expected (M,T,3) and (N,T,3) with N >= {neighbours}; found {held_out.shape} and "
+            f"{tracks.shape}."
         )
     seen = np.isfinite(held_out).all(-1)
     frames = tracks.shape[1]
@@ -207,8 +214,8 @@ def _pair(image: Any, reference: Any, mask: Any) -> tuple[Tensor, Tensor, Tensor
     """Two images and a weight per pixel as float64 in 0..1."""
     x, y = _floats(image), _floats(reference)
     if x.ndim != 3 or x.shape != y.shape:
-        raise ValueError(f"image, reference: expected [h,w,3] both, got {list(x.shape)} and {list(y.shape)}")
+        raise ValueError(f"image, reference: expected [h,w,3] of one size; found {list(x.shape)} and {list(y.shape)}.")
     w = torch.ones(x.shape[:2], dtype=x.dtype) if mask is None else _floats(mask)
     if w.shape != x.shape[:2]:
-        raise ValueError(f"mask: expected {list(x.shape[:2])} like the image, got {list(w.shape)}")
+        raise ValueError(f"mask: expected {list(x.shape[:2])} like the image; found {list(w.shape)}.")
     return x, y, w

@@ -1,8 +1,8 @@
 """LPIPS by torchmetrics' code, with weights that the user has; nothing is ever downloaded.
 
-The metric (Zhang et al. 2018) needs a classifier's backbone, about 10 MB (SqueezeNet) to 550 MB (VGG), which torchvision
-publishes as a state dict, and small linear heads, which come with torchmetrics. Without either there is no figure, and
-the table says why.
+The metric (Zhang et al. 2018) needs the backbone of a classifier, about 10 MB (SqueezeNet) to 550 MB (VGG), which
+torchvision publishes as a state dict, and small linear heads, which come with torchmetrics. Without either there is no
+figure, and tables say why.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-MAX_BYTES = 2 * 2**30  # no published backbone is nearly as large
-SMALLEST = 64  # pixels: what the backbones can still halve often enough
+MAX_BYTES = 2 * 2**30  # no published backbone comes near
+SMALLEST = 64  # pixels on a side: the backbones halve an image several times
 
 
 @dataclass(frozen=True, eq=False)
 class Lpips:
-    """The distance when there is a network, else the reason why there is none.
+    """The distance where there is a network, else the reason why there is none.
 
     Args:
         network: maps two batches [1,3,h,w] in -1..1 to their distance, or None.
@@ -38,7 +38,7 @@ class Lpips:
         """From a file of torchvision's backbone weights (``alexnet``, ``vgg16``, ``squeezenet1_1``).
 
         Without a path, or without torchmetrics and torchvision, the result has a reason instead of a network. A file
-        that is given and unfit is a ValueError.
+        that does not fit is a ValueError.
         """
         if weights is None:
             return cls()
@@ -56,13 +56,13 @@ class Lpips:
         absent = sorted(set(own.values()) - backbone.keys())
         if absent:
             raise ValueError(
-                f"{weights}: expected torchvision's weights of the {net} backbone; found no {absent[0]}: "
-                "give the file of that network"
+                f"{weights}: expected torchvision's weights of the {net} backbone; found no {absent[0]}. "
+                "Give the file of that network."
             )
         try:
             network.net.load_state_dict({key: backbone[theirs] for key, theirs in own.items()})
         except RuntimeError as error:
-            raise ValueError(f"{weights}: not the weights of the {net} backbone; {error}") from None
+            raise ValueError(f"{weights}: expected the weights of the {net} backbone; found others: {error}") from None
         return cls(network.eval(), "")
 
     def __call__(self, image: Tensor, reference: Tensor) -> float:
@@ -77,13 +77,15 @@ class Lpips:
 def _read(path: Path) -> dict[str, Tensor]:
     """A state dict of tensors. ValueError for anything else."""
     if not path.is_file():
-        raise ValueError(f"{path}: expected a file of backbone weights; found none")
+        raise ValueError(f"{path}: expected a file of backbone weights; found none.")
     if path.stat().st_size > MAX_BYTES:
-        raise ValueError(f"{path}: expected a backbone of at most {MAX_BYTES >> 30} GiB; found more")
+        raise ValueError(f"{path}: expected a backbone of at most {MAX_BYTES >> 30} GiB; found more.")
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises many kinds
-        raise ValueError(f"{path}: expected a state dict of tensors; {type(error).__name__}: {error}") from None
+        raise ValueError(
+            f"{path}: expected a state dict of tensors; found a file that does not load ({error})."
+        ) from None
     if not isinstance(state, dict) or not all(isinstance(v, Tensor) for v in state.values()):
-        raise ValueError(f"{path}: expected a state dict of tensors, as torchvision publishes; found something else")
+        raise ValueError(f"{path}: expected a state dict of tensors, as torchvision publishes; found something else.")
     return state

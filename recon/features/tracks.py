@@ -153,7 +153,7 @@ def tracks_of(
     lifted = lift_features(
         scene.moving,
         [_frame(footage, k, feature_maps) for k in lifted_frames(footage, options.every)],
-        near_plane=0.01 * scene.near,
+        near_plane=scene.moving_near,
     )
     found = as_tracks(
         scene.tracks(footage.times),
@@ -185,7 +185,7 @@ def seen_weights(scene: Gaussians4D, footage: Footage) -> Float[np.ndarray, "N T
 
     for k in np.flatnonzero(~footage.bad):
         frame = _frame(footage, int(k), nothing)
-        out[:, k] = lift_features(scene.moving, [frame], near_plane=0.01 * scene.near).weight.numpy()
+        out[:, k] = lift_features(scene.moving, [frame], near_plane=scene.moving_near).weight.numpy()
     return out
 
 

@@ -17,6 +17,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from otsync.compute.indices import evenly
+
 Look = Callable[[int, int, float], Tensor]
 Target = Callable[[int, int], Tensor]
 
@@ -46,7 +48,7 @@ def newton_sigma(
             own = keys[keys[:, 0] == v, 1]
             if len(own) < 2:
                 continue
-            chosen = own[np.unique(np.linspace(0, len(own) - 1, frames).round().astype(int))]
+            chosen = own[evenly(len(own), frames)]
             votes = np.array([_vote(look, target, v, int(k), STEP * frame_step) for k in chosen])
             variance[v] = sandwich(votes[:, 0], votes[:, 1])
     sigma = np.sqrt(variance + variance[reference])

@@ -1,4 +1,4 @@
-"""What a fit reads of the videos: frames at working size, masks, backgrounds, depth."""
+"""Footage: videos as a fit reads them, with frames at working size, masks, backgrounds and depth."""
 
 from recon.footage.footage import Footage, footage_of
 

@@ -1,4 +1,4 @@
-"""Depth maps on their way into a fit: given for all frames or for some, kept in memory or made when asked for."""
+"""Depth maps for a fit: of all frames or of some, in memory or made on demand."""
 
 from __future__ import annotations
 
@@ -8,22 +8,24 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from otsync.compute.indices import evenly
 from otsync.types import Video
 from recon.footage.footage import FOREGROUND, Footage, Lens
 
 Depths = Sequence[Any] | Callable[[int], Any]
-"""Per video: (H,W) maps of z in world units, one a frame, or a function of the frame; 0 or None where unknown."""
+"""Of one video: (H,W) maps of z in world units, one per frame, or a function of the frame; 0 or None where unknown."""
 
 
 def working_depth(
     video: Video, depth: Depths | None = None, *, width: int = 320, frames: slice | None = None
 ) -> Callable[[int], Float[np.ndarray, "h w"] | None]:
-    """Depth of the frames of :func:`recon.footage.footage_of` with the same ``width`` and ``frames``, lenses undone.
+    """Depth maps to go with :func:`recon.footage.footage_of` at the same ``width`` and ``frames``, distortion undone.
 
     Args:
-        depth: of the frames of the whole video, maps of any size over the image's field of view; None: the video's own.
+        depth: maps of the whole video, of any size over the image's field of view; None: the video's own.
 
     The nearest sample is taken, never a mean: between a body and the wall behind it there is nothing.
+    ValueError where there is no depth.
     """
     depth = video.depth if depth is None else depth
     if depth is None:
@@ -40,9 +42,9 @@ def working_depth(
 
 
 def depth_at(depths: Depths | None, footage: Footage, frame: int) -> Float[np.ndarray, "h w"] | None:
-    """The depth map of a frame of ``footage`` at its working size, 0 where unknown; None where there is none.
+    """The depth map of a frame of ``footage`` at its working size, 0 where unknown; None where the frame has none.
 
-    ValueError, naming the video, where the video has no depth at all or a map is no depth map.
+    ValueError, naming the video, where the video has no depth at all or something else stands for a map.
     """
     if depths is None:
         raise ValueError(
@@ -62,11 +64,10 @@ def depth_at(depths: Depths | None, footage: Footage, frame: int) -> Float[np.nd
 def background_depth(
     depths: Depths, footage: Footage, samples: int = 12
 ) -> tuple[Float[np.ndarray, "h w"], UInt8[np.ndarray, "h w"]]:
-    """(median depth over time of what is not foreground, in how many samples it was known); 0 where never."""
-    picks = np.flatnonzero(~footage.bad)
-    picks = picks[np.unique(np.linspace(0, len(picks) - 1, min(samples, len(picks))).round().astype(int))]
+    """(median depth over time of the background, count of the samples that know it); both 0 where none does."""
+    good = np.flatnonzero(~footage.bad)
     values = []
-    for k in picks:
+    for k in good[evenly(len(good), samples)]:
         z = depth_at(depths, footage, int(k))
         if z is not None:
             covered = z <= 0 if footage.masks is None else (z <= 0) | (footage.masks[k] > 255 * FOREGROUND)
@@ -83,7 +84,7 @@ def background_depth(
 def _check_count(depths: Depths, frames: int, name: str) -> None:
     if not callable(depths) and len(depths) != frames:
         raise ValueError(
-            f"depth of {name!r}: expected {frames} maps, one a frame (None where there is none); found {len(depths)}."
+            f"depth of {name!r}: expected {frames} maps, one per frame (None where there is none); found {len(depths)}."
         )
 
 

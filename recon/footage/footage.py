@@ -1,4 +1,4 @@
-"""What a fit reads of one video: frames at working size in memory, masks, the background, and where something moves.
+"""Footage of one video: frames at working size in memory, masks, the background, and where something moves.
 
 Everything is kept as uint8: 150 frames of 320 x 180 are 26 MB, their masks 9 MB more.
 """
@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from scipy.ndimage import maximum_filter
 from scipy.spatial.transform import Rotation
 
+from otsync.compute.indices import evenly
 from otsync.types import Camera, Video
 
 log = logging.getLogger("recon.footage")
@@ -25,24 +26,24 @@ FOREGROUND = 0.3
 """Share of a working pixel from which it counts as foreground."""
 
 GROWTH, MARGIN = 3, 10
-"""Pixels, at 320 of width, that masks grow by before the background is taken, and around what moves for a box."""
+"""Pixels, at 320 of width: by which masks grow before the background is taken, and between moving things and their box."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Footage:
-    """One video as a fit reads it, T frames of h x w working pixels.
+    """One video as a fit reads it: T frames of h x w working pixels.
 
     Args:
         images: RGB. Those of bad frames are black.
         times: seconds of every frame on the video's own clock.
         K: intrinsics in working pixels, pixel centres at +0.5, no distortion.
         w2c: world to camera, OpenCV axes; (4,4) when static, (T,4,4) when the camera moves.
-        masks: soft foreground, 255 = all of the pixel; None: not known.
-        background: masked temporal median of a static camera; None without masks or when the camera moves. Where
-            nothing was ever seen behind what moves it holds the plain median, which may show a ghost.
+        masks: soft foreground, 255 = all of the pixel; None: unknown.
+        background: masked median over time of a fixed camera; None without masks or when the camera moves. Where
+            moving things always hide it, it holds the plain median, which may show a ghost.
         background_seen: where the background was seen at least twice.
-        boxes: (T,4) x0, y0, x1, y1 (exclusive) around what moves, with a margin; the whole image without masks;
-            empty (all zeros) where nothing moves and in bad frames.
+        boxes: (T,4) x0, y0, x1, y1 (exclusive) around what moves, with a margin; without masks the whole image; all
+            zeros where nothing moves and in bad frames.
         readout: seconds from the first to the last row of a rolling shutter, or None.
         bad: frames that could not be read.
         depth: z in world units [h,w] by frame, 0 where unknown; for a depth loss.
@@ -66,7 +67,19 @@ class Footage:
     features: Mapping[int, np.ndarray] | None = None
 
     def __len__(self) -> int:
+        """Number of frames."""
         return len(self.images)
+
+    def __repr__(self) -> str:
+        first, last = (float(self.times[k]) for k in (0, -1)) if len(self) else (0.0, 0.0)
+        has = [
+            name for name in ("masks", "background", "depth", "tracks", "features") if getattr(self, name) is not None
+        ]
+        camera = "fixed" if self.w2c.ndim == 2 else "moving"
+        return (
+            f"Footage({self.name!r}, {len(self)} frames of {self.size[0]} x {self.size[1]}, {first:.3f} to {last:.3f} s, "
+            f"{camera} camera{''.join(f', {name}' for name in has)})"
+        )
 
     @property
     def size(self) -> tuple[int, int]:
@@ -80,7 +93,7 @@ class Footage:
 
     @property
     def nbytes(self) -> int:
-        """Memory that the pixels take."""
+        """Bytes of memory that the pixels take."""
         return sum(a.nbytes for a in (self.images, self.masks, self.background) if a is not None)
 
     def pose(self, frame: int) -> Float[np.ndarray, "4 4"]:
@@ -88,9 +101,9 @@ class Footage:
         return self.w2c if self.w2c.ndim == 2 else self.w2c[frame]
 
     def pose_after(self, frame: int, later: float) -> Float[np.ndarray, "4 4"]:
-        """World to camera ``later`` seconds after a frame (before it, below 0), on the own clock.
+        """World to camera ``later`` seconds after a frame (before it where below 0), on the video's own clock.
 
-        A camera that moves turns about one axis and goes along a line from frame to frame, and beyond its last ones.
+        From frame to frame a moving camera turns about one axis and moves along a line; beyond its ends it goes on so.
         """
         if self.w2c.ndim == 2 or len(self) < 2 or later == 0:
             return self.pose(frame)
@@ -105,7 +118,7 @@ class Footage:
         return np.linalg.inv(between)
 
     def nearest(self, seconds: float) -> int | None:
-        """The readable frame nearest to ``seconds`` on the own clock; None when there is none."""
+        """The readable frame nearest to ``seconds`` on the video's own clock; None where no frame is readable."""
         good = np.flatnonzero(~self.bad)
         return int(good[np.argmin(np.abs(self.times[good] - seconds))]) if len(good) else None
 
@@ -121,18 +134,18 @@ def footage_of(
     """Read a video at working size.
 
     Args:
-        masks: foreground of every frame of the video, (H,W) of any size: bool, uint8 (0 to 1 or 0 to 255) or float 0..1.
-        width: working pixels; a narrower video stays as it is. Images and masks are area-averaged, lenses undone
-            (which needs OpenCV and crops to the pixels that are seen).
+        masks: foreground of every frame of the video, (H,W) of any size: bool, uint8 (0..1 or 0..255) or float (0..1).
+        width: working pixels; a narrower video stays as it is. Images and masks are area-averaged, and distortion is
+            undone (which needs OpenCV, and crops to the pixels that are seen).
         frames: which frames; None: all.
-        samples: frames, spread over the clip, that the background is taken from (its memory: 2 bytes a value).
+        samples: frames, spread over the clip, from which the background is taken (2 bytes of memory per value).
 
-    A frame that does not read, has another size than the camera says, or holds NaN is marked bad, with a warning that
-    names it. Raises ValueError when no frame can be used, or when masks and frames do not pair up.
+    A frame that cannot be read, differs in size from the camera, or holds NaN is marked bad, with a warning that names
+    it. Raises ValueError when no frame can be used, or when masks and frames do not pair up.
     """
     if masks is not None and len(masks) != len(video.frames):
         raise ValueError(
-            f"masks of {video.name!r}: expected {len(video.frames)}, one a frame; found {len(masks)}. Leave them out or "
+            f"masks of {video.name!r}: expected {len(video.frames)}, one per frame; found {len(masks)}. Leave them out or "
             "make one for every frame."
         )
     lens = Lens.of(video.camera, width)
@@ -202,11 +215,11 @@ def boxes_of(
 def median_background(
     images: UInt8[np.ndarray, "T h w 3"], masks: UInt8[np.ndarray, "T h w"], samples: int = 40
 ) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
-    """Median over time of what was not foreground, and where at least two samples show it (one, if there is but one).
+    """Median over time of the background, and where at least two samples show it (one, where there is but one).
 
-    A plain median holds ghosts of people who move slowly; masks, grown a little, keep them out.
+    A plain median shows ghosts of people who move slowly; masks, grown a little, keep them out.
     """
-    picks = np.unique(np.linspace(0, len(images) - 1, min(samples, len(images))).round().astype(int))
+    picks = evenly(len(images), samples)
     grow = 2 * max(1, round(GROWTH * images.shape[2] / 320)) + 1
     covered = np.stack([maximum_filter(masks[k] > 255 * FOREGROUND, size=grow) for k in picks])
     count = (~covered).sum(0)
@@ -214,7 +227,7 @@ def median_background(
     covered[:, ~seen] = False
     count = np.where(seen, count, len(picks))
     values = images[picks].astype(np.int16)
-    values[covered] = 256  # sorts behind all colours
+    values[covered] = 256  # sorts after all colours
     values.sort(axis=0)
 
     def ranked(k: np.ndarray) -> np.ndarray:
@@ -295,7 +308,7 @@ def _averages(n: int, N: int) -> sp.csr_matrix:
 
 
 def _undistort(camera: Camera) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """(K without distortion, maps), cropped so that every pixel is seen. OpenCV puts pixel centres at whole numbers."""
+    """(K without distortion, maps), cropped to pixels that are all seen. OpenCV has pixel centres at whole numbers."""
     try:
         import cv2
     except ImportError:

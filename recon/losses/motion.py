@@ -19,9 +19,8 @@ from torch import Tensor
 
 from recon.motion import PerGaussian, Scaffold, fused, regularizer_kernels
 from recon.motion.motion import Motion
-from recon.motion.rotations import conjugate, product, rotation_vectors
 from recon.motion.solve import FRAME
-from recon.raster.projection import rotation_matrices
+from recon.rotations import conjugate, product, rotation_matrices, rotation_vectors
 
 SOFT = 0.0075  # footprints: below it a norm is quadratic (0.1 mm where a footprint is 1.33 cm)
 SOFT_ANGLE = 1e-4  # radians

@@ -1,7 +1,7 @@
 """How things move: a scaffold of splined nodes, and its ablations, in one slot.
 
 motion.py        Motion: what a fit asks of any of them
-paths.py         HermiteSpline, Sampled: curves in time as sums over four knots; rotations.py: quaternions
+paths.py         HermiteSpline, Sampled: curves in time as sums over four knots
 scaffold.py      Scaffold: nodes, and binding Gaussians to them; binding.py: who is bound to what
 warp.py          carrying Gaussians with nodes: the definition in torch
 fused.py         the same, poses and motion losses in compiled kernels: *_kernels.py

@@ -14,10 +14,10 @@ from recon.motion import nodes as picking
 from recon.motion.binding import Binding
 from recon.motion.nodes import Grid
 from recon.motion.paths import HermiteSpline
-from recon.motion.rotations import continuous, quaternions
 from recon.motion.scaffold import Scaffold
 from recon.motion.solve import FRAME, Coupling, Observations, Smoothness, neighbourhood_rotations, solve_curves
 from recon.motion.warp import LINEAR
+from recon.rotations import continuous, quaternions
 
 logger = logging.getLogger("recon.motion")
 

@@ -15,8 +15,8 @@ from recon.motion import warp as warping
 from recon.motion.binding import NODES
 from recon.motion.nodes import REACH, edge_weights, neighbours
 from recon.motion.paths import WINDOW
-from recon.motion.rotations import continuous, unit
 from recon.motion.scaffold import Scaffold
+from recon.rotations import continuous, unit
 
 
 @dataclass(frozen=True, eq=False)

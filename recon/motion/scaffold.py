@@ -16,7 +16,7 @@ from recon.motion import warp as warping
 from recon.motion.arrays import indices, numbers, scalar
 from recon.motion.binding import NODES, Binding
 from recon.motion.paths import WINDOW, Path, path_arrays, path_from_arrays
-from recon.motion.rotations import unit
+from recon.rotations import unit
 
 LEAST_WEIGHT = 1e-6  # before normalisation: a point far from all its nodes still follows them
 

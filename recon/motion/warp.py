@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from recon.motion.binding import Binding
-from recon.motion.rotations import conjugate, product, unit
-from recon.raster.projection import rotation_matrices
+from recon.rotations import conjugate, product, rotation_matrices, unit
 
 LINEAR, DUAL_QUATERNION = "linear", "dual-quaternion"
 BLENDS = (LINEAR, DUAL_QUATERNION)

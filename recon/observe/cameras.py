@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import torch
@@ -16,7 +17,7 @@ from torch import Tensor
 
 from recon.footage.footage import Footage
 from recon.observe.effects import Observe, Rendered, Shot
-from recon.raster import render, sh
+from recon.raster import Rendering, render, sh
 from recon.scene.gaussians import Gaussians
 from recon.scene.gaussians4d import Gaussians4D, join
 
@@ -124,19 +125,8 @@ def observer(
             share[:n] = 1
             colors = torch.cat([colors, share.expand(*colors.shape[:-1], 1)], -1)
         x0, y0, x1, y1 = shot.box
-        out = render(
-            drawn.means,
-            drawn.quats,
-            drawn.scales,
-            drawn.opacities,
-            colors,
-            w2c,
-            K,
-            x1 - x0,
-            y1 - y0,
-            near_plane=scene.near if together else 0.01 * scene.near,
-            depth="expected" if depth else None,
-        )
+        near = scene.near if together else scene.moving_near
+        out = draw(drawn, w2c, K, (x1 - x0, y1 - y0), near, colors=colors, depth="expected" if depth else None)
         if probes is not None:
             probes.append((out.means2d, out.radii))
         rgb = out.colors[0]
@@ -178,7 +168,7 @@ def observer_at_once(
         K,
         max(w for w, _ in sizes),
         max(h for _, h in sizes),
-        near_plane=0.01 * scene.near,
+        near_plane=scene.moving_near,
         depth="expected" if depth else None,
     )
     if probes is not None:
@@ -195,7 +185,28 @@ def feature_image(scene: Gaussians4D, clip: Clip, frame: int, t: Tensor, box: Bo
     w2c, K = clip.view(frame, box)
     parts = (moving.means, moving.quats, moving.scales, moving.opacities, scene.features)
     size = (box[2] - box[0], box[3] - box[1])
-    return render(*parts, w2c, K, *size, near_plane=0.01 * scene.near, depth=None).colors[0]
+    return render(*parts, w2c, K, *size, near_plane=scene.moving_near, depth=None).colors[0]
+
+
+def draw(
+    gaussians: Gaussians,
+    w2c: Tensor,
+    K: Tensor,
+    size: tuple[int, int],
+    near: float,
+    *,
+    colors: Tensor | None = None,
+    depth: Literal["expected", "accumulated"] | None = None,
+) -> Rendering:
+    """Gaussians as cameras w2c [C,4,4], K [C,3,3] see them, images of ``size`` (width, height).
+
+    Args:
+        near: near plane, world units.
+        colors: channels to draw instead of the Gaussians' own colours.
+    """
+    colors = colours(gaussians, w2c) if colors is None else colors
+    splats = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, colors)
+    return render(*splats, w2c, K, *size, near_plane=near, depth=depth)
 
 
 def colours(gaussians: Gaussians, w2c: Tensor, means: Tensor | None = None) -> Tensor:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from otsync.compute.indices import evenly
 from otsync.compute.threads import MapLike
 from otsync.files.arrays import write_json
 from otsync.io import Scene
@@ -132,7 +133,7 @@ def compared(
             progress.note(f"held-out video {footage.name} is not compared: {error}")
         else:
             videos.append(FilmedBy.of(footage, looking.clock, looking.gain, held_out=True))
-    for n in _some(len(ready.footage), SHOWN_TRAINING):
+    for n in evenly(len(ready.footage), SHOWN_TRAINING).tolist():
         footage = ready.footage[n]
         try:
             looking = view(
@@ -151,10 +152,6 @@ def compared(
 
 SHOWN_TRAINING = 2
 """Training cameras that are compared as well, to show what the held-out ones lack."""
-
-
-def _some(count: int, most: int) -> list[int]:
-    return sorted({int(i) for i in np.linspace(0, count - 1, min(count, most)).round()})
 
 
 def _write_fit(out: Path, found: Reconstruction) -> None:

@@ -11,20 +11,10 @@ import torch
 from torch import Tensor
 
 from recon.raster.rendering import ALPHA_MIN, QUAT_NORM2_MIN, RADIUS_SIGMAS, Settings, Splats
+from recon.rotations import rotation_matrices
 
 FRUSTUM_MARGIN = 0.3  # of tan(fov / 2): how far outside the image the Jacobian still follows x / z
 MAX_RADIUS = 2**30  # radii are int32
-
-
-def rotation_matrices(quats: Tensor) -> Tensor:
-    """Rotations [...,3,3] of *unit* quaternions wxyz [...,4]."""
-    w, x, y, z = quats.unbind(-1)
-    entries = [
-        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    ]
-    return torch.stack(entries, -1).reshape(*quats.shape[:-1], 3, 3)
 
 
 def project(

@@ -45,7 +45,7 @@ def seen_by(result: Result, camera: Camera, t: float) -> Tensor:
     with torch.no_grad():
         if scene.static is None or not result.layered:
             return scene.render(camera, t, depth=None).colors[0]
-        moving = scene.moving(t).render(camera, depth=None, near_plane=0.01 * scene.near)
+        moving = scene.moving(t).render(camera, depth=None, near_plane=scene.moving_near)
         behind = scene.static.render(camera, depth=None, near_plane=scene.near)
         return moving.colors[0] + (1 - moving.alphas[0]) * behind.colors[0]
 

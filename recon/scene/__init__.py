@@ -1,4 +1,4 @@
-"""The scene: 3-D Gaussians, 4-D Gaussians, their files, and where they begin."""
+"""The scene: 3D Gaussians, 4D Gaussians, their files, and seeding them."""
 
 from recon.scene.gaussians import Gaussians
 from recon.scene.gaussians4d import Gaussians4D

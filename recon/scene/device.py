@@ -1,4 +1,4 @@
-"""Where a fit's tensors live: on the CPU, or on a GPU that is asked for and there."""
+"""The device that a fit's tensors live on: the CPU, or a GPU where one is asked for and present."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import torch
 def device_of(name: torch.device | str) -> torch.device:
     """The device of this name: "cpu", "cuda", or "cuda:1" for the second GPU.
 
-    ValueError when it is none of those, is not there, or has nothing to render with.
+    ValueError for any other name, for a device that is not there, and for a GPU without a renderer.
     """
     try:
         device = torch.device(name)
     except (RuntimeError, TypeError):
         device = None
-    # "cpu:3" is a name to torch, but no tensor is there: they say that they are on "cpu"
+    # torch takes "cpu:3" for a name, yet tensors put there say that they are on "cpu"
     if device is None or device.type not in ("cpu", "cuda") or (device.type == "cpu" and device.index is not None):
         raise ValueError(f"device: expected 'cpu', 'cuda' or 'cuda:N'; found {str(name)!r}.")
     if device.type == "cpu":
@@ -25,14 +25,14 @@ def device_of(name: torch.device | str) -> torch.device:
     if (device.index or 0) >= count:
         there = ", ".join(["cpu", *(f"cuda:{n}" for n in range(count))])
         remedy = (
-            "This build of torch is for the CPU alone: install one for CUDA, or take 'cpu'."
+            "This build of torch has no CUDA: install one that has, or use 'cpu'."
             if torch.version.cuda is None and torch.version.hip is None
-            else "Check the driver and CUDA_VISIBLE_DEVICES, or take 'cpu'."
+            else "Check the driver and CUDA_VISIBLE_DEVICES, or use 'cpu'."
         )
-        raise ValueError(f"device: expected one that is there ({there}); found {str(name)!r}. {remedy}")
+        raise ValueError(f"device: expected one of {there}; found {str(name)!r}. {remedy}")
     if importlib.util.find_spec("gsplat") is None:
         raise ValueError(
-            f"device: {str(name)!r} needs gsplat to render there; it is not installed: pip install 'otsync[cuda]', or "
-            "take 'cpu'."
+            f"device: expected gsplat, which renders on {str(name)!r}; found none installed. pip install 'otsync[cuda]', or "
+            "use 'cpu'."
         )
     return device

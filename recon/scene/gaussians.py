@@ -1,8 +1,4 @@
-"""Scenes of 3-D Gaussians in the parametrisation of 3DGS, their rendering and their files.
-
-The standard .ply of 3DGS (Kerbl et al. 2023) is read and written; the compact .splat of web viewers is written. Files
-are not trusted: nothing is allocated before the header's promises have been held against the size of the file.
-"""
+"""3D Gaussians in the parametrisation of 3DGS (Kerbl et al. 2023), and their rendering."""
 
 from __future__ import annotations
 
@@ -17,12 +13,10 @@ from torch import Tensor
 from otsync.types import Camera
 from recon.raster import Rendering, render, sh
 
-SPLAT_BYTES = 32  # of one Gaussian in a .splat file
 
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Gaussians:
-    """N Gaussians as 3DGS optimises them: unconstrained numbers, whose activated values are properties.
+    """N Gaussians as 3DGS optimises them: unconstrained numbers; their activated values are properties.
 
     means [N,3] world units; quats [N,4] wxyz, any length; log_scales [N,3]; opacity_logits [N];
     sh [N,K,3] spherical-harmonics coefficients of the colour, the constant (DC) first, K = (degree + 1)^2.
@@ -38,38 +32,41 @@ class Gaussians:
         n = len(self.means)
         expected = {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "opacity_logits": (n,)}
         for name, shape in expected.items():
-            found = tuple(getattr(self, name).shape)
-            if found != shape:
-                raise ValueError(f"{name}: expected shape {shape} for {n} means, got {found}")
+            actual = tuple(getattr(self, name).shape)
+            if actual != shape:
+                raise ValueError(f"{name}: expected shape {shape} for {n} means; found {actual}.")
         if (
             self.sh.ndim != 3
             or self.sh.shape[0] != n
             or self.sh.shape[2] != 3
             or self.sh.shape[1] not in (1, 4, 9, 16, 25)
         ):
-            raise ValueError(f"sh: expected shape ({n}, 1 | 4 | 9 | 16 | 25, 3), got {tuple(self.sh.shape)}")
+            raise ValueError(f"sh: expected shape ({n}, 1 | 4 | 9 | 16 | 25, 3); found {tuple(self.sh.shape)}.")
 
     @classmethod
     def from_colors(
         cls, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, *, sh_degree: int = 0
     ) -> Gaussians:
-        """From activated values: scales >= 0 [N,3], opacities in 0..1 [N], colours [N,3] seen alike from everywhere.
+        """From activated values: scales >= 0 [N,3], opacities in 0..1 [N], colours [N,3] that are alike from everywhere.
 
-        sh_degree: 0..4, of the harmonics that there is room for; above the constant they are 0.
+        sh_degree: 0..4, the degree to leave room for; coefficients above the constant are 0.
 
         Scales below 1e-12 and opacities within 1e-6 of 0 and 1 become these limits, whose logarithms are finite.
         """
         if (scales < 0).any() or (opacities < 0).any() or (opacities > 1).any():
-            raise ValueError("scales, opacities: expected scales >= 0 and opacities in 0..1, got values beyond")
+            raise ValueError("scales, opacities: expected scales >= 0 and opacities in 0..1; found values beyond.")
         scales, opacities = scales.clamp_min(1e-12), opacities.clamp(1e-6, 1 - 1e-6)
         if sh_degree not in range(sh.MAX_DEGREE + 1):
-            raise ValueError(f"sh_degree: expected 0 to {sh.MAX_DEGREE}, got {sh_degree}")
+            raise ValueError(f"sh_degree: expected 0 to {sh.MAX_DEGREE}; found {sh_degree}.")
         constant = ((colors - 0.5) / sh.C0)[:, None]
         rest = constant.new_zeros(len(means), (sh_degree + 1) ** 2 - 1, 3)
         return cls(means, quats, scales.log(), opacities.logit(), torch.cat([constant, rest], 1))
 
     def __len__(self) -> int:
         return len(self.means)
+
+    def __repr__(self) -> str:
+        return f"Gaussians({len(self)}, sh_degree={self.sh_degree}, {self.means.device})"
 
     @property
     def scales(self) -> Tensor:
@@ -96,11 +93,11 @@ class Gaussians:
         sizes = {(c.width, c.height) for c in cameras}
         if len(sizes) != 1:
             raise ValueError(
-                f"camera: expected one or more cameras of one image size, got sizes {sorted(sizes)}: "
-                "render each size on its own"
+                f"camera: expected one or more cameras of one image size; found sizes {sorted(sizes)}. "
+                "Render each size by itself."
             )
         if any(c.distortion is not None and np.any(c.distortion) for c in cameras):
-            raise ValueError("camera: expected no distortion, got coefficients: undistort the images and drop them")
+            raise ValueError("camera: expected no distortion; found coefficients. Undistort the images and drop them.")
         w2c = [np.atleast_3d(c.w2c).reshape(-1, 4, 4) for c in cameras]
         Ks = np.concatenate([np.repeat(c.K[None], len(v), 0) for c, v in zip(cameras, w2c, strict=True)])
         viewmats = torch.as_tensor(np.concatenate(w2c)).to(self.means)
@@ -118,10 +115,10 @@ class Gaussians:
         return Gaussians(*(getattr(self, f.name).to(device) for f in fields(self)))
 
     def finite(self) -> Gaussians:
-        """These Gaussians; ValueError when a parameter is NaN or infinite, which no file should hold."""
+        """These Gaussians; ValueError where a parameter is NaN or infinite, which no file should hold."""
         for f in fields(self):
             if not getattr(self, f.name).isfinite().all():
                 raise ValueError(
-                    f"gaussians.{f.name}: expected finite values, got NaN or infinity: the fit has diverged"
+                    f"gaussians.{f.name}: expected finite values; found NaN or infinity. The fit has diverged: lower its rates."
                 )
         return self

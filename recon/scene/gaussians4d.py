@@ -1,4 +1,4 @@
-"""A scene of moving and static Gaussians that can be asked for any instant of world time."""
+"""A scene of moving and static Gaussians, at any instant of world time."""
 
 from __future__ import annotations
 
@@ -33,12 +33,16 @@ UNSOUND = (
     json.JSONDecodeError,
     UnicodeDecodeError,
 )
-"""What a stranger's header raises, apart from ValueError: JSON of other types, of other lengths, too deep or too large."""
+"""Errors beside ValueError that a stranger's header raises: JSON of other types, other lengths, too deep or too large."""
 
 
-@dataclass(frozen=True, eq=False)
+NEAR_OF_MOVING = 0.01
+"""Near plane of what moves, as a share of that of what is static."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Gaussians4D:
-    """Dynamic Gaussians that a motion carries, and static ones that never meet it.
+    """Dynamic Gaussians, which a motion carries, and static ones.
 
     Args:
         dynamic: N Gaussians; means and quats are those of the rest pose that the motion binds them to.
@@ -48,8 +52,8 @@ class Gaussians4D:
         frame_step: seconds of one frame of the reference.
         span: (first, last) world seconds that the videos cover.
         static: S Gaussians, or None.
-        near: distance along z, world units, below which nothing static is drawn: a backdrop just in front of a
-            camera that it was not fitted to would hide the scene.
+        near: distance along z, world units, below which nothing static is drawn: a backdrop fitted to other cameras
+            may stand just in front of this one and hide the scene.
         features: (N,D) time-invariant features of the dynamic Gaussians, or None.
     """
 
@@ -66,14 +70,28 @@ class Gaussians4D:
         for name in ("footprint", "frame_step"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
-                raise ValueError(f"{name}: expected a positive number, got {value}")
+                raise ValueError(f"{name}: expected a number > 0; found {value}.")
         if not (math.isfinite(self.near) and self.near >= 0):
-            raise ValueError(f"near: expected a distance of 0 or more, got {self.near}")
+            raise ValueError(f"near: expected a distance of 0 or more; found {self.near}.")
         if not (len(self.span) == 2 and all(map(math.isfinite, self.span)) and self.span[0] <= self.span[1]):
-            raise ValueError(f"span: expected (first, last) world seconds in order, got {self.span}")
+            raise ValueError(f"span: expected (first, last) world seconds in order; found {self.span}.")
 
     def __len__(self) -> int:
+        """Number of dynamic Gaussians."""
         return len(self.dynamic)
+
+    def __repr__(self) -> str:
+        static = 0 if self.static is None else len(self.static)
+        first, last = self.span
+        return (
+            f"Gaussians4D({len(self)} moving, {static} static, {type(self.motion).__name__}, "
+            f"{first:.3f} to {last:.3f} s, {self.dynamic.means.device})"
+        )
+
+    @property
+    def moving_near(self) -> float:
+        """Near plane for what moves: unlike a backdrop it stands in front of no camera, so nearly all of it is drawn."""
+        return NEAR_OF_MOVING * self.near
 
     def moving(self, t: Tensor | float, clocks: Tensor | None = None) -> Gaussians:
         """The dynamic Gaussians at world time ``t`` (seconds), differentiable in it."""
@@ -86,7 +104,7 @@ class Gaussians4D:
         return moving if self.static is None else join(moving, self.static)
 
     def to(self, device: torch.device | str) -> Gaussians4D:
-        """The same scene on "cpu", or on a GPU ("cuda"): a fit of it then runs there. ValueError where there is none."""
+        """The same scene on "cpu" or on a GPU ("cuda"), where a fit of it then runs. ValueError where there is no GPU."""
         device = device_of(device)
         return replace(
             self,
@@ -105,7 +123,7 @@ class Gaussians4D:
     def render(self, camera: Camera, t: Tensor | float, **options: Any) -> Rendering:
         """What a static ``camera`` sees at world time ``t``; options are those of :func:`recon.raster.render`."""
         if camera.w2c.ndim == 3:
-            raise ValueError("camera: expected one pose, got one per frame: take the pose of the wanted frame")
+            raise ValueError("camera: expected one pose; found one per frame. Take the pose of the frame you want.")
         options.setdefault("near_plane", self.near)
         return self.at(t).render(camera, **options)
 
@@ -162,7 +180,7 @@ def scene_arrays(scene: Gaussians4D) -> dict[str, np.ndarray]:
 
 
 def scene_from_arrays(arrays: Mapping[str, np.ndarray]) -> Gaussians4D:
-    """The scene that :func:`scene_arrays` took apart. One of :data:`UNSOUND` or ValueError say what is missing or wrong."""
+    """The scene that :func:`scene_arrays` took apart. ValueError or one of :data:`UNSOUND` says what is missing or wrong."""
     about = json.loads(arrays["scene"].tobytes().decode())
     if not isinstance(about, dict) or about.get("format") != FORMAT or about.get("version") != VERSION:
         raise ValueError(f"expected a 4D scene (format {FORMAT!r}, version {VERSION}); found another. Write it anew.")
@@ -190,7 +208,7 @@ def _gaussians(arrays: Mapping[str, np.ndarray], part: str) -> Gaussians:
     """The Gaussians whose arrays are named ``part.*``; shapes are checked by their own class."""
     names = [f"{part}.{f.name}" for f in fields(Gaussians)]
     means, *others = (numbers(arrays, n, (None,) * np.ndim(arrays[n])) for n in names)
-    found = Gaussians(means, *others)
+    gaussians = Gaussians(means, *others)
     if any(x.dtype != means.dtype for x in others):
         raise ValueError(f"{part}: expected arrays of one precision; found {[str(x.dtype) for x in (means, *others)]}.")
-    return found
+    return gaussians

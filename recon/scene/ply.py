@@ -1,4 +1,7 @@
-"""Gaussians in the file formats of 3DGS viewers: .ply and .splat."""
+"""Gaussians in the file formats of 3DGS viewers: .ply (read and written) and .splat (written).
+
+Files are not trusted: nothing is allocated before the header has been checked against the size of the file.
+"""
 
 from __future__ import annotations
 
@@ -62,14 +65,14 @@ def load_ply(path: str | os.PathLike[str]) -> Gaussians:
     missing = [name for name in ply_fields(k) if name not in names and not name.startswith("n")]
     if rest % 3 or k not in (1, 4, 9, 16, 25) or missing:
         raise ValueError(
-            f"{path}: expected the properties of 3DGS with 0, 9, 24, 45 or 72 f_rest, got {rest} f_rest"
+            f"{path}: expected the properties of 3DGS with 0, 9, 24, 45 or 72 f_rest; found {rest} f_rest"
             + (f" and no {', '.join(missing[:4])}" if missing else "")
-            + ": export it as standard 3DGS"
+            + ". Export it as standard 3DGS."
         )
     try:
         vertex = PlyData.read(str(path), mmap=False)["vertex"].data
     except (PlyParseError, ValueError, KeyError) as error:
-        raise ValueError(f"{path}: expected a .ply file, got one that cannot be parsed ({error})") from error
+        raise ValueError(f"{path}: expected a .ply file; found one that cannot be parsed ({error}).") from error
 
     def columns(*wanted: str) -> np.ndarray:
         return np.stack([np.asarray(vertex[name], np.float32) for name in wanted], -1).reshape(n, len(wanted))
@@ -89,19 +92,21 @@ def load_ply(path: str | os.PathLike[str]) -> Gaussians:
         if not np.isfinite(array).all():
             bad = int((~np.isfinite(array)).reshape(n, -1).any(-1).sum())
             raise ValueError(
-                f"{path}: expected finite {name}, got NaN or infinity in {bad} of {n} Gaussians: "
-                "the fit that wrote it has diverged"
+                f"{path}: expected finite {name}; found NaN or infinity in {bad} of {n} Gaussians. "
+                "The fit that wrote it has diverged."
             )
     return Gaussians(**{name: torch.from_numpy(np.ascontiguousarray(a)) for name, a in arrays.items()})
 
 
 def _check_ply_header(path: Path) -> tuple[int, list[str]]:
-    """Number and property names of the vertices, after holding the header against the size of the file."""
+    """Number and property names of the vertices, once the header has been checked against the size of the file."""
     sizes = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4, "float": 4, "double": 8}
     sizes |= {"int8": 1, "uint8": 1, "int16": 2, "uint16": 2, "int32": 4, "uint32": 4, "float32": 4, "float64": 8}
 
-    def refuse(found: str) -> ValueError:
-        return ValueError(f"{path}: expected a 3DGS .ply with one element 'vertex' of scalar properties, got {found}")
+    def refuse(problem: str) -> ValueError:
+        return ValueError(
+            f"{path}: expected a 3DGS .ply with one element 'vertex' of scalar properties; found {problem}."
+        )
 
     with open(path, "rb") as file:
         head = file.read(MAX_HEADER_BYTES)
@@ -130,8 +135,8 @@ def _check_ply_header(path: Path) -> tuple[int, list[str]]:
     body = total - end - len(b"end_header\n")
     if n * bytes_each > body + ascii_format:
         raise ValueError(
-            f"{path}: expected {n} Gaussians of {bytes_each} bytes as its header says, got {body} bytes: "
-            "the file is cut off or its header is wrong"
+            f"{path}: expected {n} Gaussians of {bytes_each} bytes as its header says; found {body} bytes. "
+            "The file is cut off or its header is wrong."
         )
     return n, names
 

@@ -1,10 +1,10 @@
-"""Where Gaussians begin: surfaces that the depth maps show, taken over moment by moment.
+"""Seeding: the first Gaussians of a scene, on the surfaces that the depth maps show, moment by moment.
 
-At the middle of the clip every surface voxel gets a Gaussian and is bound to the scaffold. At each further moment the
-model is warped there, and only where it has nothing near are new ones added: what a moment shows that an earlier one
-hid. Their means are those of that moment, so each moment is a rest of the scaffold.
+At the middle of the clip every surface voxel gets a Gaussian, which is bound to the scaffold. At each further moment the
+Gaussians are carried there, and new ones are added where none is near: on what earlier moments hid. Their means hold at
+that moment, so each moment is a rest of the scaffold.
 
-A rolling shutter is not undone here: its rows are up to half a readout off, which the fit then corrects.
+A rolling shutter is not undone here: its rows are off by up to half a readout, which the fit corrects.
 """
 
 from __future__ import annotations
@@ -29,22 +29,22 @@ from recon.scene.gaussians4d import Gaussians4D
 logger = logging.getLogger("recon.seed")
 
 INSIDE = 230
-"""Masks of 0..255 from which on a pixel shows nothing but what moves: edges mix in the background's colour and depth."""
+"""Masks of 0..255 from which a pixel shows only what moves: at edges the background's colour and depth mix in."""
 
 APART = 8 * 1 / 30
-"""Seconds between the moments that seeds are taken at."""
+"""Seconds between the moments at which seeds are taken."""
 
 
 @dataclass(frozen=True)
 class Seeding:
-    """How densely Gaussians begin.
+    """How densely a scene is seeded.
 
     Args:
         voxel: footprints between seeds. support: pixels that must have seen a voxel, so that stray depths seed nothing.
-        reach: voxels within which a warped Gaussian counts as being there already.
-        scale: standard deviation, in voxels. opacity: at the start.
-        sh_degree: 1 to 4 where the colours of what moves depend on the direction they are seen from (sheen, strong
-            lamps), in the world's directions; 0: they do not, and nothing is computed for it.
+        reach: voxels around a Gaussian in which no other is seeded.
+        scale: standard deviation of a seed, in voxels. opacity: of a seed.
+        sh_degree: 1 to 4 where the colours of what moves depend on the direction from which they are seen (sheen,
+            strong lamps), in the world's directions; 0: they do not, and nothing is computed for it.
     """
 
     voxel: float = 2.7
@@ -63,10 +63,10 @@ class Seeding:
 
 
 def moments(span: tuple[float, float], frame_step: float, apart: float = APART) -> np.ndarray:
-    """World seconds to seed at: the middle first, then from it outwards, ``apart`` seconds each, then both ends.
+    """World seconds to seed at: the middle first, then outwards in steps of ``apart`` seconds, then both ends.
 
-    The middle is a whole number of the reference's frames after the first second, which the earliest video begins at:
-    moments lie between the frames of every other video, and of the reference where another began between two of its.
+    The middle is a whole number of the reference's frames after the first second, at which the earliest video begins.
+    So moments lie between the frames of every other video, and of the reference where a video began between two of its.
     """
     first, last = span
     middle = first + frame_step * round((last - first) / 2 / frame_step)
@@ -80,10 +80,10 @@ def moments(span: tuple[float, float], frame_step: float, apart: float = APART) 
 
 
 def shown_at(footage: Sequence[Footage], offsets: Offsets, t: float, frame_step: float) -> list[int | None]:
-    """Of every video the readable frame believed nearest to world second ``t``.
+    """For every video the readable frame that is believed nearest to world second ``t``.
 
-    None where that is further than one frame of the reference away. Whoever makes depth maps for seeding asks here which
-    frames need one: halfway between two frames another rounding would choose the other.
+    None where that is further than one frame of the reference away. To make depth maps for seeding, ask this function
+    which frames need one: half-way between two frames another rounding would choose the other.
     """
     frames: list[int | None] = []
     for f in footage:
@@ -199,7 +199,8 @@ def seed(
         logger.info("seeds until %.3f s: %d", t, len(means))
     if not len(means):
         raise ValueError(
-            "depth: expected depth where something moves, at one moment at least; found none. Check masks and depth maps."
+            "depth: expected depth where something moves, at one moment at least; found none. Check masks and "
+            "depth maps."
         )
     n = len(means)
     gaussians = Gaussians.from_colors(

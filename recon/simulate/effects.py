@@ -1,4 +1,4 @@
-"""What the simulated cameras do to the light."""
+"""Effects of simulated cameras: gain, noise, blur, rolling shutter, and a lamp that shines on what they film."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from otsync.types import Camera
 class Instant:
     """What a camera sees at one instant: rgb [h,w,3] and alpha [h,w,1] of what moves.
 
-    z [h,w,1]: its depth, and solid [h,w,1]: its alpha, both as they are without blur, which a depth estimator looks through.
+    z [h,w,1]: its depth; solid [h,w,1]: its alpha. Neither has blur, which depth estimators look through.
     """
 
     rgb: Tensor
@@ -31,7 +31,7 @@ See = Callable[[float], Instant]
 
 @dataclass(frozen=True)
 class Exposure:
-    """Every camera has a gain of its own per channel, log-normal with this standard deviation."""
+    """Every camera has its own gain per channel, log-normal with this standard deviation."""
 
     size: float = 0.08
 
@@ -42,7 +42,7 @@ class Exposure:
 
 @dataclass(frozen=True)
 class MoreNoise:
-    """White noise beyond the usual, standard deviation in 0..1."""
+    """White noise beyond the usual, of this standard deviation in 0..1."""
 
     size: float = 0.03
 
@@ -88,9 +88,9 @@ class Rolling:
 
 @dataclass(frozen=True)
 class Sheen:
-    """A lamp that what moves reflects: ``size * max(0, n . h) ** sharpness`` on every channel (Blinn 1977).
+    """A lamp reflected by what moves: ``size * max(0, n . h) ** sharpness`` on every channel (Blinn 1977).
 
-    h: half-way between the directions of the lamp, which is far away, and of the camera.
+    h: half-way between the directions to the lamp, which is far away, and to the camera.
     """
 
     size: float = 0.3

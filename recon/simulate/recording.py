@@ -1,4 +1,4 @@
-"""A simulated capture as a recording on disk: what ``recon fit`` and ``otsync run`` read, and the truth beside it."""
+"""A simulated capture as a recording on disk, for ``recon fit`` and ``otsync run``, with the truth beside it."""
 
 from __future__ import annotations
 
@@ -17,23 +17,21 @@ from recon.motion import ScaffoldOptions, build_scaffold
 from recon.scene.gaussians4d import Gaussians4D
 from recon.scene.seed import Seeding, seed
 from recon.simulate.capture import Capture
-
-CAMERA_DISTANCE = 2.6
-"""Metres from the cameras to what moves: their images' pixels cover this over the focal length."""
+from recon.simulate.world import DISTANCE
 
 DEPTH_STEP = 0.0005
 """Metres per step of the 16-bit depth images."""
 
 
 def write_capture(capture: Capture, folder: str | os.PathLike[str], *, masks: bool = True, depth: bool = True) -> None:
-    """Write ``scene.json``, images, masks, depth of the training cameras, their tracks, ``truth.json`` and ``start.json``.
+    """Write ``scene.json``, ``truth.json``, ``start.json``, images, masks, and the training cameras' depth and tracks.
 
-    start.json holds the offsets that a fit may begin with: zero for every camera. Held-out cameras film at true world
-    time, which both files say. ValueError for a folder that holds another recording.
+    start.json holds offsets for a fit to begin with: zero for every camera. Held-out cameras film at true world time, as
+    both files say. ValueError for a folder that holds another recording.
     """
     folder = Path(folder)
     if (folder / "scene.json").exists():
-        raise ValueError(f"{folder}: expected a folder without a recording; it holds scene.json. Choose another.")
+        raise ValueError(f"{folder}: expected a folder without a recording; found scene.json in it. Choose another.")
     videos = []
     every = [*capture.footage, *capture.held_out]
     for n, footage in enumerate(every):
@@ -50,7 +48,7 @@ def write_capture(capture: Capture, folder: str | os.PathLike[str], *, masks: bo
     true = np.concatenate([capture.offsets - capture.offsets[0], np.zeros(len(capture.held_out))])
     Offsets.known(names, true, 1 / capture.frame_step).save(folder / "truth.json")
     Offsets.known(names, np.zeros(len(names)), 1 / capture.frame_step).save(folder / "start.json")
-    write_document(folder / "scene.json", videos)  # last: a folder with it is whole
+    write_document(folder / "scene.json", videos)  # last: a folder that holds it is complete
 
 
 def _images(footage: Footage, folder: Path, masks: bool) -> dict[str, Any]:
@@ -82,12 +80,12 @@ def _png(path: Path, image: np.ndarray) -> None:
         Image.fromarray(image).save(stream, "PNG")
 
 
-def begun(
+def initial_scene(
     capture: Capture, offsets: Offsets, options: ScaffoldOptions | None = None, *, seeding: Seeding | None = None
 ) -> Gaussians4D:
-    """The scene that a fit of a capture begins with: scaffold and seeds from the believed ``offsets``, and the true
+    """The scene with which a fit of a capture begins: scaffold and seeds from the believed ``offsets``, and the true
     static Gaussians, so that what moves is judged by itself."""
-    footprint = float(np.median([CAMERA_DISTANCE / f.K[0, 0] for f in capture.footage]))
+    footprint = float(np.median([DISTANCE / f.K[0, 0] for f in capture.footage]))
     span = (float(capture.footage[0].times[0]), float(capture.footage[0].times[-1]))
     motion = build_scaffold(
         capture.tracks, offsets.seconds, footprint=footprint, frame_step=capture.frame_step, options=options

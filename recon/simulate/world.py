@@ -1,9 +1,9 @@
-"""A small filmed world with exact answers: what the fit's tests, examples and ablations run on.
+"""A small world with exact answers, for tests, examples and ablations.
 
 Two articulated bodies of six rigid parts walk between a floor and a wall; every surface point is a Gaussian that moves
 at every real time. Cameras around them film it, each with a clock that is off by a known part of a frame: camera v's
-frame at its own time t shows the world at ``t + offset_v``, and so do its tracks, its depth and its masks. A method is
-given all but the offsets. Metres, seconds, z up.
+frame at its own time t shows the world at ``t + offset_v``, and so do its tracks, its depth and its masks. Methods are
+given everything but the offsets. Metres, seconds, z up.
 """
 
 from __future__ import annotations
@@ -25,19 +25,22 @@ NOISE = 0.01
 """Standard deviation of the images' noise, in 0..1."""
 
 RADIUS, HEIGHT = 3.2, 3.0
-"""Of the wall around the scene, m. Cameras stand inside of it, so splats of the wall come close to them."""
+"""Of the wall around the scene, m. Cameras stand inside it, so splats of the wall come close to them."""
 
-NEAR = 0.6
-"""m; what is static and nearer than this to a camera is not drawn."""
+DISTANCE, MIDDLE = 2.6, (0, 0, 0.7)
+"""From the cameras to the axis of the scene, m, and the point that they look at."""
 
-TRACK_NOISE, DRIFTING, DRIFT, SHORTEST = 0.006, 0.05, 0.01, 8
-"""Tracks: m of white noise; share that drifts and its random walk, m per frame; frames that a track must be seen."""
+STATIC_NEAR = 0.6
+"""m; static things nearer than this to a camera are not drawn."""
 
-DEPTH_SCALE, DEPTH_NOISE = 0.004, 0.006
-"""Depth maps: relative error of a whole frame, and m of noise of every pixel."""
+SPLAT = 0.03
+"""Standard deviation of the moving Gaussians, m."""
+
+POINTS = 2200
+"""Moving Gaussians of both bodies."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class World:
     """The truth: N moving Gaussians at every real time, and S static ones.
 
@@ -56,13 +59,16 @@ class World:
     colors: Float[np.ndarray, "N 3"]
     static: Gaussians
 
+    def __repr__(self) -> str:
+        return f"World({len(self.part)} moving Gaussians on {len(self.scene.parts)} parts, {len(self.static)} static)"
+
     @property
     def body(self) -> Int[np.ndarray, " N"]:
         """Which body every moving Gaussian belongs to."""
         return self.scene.parts.object[self.part]
 
     def positions(self, times: Sequence[float] | np.ndarray) -> Float[np.ndarray, "N T 3"]:
-        """Of the moving Gaussians at world ``times`` (s)."""
+        """Positions of the moving Gaussians at world ``times`` (s)."""
         R, p = self.scene.pose(np.asarray(times, float))
         return np.einsum("ntij,nj->nti", R[self.part], self.local) + p[self.part]
 
@@ -76,10 +82,11 @@ class World:
         n = len(means)
         upright = torch.tensor([1.0, 0, 0, 0]).repeat(n, 1)
         colors = torch.as_tensor(self.colors, dtype=torch.float32)
-        return Gaussians.from_colors(means, upright, torch.full((n, 3), 0.03), torch.full((n,), 0.9), colors)
+        return Gaussians.from_colors(means, upright, torch.full((n, 3), SPLAT), torch.full((n,), 0.9), colors)
 
 
-def _world(seed: int) -> World:
+def draw_world(seed: int) -> World:
+    """Two bodies in a room; ``seed`` decides everything."""
     bodies = [_body(b, stream(seed, "body", b)) for b in range(2)]
     parts = Parts.join([parts for parts, _ in bodies])
 
@@ -88,12 +95,12 @@ def _world(seed: int) -> World:
         return np.concatenate([R for R, _ in poses]), np.concatenate([p for _, p in poses])
 
     rng = stream(seed, "surface")
-    part, local, normals = sample_surface(parts, 2200, rng)
+    part, local, normals = sample_surface(parts, POINTS, rng)
     base = rng.uniform(0.1, 0.9, (len(parts), 3))
     wave = rng.normal(0, 18, (len(parts), 3, 3))
     texture = 0.18 * np.sin(np.einsum("ni,nij->nj", local, wave[part])) + 0.05 * rng.standard_normal((len(part), 3))
     return World(
-        Scene(parts, pose, distance=2.6, center=(0, 0, 0.7)),
+        Scene(parts, pose, distance=DISTANCE, center=MIDDLE),
         part,
         local,
         normals,
@@ -143,8 +150,8 @@ def _body(b: int, rng: np.random.Generator) -> tuple[Parts, Callable[[np.ndarray
 def _room(rng: np.random.Generator) -> Gaussians:
     """A floor and a round wall of small, flat, overlapping discs, blotchy.
 
-    Splats are sorted by their middles, so that a floor of large ones would seem to stand higher, and differently so from
-    every side.
+    Splats are sorted by their middles: a floor of large ones would seem to stand higher, and differently so from every
+    side.
     """
     on_floor, on_wall, width = 4000, 7000, 0.08
     angle = rng.uniform(0, 2 * np.pi, on_wall)

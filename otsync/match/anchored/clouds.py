@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from ...compute.indices import evenly
 from ...costs.linear import binary_scale, unit_features
 from ...types import TrackSet
 
@@ -55,7 +56,7 @@ class Cloud:
         from . import kernels
 
         T = len(self.weight)
-        at = np.unique(np.linspace(0, T - 1, frames).round().astype(np.int64))
+        at = evenly(T, frames)
         out = np.empty((len(self), 3 * len(at)), np.float32)
         run(kernels.poses, len(self), self.columns, self.weight, at, out)
         return out

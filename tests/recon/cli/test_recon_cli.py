@@ -347,7 +347,7 @@ def test_simulate_writes_a_recording_that_the_printed_command_fits(tmp_path, cap
     truth, start = Offsets.load(tmp_path / "w" / "truth.json"), Offsets.load(tmp_path / "w" / "start.json")
     assert truth.seconds[0] == 0 != truth.seconds[1] and not start.seconds.any()
     assert main(args) == 2
-    assert "holds scene.json" in capsys.readouterr().err
+    assert "found scene.json" in capsys.readouterr().err
 
 
 def test_declared_readouts_and_given_exposures_reach_the_fit(tmp_path, monkeypatch, capsys):

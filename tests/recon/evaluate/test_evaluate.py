@@ -101,9 +101,9 @@ def test_offset_error_fixes_the_gauge():
     part = offset_error(found, true, 0.02)
     assert part.mean == pytest.approx(0.75) and np.isnan(part.errors[2])
     assert math.isnan(offset_error([np.nan, 1.0], [0.0, 1.0], 0.02).mean)
-    for wrong in ({"frame_step": 0.0}, {"reference": 4}, {"gauge": "first"}, {"found": [0.0]}):
+    for wrong in ({"frame_step": 0.0}, {"reference": 4}, {"gauge": "first"}, {"estimated": [0.0]}):
         with pytest.raises(ValueError, match=next(iter(wrong))):
-            offset_error(**{"found": found, "true": true, "frame_step": 0.02, **wrong})
+            offset_error(**{"estimated": found, "true": true, "frame_step": 0.02, **wrong})
 
 
 def rigid(n=30, frames=41, seed=0):

@@ -11,13 +11,13 @@ from recon.evaluate.views import view
 from recon.fit.optimize import RATES, without
 from recon.fit.verb import fit
 from recon.simulate.capture import synthetic
-from recon.simulate.recording import begun
+from recon.simulate.recording import initial_scene
 
 
 def refined(seed: int, steps: int, rates=RATES):
     capture = synthetic(seed)
     believed = Offsets.known([f.name for f in capture.footage], np.zeros(len(capture.footage)), 30)
-    result = fit(begun(capture, believed), capture.footage, believed, steps=steps, rates=rates)
+    result = fit(initial_scene(capture, believed), capture.footage, believed, steps=steps, rates=rates)
     error = offset_error(result.offsets.seconds, capture.offsets, capture.frame_step)
     held = view(result.scene, capture.held_out[0], Clock(0.0), gain=np.ones(3)).score(most=24, pictures=0).mean
     return error, held, result

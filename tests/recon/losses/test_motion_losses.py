@@ -23,8 +23,8 @@ from recon.losses.motion import (
     soft_norm,
 )
 from recon.motion import Binding, HermiteSpline, PerGaussian, Sampled, Scaffold, Static
-from recon.motion.rotations import continuous, quaternions
 from recon.motion.solve import FRAME
+from recon.rotations import continuous, quaternions
 from tests.recon.motion.worlds import leaves, random_scaffold
 
 EVERY = (*MOTION_LOSSES, RotationVelocity(), RotationAcceleration())

@@ -11,9 +11,8 @@ from scipy.spatial import cKDTree
 
 from otsync.types import TrackSet
 from recon.motion import ScaffoldOptions, build_scaffold
-from recon.motion.rotations import unit
 from recon.motion.solve import FRAME
-from recon.raster.projection import rotation_matrices
+from recon.rotations import rotation_matrices, unit
 from tests.recon.motion.worlds import FOOTPRINT, Bodies, filmed, random_rotation
 
 UNITS = {"footprint": FOOTPRINT, "frame_step": FRAME}

@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from recon.motion import HermiteSpline, Sampled
 from recon.motion.paths import path_arrays, path_from_arrays
-from recon.motion.rotations import conjugate, continuous, product, quaternions, rotation_vectors, unit
-from recon.raster.projection import rotation_matrices
+from recon.rotations import conjugate, continuous, product, quaternions, rotation_matrices, rotation_vectors, unit
 
 
 def scipy_spline(path: HermiteSpline, knots: np.ndarray) -> CubicHermiteSpline:

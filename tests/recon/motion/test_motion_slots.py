@@ -10,9 +10,8 @@ import torch
 
 from otsync.types import TrackSet
 from recon.motion import HermiteSpline, PerGaussian, Sampled, Static, build_scaffold, density, motion_from_arrays
-from recon.motion.rotations import unit
 from recon.motion.solve import FRAME
-from recon.raster.projection import rotation_matrices
+from recon.rotations import rotation_matrices, unit
 from tests.recon.motion.worlds import FOOTPRINT, Bodies, filmed, leaves, random_gaussians, random_scaffold
 
 
@@ -152,7 +151,7 @@ def test_nodes_grow_where_gaussians_pull(carried):
 def test_a_rigid_motion_is_not_changed_by_growing():
     from scipy.spatial.transform import Rotation
 
-    from recon.motion.rotations import continuous, quaternions
+    from recon.rotations import continuous, quaternions
 
     rng = np.random.default_rng(0)
     scaffold = random_scaffold(gaussians=0, rests=(), dtype=torch.float64)

@@ -16,8 +16,7 @@ from scipy.spatial.transform import Rotation
 from otsync.compute.threads import get_threads, set_threads
 from recon.motion import Binding, HermiteSpline, Sampled, Scaffold, fused
 from recon.motion import warp as warping
-from recon.motion.rotations import conjugate, product, quaternions, unit
-from recon.raster.projection import rotation_matrices
+from recon.rotations import conjugate, product, quaternions, rotation_matrices, unit
 from tests.recon.motion.worlds import leaves, random_gaussians, random_scaffold
 
 BLENDS = ["linear", "dual-quaternion"]

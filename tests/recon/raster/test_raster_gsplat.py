@@ -10,8 +10,9 @@ import torch
 
 from recon.raster import render, sh
 from recon.raster.cpu import backend as cpu_backend
-from recon.raster.projection import project, rotation_matrices
+from recon.raster.projection import project
 from recon.raster.rendering import Settings
+from recon.rotations import rotation_matrices
 from tests.recon.scenes import LEAVES, Scene, random_scene, relative, run
 
 gsplat = pytest.importorskip("gsplat", reason="gsplat is not installed: pip install 'otsync[cuda]'")

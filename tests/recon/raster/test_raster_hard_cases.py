@@ -376,7 +376,7 @@ def test_numpy_arrays_are_named():
     arguments = [torch.zeros(4, 3), torch.ones(4, 4), torch.ones(4, 3), torch.ones(4), torch.ones(4, 3)]
     for i, name in enumerate(("means", "quats", "scales", "opacities", "colors")):
         mixed = [t.numpy() if k == i else t for k, t in enumerate(arguments)]
-        with pytest.raises(ValueError, match=f"{name}: expected a torch tensor, got ndarray"):
+        with pytest.raises(ValueError, match=f"{name}: expected a torch tensor; found ndarray"):
             render(*mixed, torch.eye(4)[None], torch.eye(3)[None], 8, 8)
 
 

@@ -13,8 +13,9 @@ from plyfile import PlyData
 from otsync.types import Camera, TrackSet
 from recon.motion import HermiteSpline, PerGaussian
 from recon.result.export import check_times, export, frame_times, scene_tracks
-from recon.result.orbit import look_at, orbit
+from recon.result.orbit import orbit
 from recon.result.video import write_images
+from recon.rotations import look_at
 from recon.scene.gaussians import Gaussians
 from recon.scene.gaussians4d import Gaussians4D
 from recon.scene.ply import load_ply

@@ -11,7 +11,8 @@ from recon.evaluate.figures import psnr
 from recon.raster import render, sh
 from recon.simulate.capture import synthetic
 from recon.simulate.effects import Blur, Exposure, MoreNoise, Rolling, Sheen
-from recon.simulate.world import DEPTH_NOISE, FPS, NEAR, TRACK_NOISE
+from recon.simulate.estimates import DEPTH_NOISE, TRACK_NOISE
+from recon.simulate.world import FPS, STATIC_NEAR
 
 SMALL = {"cameras": 3, "held_out": 1, "frames": 9, "size": (80, 48)}
 
@@ -29,7 +30,7 @@ def seen(world, footage, t):
         colors = (sh.C0 * g.sh[:, 0] + 0.5).clamp(0, 1)
         return render(g.means, g.quats, g.scales, g.opacities, colors, w2c, K, *footage.size, near_plane=near)
 
-    back, body = draw(world.static, NEAR), draw(world.moving(t), 0.01)
+    back, body = draw(world.static, STATIC_NEAR), draw(world.moving(t), 0.01)
     image = body.colors[0] + (1 - body.alphas[0]) * back.colors[0]
     return image.numpy().clip(0, 1), body.alphas[0, ..., 0].numpy()
 

@@ -1,4 +1,4 @@
-"""Filming a world: one image per shot, through the effects."""
+"""A camera that films a world through its effects: images, masks and exact depth."""
 
 from __future__ import annotations
 
@@ -14,12 +14,19 @@ from otsync.types import Camera
 from recon.raster import render, sh
 from recon.scene.gaussians import Gaussians
 from recon.simulate.effects import Blur, Effect, Exposure, Instant, MoreNoise, Rolling, See, Sheen
-from recon.simulate.world import NEAR, NOISE, World
+from recon.simulate.world import NOISE, STATIC_NEAR, World
+
+MOVING_NEAR = 0.01
+"""Near plane of what moves, m."""
+
+HALF, SOLID, CLEAR = 0.5, 0.6, 0.05
+"""Alpha above which a pixel is in the mask, above which its depth is that of what moves, and below which the wall's.
+Between the last two it has none: silhouettes mix both."""
 
 
 @dataclass(frozen=True, eq=False)
-class Shots:
-    """The frames of one camera: uint8 images, bool masks, and depths [T,h,w] without error, 0 at silhouettes."""
+class Frames:
+    """What one camera filmed: uint8 images, bool masks, and exact depth [T,h,w], 0 at silhouettes."""
 
     images: np.ndarray
     masks: np.ndarray
@@ -27,8 +34,8 @@ class Shots:
 
 
 @dataclass(frozen=True, eq=False)
-class Film:
-    """One camera with its effects, loaded with a world."""
+class FilmingCamera:
+    """One camera in front of a world, with its effects, gain and sources of noise."""
 
     world: World
     camera: Camera
@@ -37,7 +44,7 @@ class Film:
     noise: tuple[tuple[float, np.random.Generator], ...]
 
     @classmethod
-    def of(cls, world: World, camera: Camera, c: int, effects: tuple[Effect, ...], seed: int) -> Film:
+    def of(cls, world: World, camera: Camera, c: int, effects: tuple[Effect, ...], seed: int) -> FilmingCamera:
         gain, noise = np.ones(3), [(NOISE, stream(seed, c, "noise"))]
         seen: Counter[str] = Counter()
         for effect in effects:
@@ -52,10 +59,10 @@ class Film:
                 camera = replace(camera, readout=effect.readout)
         return cls(world, camera, effects, gain, tuple(noise))
 
-    def shoot(self, times: Float[np.ndarray, " T"]) -> Shots:
-        """Frames at world ``times``. Depth is that of the rows' instants, without blur."""
+    def film(self, times: Float[np.ndarray, " T"]) -> Frames:
+        """Frames at world ``times`` (s). Depth has no blur, but its rows are those of a rolling shutter."""
         with torch.no_grad():
-            backdrop = self._render(self.world.static, NEAR)
+            backdrop = self._render(self.world.static, STATIC_NEAR)
             wall = backdrop.z[..., 0].numpy()
             see = self._see()
             images, masks, depths = [], [], []
@@ -65,14 +72,14 @@ class Film:
                 for size, rng in self.noise:
                     image = image + size * rng.standard_normal(image.shape)
                 images.append(np.rint(255 * image.clip(0, 1)).astype(np.uint8))
-                masks.append(seen.alpha[..., 0].numpy() > 0.5)
+                masks.append(seen.alpha[..., 0].numpy() > HALF)
                 alpha, z = seen.solid[..., 0].numpy(), seen.z[..., 0].numpy()
-                depths.append(np.where(alpha > 0.6, z, np.where(alpha < 0.05, wall, 0)).astype(np.float32))
-        return Shots(np.stack(images), np.stack(masks), np.stack(depths))
+                depths.append(np.where(alpha > SOLID, z, np.where(alpha < CLEAR, wall, 0)).astype(np.float32))
+        return Frames(np.stack(images), np.stack(masks), np.stack(depths))
 
     def _see(self) -> See:
         """The camera through its effects."""
-        see: See = lambda t: self._render(self._moving(t), 0.01)  # noqa: E731
+        see: See = lambda t: self._render(self._moving(t), MOVING_NEAR)  # noqa: E731
         for effect in self.effects:
             if isinstance(effect, Blur | Rolling):
                 see = effect(see, self.camera)

@@ -1,4 +1,7 @@
-"""Quaternions wxyz: what splining, blending and fitting node rotations needs of them."""
+"""Rotations as quaternions wxyz and matrices, in torch and numpy; and the pose of a camera that looks at a point.
+
+Inside kernels: :mod:`otsync.compute.quaternions`.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from otsync.compute.quaternions import LEAST_NORM
+LEAST_NORM = 1e-12  # as in the kernels, which are not imported here: the renderer works without numba
 
 
 def unit(quats: Tensor) -> Tensor:
@@ -35,8 +38,19 @@ def product(p: Tensor, q: Tensor) -> Tensor:
     )
 
 
+def rotation_matrices(quats: Tensor) -> Tensor:
+    """Rotations [...,3,3] of *unit* quaternions wxyz [...,4]."""
+    w, x, y, z = quats.unbind(-1)
+    entries = [
+        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    ]
+    return torch.stack(entries, -1).reshape(*quats.shape[:-1], 3, 3)
+
+
 def rotation_vectors(quats: Tensor) -> Tensor:
-    """Logarithms of *unit* quaternions [...,4]: axis times angle, radians in -pi..pi, [...,3]. Smooth at no rotation."""
+    """Logarithms [...,3] of *unit* quaternions [...,4]: axis times angle, radians in -pi..pi. Smooth at no rotation."""
     q = torch.where(quats[..., :1] < 0, -quats, quats)
     sine2 = (q[..., 1:] ** 2).sum(-1, keepdim=True)
     small = sine2 < 1e-12
@@ -62,3 +76,22 @@ def continuous(quats: Float[np.ndarray, "P *B 4"]) -> Float[np.ndarray, "P *B 4"
     steps = np.einsum("p...i,p...i->p...", quats[1:], quats[:-1])
     flips = np.cumprod(np.where(steps < 0, -1.0, 1.0), axis=0)
     return np.concatenate([quats[:1], quats[1:] * flips[..., None]])
+
+
+def look_at(
+    eye: Float[np.ndarray, " 3"], focus: Float[np.ndarray, " 3"], up: Float[np.ndarray, " 3"]
+) -> Float[np.ndarray, "4 4"]:
+    """World to camera (OpenCV axes) of a camera at ``eye`` that looks at ``focus``, its rows along the horizon.
+
+    ValueError where it looks along ``up``.
+    """
+    z = focus - eye
+    z = z / np.linalg.norm(z)
+    x = np.cross(z, up)
+    if np.linalg.norm(x) < 1e-6 * np.linalg.norm(up):
+        raise ValueError("up: expected an axis across the line of sight; found it along it. Move the eye aside.")
+    x /= np.linalg.norm(x)
+    w2c = np.eye(4)
+    w2c[:3, :3] = np.stack([x, np.cross(z, x), z])
+    w2c[:3, 3] = -w2c[:3, :3] @ eye
+    return w2c
