@@ -12,8 +12,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from otsync.files.arrays import write_npz
 from otsync.cli import main
+from otsync.files.arrays import write_npz
 from otsync.io import READERS, ImageFrames, VideoFrames, describe_folder, find_reader, open_scene, readers
 from otsync.io.document import FORMAT, VERSION, document, write_document
 from otsync.io.frames import _Errors
