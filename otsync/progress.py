@@ -1,10 +1,10 @@
-"""Progress bars on a terminal, for what takes longer than a moment; nowhere else. A leaf."""
+"""Progress: bars on a terminal, lines on stderr, and the wall time of stages. Knows nothing of the rest."""
 
 from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import TypeVar
 
@@ -50,36 +50,32 @@ def say(text: str) -> None:
 
 
 Tell = Callable[[str], None]
-
-
-class Stopwatch:
-    """Wall seconds per stage."""
-
-    def __init__(self, tell: Tell):
-        self.tell, self.seconds, self._last = tell, {}, time.perf_counter()  # type: Tell, dict[str, float], float
-
-    def lap(self, stage: str) -> None:
-        now = time.perf_counter()
-        self.seconds[stage] = now - self._last
-        self._last = now
-        self.tell(f"{stage}: {self.seconds[stage]:.1f} s")
+"""Receives lines of progress."""
 
 
 class Progress:
-    """Says what happens, remembers what was lacking, and times the stages."""
+    """Says what happens, remembers what the user should know, and times the stages.
+
+    Args:
+        tell: receives one line a note and a stage.
+
+    ``notes``: what was noted, in order. ``seconds``: wall time per stage.
+    """
 
     def __init__(self, tell: Tell = lambda text: None):
-        self.tell, self.notes, self.seconds = tell, [], {}  # type: Tell, list[str], dict[str, float]
+        self.tell = tell
+        self.notes: list[str] = []
+        self.seconds: dict[str, float] = {}
 
     def note(self, text: str) -> None:
-        """Something that the user should know when reading the result; said once, however often it is found."""
+        """Something that the user should know when reading the result; told once, however often it is noted."""
         if text not in self.notes:
             self.notes.append(text)
             self.tell(f"note: {text}")
 
     @contextmanager
-    def stage(self, name: str):
-        """Time what happens inside."""
+    def stage(self, name: str) -> Iterator[None]:
+        """Time what happens inside; times of the same name add up. Tells the total at the end."""
         started = time.perf_counter()
         yield
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - started

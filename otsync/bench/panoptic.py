@@ -33,9 +33,11 @@ from ..io.scene import Scene
 from ..match.anchored import AnchoredFGW
 from ..match.candidates import Candidates
 from ..match.dense import FusedGromovWasserstein, OptimalTransport, PartialFGW
+from ..priors.points import ChainedFlow
 from ..priors.stereo import Rig
 from ..progress import counted
-from ..recordings.routes import COLOUR, Stages, pairs_in_pixels, pairs_in_space
+from ..recordings.routes import pairs_in_pixels, pairs_in_space
+from ..recordings.stages import COLOUR, Stages
 from ..recordings.tracking import pixel_tracks
 from ..refine.unrefined import Unrefined
 from ..sync.graph import Graph
@@ -125,8 +127,8 @@ class Material:
 
         def track(v: int) -> dict[str, np.ndarray]:
             # every camera seeds its grids in frames of its own, or the seeds' rhythm would tell the truth
-            phase = zlib.crc32(scene.names[v].encode()) % stages.tracking.points.every
-            tracking = replace(stages.tracking, points=replace(stages.tracking.points, phase=phase))
+            phase = zlib.crc32(scene.names[v].encode()) % ChainedFlow.every
+            tracking = replace(stages.tracking, points=ChainedFlow(phase=phase))
             return tracking(scene.videos[v], None, cache)
 
         raw = list(map(track, range(len(scene.videos))))

@@ -22,26 +22,29 @@ class Init:
     """
 
     folder: tyro.conf.Positional[Path]
-    """Panoptic layout, video files, or one folder of images per camera."""
+    """Panoptic layout, video files, one folder of images per camera, or a layout that a plugin reads."""
     out: Path | None = None
     """Where to write; default: scene.json in the folder."""
+    reader: str | None = None
+    """Name of the reader; default: the first that claims the folder."""
     fps: float | None = None
-    """Frames per second of image folders, which carry no clock."""
+    """Frames per second of images, which carry no clock."""
     force: bool = False
     """Replace an existing scene.json."""
 
     def run(self) -> int:
         from ..files.arrays import write_json
-        from ..io import describe_folder
+        from ..io import describe_folder, find_reader
 
         out = self.out or self.folder / "scene.json"
         if out.exists() and not self.force:
             raise ValueError(f"{out}: exists already. Pass --force to replace it, or --out for another place.")
         if out.parent.resolve() != self.folder.resolve():
             print(f"note: paths in {out} are relative to {self.folder}; keep it there to use it", file=sys.stderr)
-        document = describe_folder(self.folder, fps=self.fps)
+        name, _ = find_reader(self.folder, self.reader)
+        document = describe_folder(self.folder, reader=name, fps=self.fps)
         write_json(out, document)
-        print(f"wrote {out}: {len(document['videos'])} videos")
+        print(f"wrote {out}: {len(document['videos'])} videos (reader: {name})")
         for note in document.get("notes", ()):
             print(f"note: {note}")
         for item in document.get("missing", ()):

@@ -12,7 +12,7 @@ import dataclasses
 import hashlib
 import sys
 import types
-from collections.abc import Mapping, Set
+from collections.abc import Mapping, Sequence, Set
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,12 @@ def content_key(*items: Any) -> str:
     ValueError names an object whose content cannot be read.
     """
     return _hash(items, ()).hexdigest()
+
+
+def sequence_key(images: Sequence[Any]) -> str:
+    """A hash of a sequence of images: its own ``digest()`` where it has one (lazy frames), else of all their values."""
+    digest = getattr(images, "digest", None)
+    return digest() if digest is not None else content_key(*[None if f is None else np.asarray(f) for f in images])
 
 
 def _hash(x: Any, inside: tuple[int, ...]) -> hashlib.blake2b:

@@ -25,12 +25,15 @@ def cut(scene: Scene, first: int, stop: int) -> Scene:
 
 
 def keep_frames(scene: Scene, index: Sequence[Sequence[int]]) -> Scene:
-    """The frames at ``index`` (rising) of every video, with their masks, depth, poses and times."""
-    videos, masks = [], []
-    for video, mask, picks in zip(scene.videos, scene.masks, index, strict=True):
-        if len(picks) == len(video.frames):
+    """The frames at ``index`` (rising) of every video, with their masks, labels, depth, poses and times."""
+    videos, masks, labels = [], [], []
+    labels_of = scene.labels or (None,) * len(scene.videos)
+    for video, mask, label, picks in zip(scene.videos, scene.masks, labels_of, index, strict=True):
+        whole = len(picks) == len(video.frames)
+        masks.append(mask if whole or mask is None else _some(mask, picks))
+        labels.append(label if whole or label is None else _some(label, picks))
+        if whole:
             videos.append(video)
-            masks.append(mask)
             continue
         camera, at = video.camera, np.asarray(picks, int)
         if camera.w2c.ndim == 3:
@@ -41,8 +44,7 @@ def keep_frames(scene: Scene, index: Sequence[Sequence[int]]) -> Scene:
         thinned = video.fps is not None and len(at) > 1 and float(np.median(np.diff(times))) > 1.5 / video.fps
         frames, fps = _some(video.frames, picks), None if thinned else video.fps
         videos.append(replace(video, frames=frames, camera=camera, fps=fps, timestamps=times, depth=depth))
-        masks.append(None if mask is None else _some(mask, picks))
-    return replace(scene, videos=tuple(videos), masks=tuple(masks))
+    return replace(scene, videos=tuple(videos), masks=tuple(masks), labels=tuple(labels) if scene.labels else ())
 
 
 def unreadable(video: Video, masks: Sequence[Any] | None = None) -> dict[int, str]:

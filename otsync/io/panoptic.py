@@ -12,29 +12,38 @@ from typing import Any
 import numpy as np
 
 from ..files.arrays import read_json
-from .document import FORMAT, VERSION
+from .document import document
 
 METAS = ("train_meta.json", "test_meta.json")
 
+STUDIO_FPS = 30.0
+"""Capture rate where none is given: the files do not tell it."""
 
-def is_panoptic(folder: Path) -> bool:
-    return any((folder / meta).is_file() for meta in METAS) and (folder / "ims").is_dir()
 
+class Panoptic:
+    """The layout of the Panoptic Sports scenes, calibrated; cameras in the order of their numbers."""
 
-def describe_panoptic(folder: Path, *, fps: float = 30.0) -> dict[str, Any]:
-    """The folder as a scene document, cameras in order of their number. ValueError names file and field."""
-    videos = []
-    for name in METAS:
-        if (folder / name).is_file():
-            try:
-                videos += _videos(read_json(folder / name), folder, fps)
-            except (KeyError, TypeError, IndexError, ValueError, AttributeError) as error:
-                raise ValueError(
-                    f"{folder / name}: expected w, h, fn, k, w2c and cam_id; {type(error).__name__}: {error}."
-                ) from None
-    videos.sort(key=lambda v: (len(v["name"]), v["name"]))
-    note = f"the layout does not store the capture rate; {fps:g} fps assumed"
-    return {"format": FORMAT, "version": VERSION, "frame": "panoptic", "videos": videos, "notes": [note]}
+    name = "panoptic"
+    looks_for = f"{' or '.join(METAS)} beside ims/"
+
+    def claims(self, folder: Path) -> bool:
+        return any((folder / meta).is_file() for meta in METAS) and (folder / "ims").is_dir()
+
+    def describe(self, folder: Path, *, fps: float | None = None) -> dict[str, Any]:
+        """ValueError names file and field. ``fps``: the capture rate, assumed where it is not given."""
+        rate = STUDIO_FPS if fps is None else fps
+        videos = []
+        for name in METAS:
+            if (folder / name).is_file():
+                try:
+                    videos += _videos(read_json(folder / name), folder, rate)
+                except (KeyError, TypeError, IndexError, ValueError, AttributeError) as error:
+                    raise ValueError(
+                        f"{folder / name}: expected w, h, fn, k, w2c and cam_id; {type(error).__name__}: {error}."
+                    ) from None
+        videos.sort(key=lambda v: (len(v["name"]), v["name"]))
+        assumed = f"the layout does not store the capture rate; {rate:g} fps assumed"
+        return document(videos, "panoptic", notes=[assumed] if fps is None else [])
 
 
 def _videos(meta: dict[str, Any], folder: Path, fps: float) -> list[dict[str, Any]]:
@@ -42,7 +51,7 @@ def _videos(meta: dict[str, Any], folder: Path, fps: float) -> list[dict[str, An
     T, C = len(fn), len(fn[0])
     if k.shape != (T, C, 3, 3) or w2c.shape != (T, C, 4, 4) or any(len(row) != C for row in fn):
         raise ValueError(f"k {k.shape}, w2c {w2c.shape} and fn ({T} x {C}) do not agree")
-    out = []
+    entries = []
     for c in range(C):
         cam = str(int(meta["cam_id"][0][c]))
         poses = w2c[:, c]
@@ -63,8 +72,8 @@ def _videos(meta: dict[str, Any], folder: Path, fps: float) -> list[dict[str, An
         masks = [str(Path(row[c]).with_suffix(".png")) for row in fn]
         if (folder / "seg" / masks[0]).is_file():
             entry["masks"] = _pattern(masks, folder / "seg", "seg")
-        out.append(entry)
-    return out
+        entries.append(entry)
+    return entries
 
 
 def _pattern(names: list[str], home: Path, prefix: str) -> str | list[str]:
@@ -72,7 +81,7 @@ def _pattern(names: list[str], home: Path, prefix: str) -> str | list[str]:
     first = Path(names[0])
     pattern = f"{prefix}/{first.parent.as_posix()}/*{first.suffix}"
     if ".." not in first.parts and not first.is_absolute():
-        found = sorted(p.name for p in (home / first.parent).glob(f"*{first.suffix}"))
-        if [(first.parent / f).as_posix() for f in found] == names:
+        there = sorted(p.name for p in (home / first.parent).glob(f"*{first.suffix}"))
+        if [(first.parent / name).as_posix() for name in there] == names:
             return pattern
     return [f"{prefix}/{n}" for n in names]

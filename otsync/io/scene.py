@@ -34,6 +34,7 @@ from ..types import Camera, Video
 from .document import FORMAT, VERSION
 from .frames import ArrayFrames, FrameRange, ImageFrames, LazyFrames, VideoFrames
 from .images import read_depth, read_image, read_labels, read_mask
+from .readers import describe_folder
 
 MAX_VIDEOS, MAX_FILES = 1000, 200_000
 
@@ -76,27 +77,25 @@ class Scene:
         )
 
 
-def open_scene(path: str | os.PathLike[str], *, allow_outside: bool = False) -> Scene:
-    """Read ``scene.json``, a folder that holds one, or a folder in Panoptic layout.
+def open_scene(path: str | os.PathLike[str], *, reader: str | None = None, allow_outside: bool = False) -> Scene:
+    """Read ``scene.json``, a folder that holds one, or a folder that a reader describes in full.
 
     Args:
+        reader: the name of one of :func:`otsync.io.readers`, to read a folder with, whether it holds a ``scene.json``
+            or not; default: ``scene.json``, else the first reader that claims the folder.
         allow_outside: let the file name paths outside its own folder. Off, because a file from a stranger could
             otherwise have any file of yours read.
     """
-    document, root = read_document(path)
+    document, root = read_document(path, reader=reader)
     return scene_from_document(document, root, allow_outside=allow_outside)
 
 
-def read_document(path: str | os.PathLike[str]) -> tuple[dict[str, Any], Path]:
-    """The scene document behind ``path``, and the folder its paths are relative to."""
+def read_document(path: str | os.PathLike[str], *, reader: str | None = None) -> tuple[dict[str, Any], Path]:
+    """The scene document behind ``path``, and the folder its paths are relative to. ``reader`` as in :func:`open_scene`."""
     path = Path(path)
+    if reader is not None or (path.is_dir() and not (path / "scene.json").is_file()):
+        return describe_folder(path, reader=reader), path
     if path.is_dir():
-        from .panoptic import describe_panoptic, is_panoptic
-
-        if not (path / "scene.json").is_file():
-            if is_panoptic(path):
-                return describe_panoptic(path), path
-            raise ValueError(f"{path}: expected a scene.json in this folder; found none. Run: otsync init {path}")
         path = path / "scene.json"
     document = read_json(path)
     if not isinstance(document, dict) or document.get("format") != FORMAT:
@@ -113,7 +112,8 @@ def scene_from_document(document: dict[str, Any], root: Path, *, allow_outside: 
         raise ValueError(f"scene.videos: expected a list of 1 to {MAX_VIDEOS} videos; found {_short(entries)}.")
     if document.get("missing"):
         raise ValueError(
-            f"scene.json: still missing: {_short(document['missing'])}. Fill it in, then delete 'missing'."
+            f"scene.json: still missing: {_short(document['missing'])}. Write the file with otsync init, fill it in, then "
+            "delete 'missing'."
         )
     builder = Paths(root, allow_outside)
     built = [_video(entry, n, builder) for n, entry in enumerate(entries)]

@@ -1,7 +1,13 @@
-"""What pixels tell before any synchronisation: masks, flow, point tracks, features, depth. One leaf per prior.
+"""From pixels, before any synchronisation: masks, flow, point tracks, features, depth.
 
-A prior is an object in a slot (a frozen dataclass, called with frames); its parameters and the content of its input
-make the key under which :class:`Cache` keeps the result.
+slots.py        what goes into the slots of tracking
+working.py      frames at the resolution that priors work at
+masks.py        which pixels move
+flow.py         optical flow between neighbouring frames
+points.py       point tracks
+features.py     descriptors of tracks
+stereo.py       depth of tracked points of a rig by visual hull and correlation
+dense.py        the same at every pixel of a mask
 """
 
 from ..files.cache import Cache
@@ -9,16 +15,32 @@ from .features import Daisy, LabHistogram
 from .flow import DISFlow
 from .masks import FlowResidual, GivenMasks, MedianBackground
 from .points import ChainedFlow
+from .slots import Describer, Masker, Tracker
 from .working import WorkingFrames
 
 __all__ = [
+    "DESCRIBERS",
+    "MASKERS",
+    "TRACKERS",
     "Cache",
     "ChainedFlow",
     "DISFlow",
     "Daisy",
+    "Describer",
     "FlowResidual",
     "GivenMasks",
     "LabHistogram",
+    "Masker",
     "MedianBackground",
+    "Tracker",
     "WorkingFrames",
 ]
+
+MASKERS = (MedianBackground, FlowResidual)
+"""Maskers that the shell offers; plugins come on top."""
+
+TRACKERS = (ChainedFlow,)
+"""Trackers of points that the shell offers; plugins come on top."""
+
+DESCRIBERS = (LabHistogram, Daisy)
+"""Describers of tracks that the shell offers; plugins come on top."""

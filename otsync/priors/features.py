@@ -4,20 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from .working import WorkingFrames, bilinear
-
-
-class Describer(Protocol):
-    """The ``features`` slot."""
-
-    def __call__(
-        self, frames: WorkingFrames, masks: Sequence[np.ndarray], uv: Float[np.ndarray, "N T 2"], fps: float
-    ) -> Float[np.ndarray, "N D"]: ...
 
 
 @dataclass(frozen=True)
@@ -102,8 +94,8 @@ class Daisy:
         total = np.zeros((len(uv), (self.rings * self.spokes + 1) * self.directions))
         for k, at in samples(np.isfinite(uv[..., 0]), self.every * fps / 30):
             inside = np.clip(uv[at, k], 0, np.array(frames.size) - 1)
-            _, found = daisy.compute(frames.gray(k), [cv2.KeyPoint(float(x), float(y), 1.0) for x, y in inside])
-            total[at] += np.nan_to_num(found)
+            _, rings = daisy.compute(frames.gray(k), [cv2.KeyPoint(float(x), float(y), 1.0) for x, y in inside])
+            total[at] += np.nan_to_num(rings)
         norm = np.linalg.norm(total, axis=1, keepdims=True)
         return np.where(norm > 1e-6, total, 1.0) / np.where(norm > 1e-6, norm, np.sqrt(total.shape[1]))
 

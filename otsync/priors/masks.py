@@ -1,24 +1,19 @@
-"""What moves: foreground masks of a video at working resolution."""
+"""Foreground masks: which pixels of a video move, at working resolution."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 from jaxtyping import Bool
 
 from ..compute.indices import evenly
+from ..files.digest import sequence_key
+from ..geometry import fundamental, sampson
 from ..types import Camera
 from .flow import DISFlow
 from .working import WorkingFrames
-
-
-class Masker(Protocol):
-    """The ``masks`` slot: frames in, (T,h,w) foreground out."""
-
-    def __call__(self, frames: WorkingFrames, camera: Camera) -> Bool[np.ndarray, "T h w"]: ...
 
 
 @dataclass(frozen=True)
@@ -52,6 +47,11 @@ class GivenMasks:
 
     masks: Sequence[np.ndarray]
 
+    @property
+    def cache_key(self) -> tuple[str, str]:
+        """The pixels of the masks, wherever they come from."""
+        return "given", sequence_key(self.masks)
+
     def __call__(self, frames: WorkingFrames, camera: Camera) -> Bool[np.ndarray, "T h w"]:
         return np.stack([frames.mask(np.asarray(m)) for m in self.masks])
 
@@ -73,8 +73,6 @@ class FlowResidual:
     flow: DISFlow = field(default_factory=DISFlow)
 
     def __call__(self, frames: WorkingFrames, camera: Camera) -> Bool[np.ndarray, "T h w"]:
-        from ..geometry import fundamental, sampson
-
         T, (w, h) = len(frames), frames.size
         grid = np.stack(np.meshgrid(np.arange(w), np.arange(h)), -1).reshape(-1, 2).astype(float)
         out = np.zeros((T, h, w), bool)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -55,6 +55,33 @@ class Rig:
         return cls(frames, tuple(masks), tuple(v.camera for v in videos), index)
 
 
+class TrackDepth(Protocol):
+    """The ``stereo`` slot: depth of point tracks, from a rig whose videos are on one clock."""
+
+    @property
+    def min_views(self) -> int:
+        """Static videos that it needs at least."""
+        ...
+
+    def __call__(
+        self,
+        rig: Rig,
+        uv: Sequence[Float[np.ndarray, "N T 2"]],
+        cache: Cache | None = None,
+        key: tuple[Any, ...] = (),
+        map: MapLike = map,
+    ) -> list[Float[np.ndarray, "N T"]]:
+        """Depth along z of every track point (undistorted camera pixels, nan unseen), in world units, 0 unknown.
+
+        Args:
+            cache: where parts of the work are kept, so that a run that was killed continues. It looks them up by
+                ``key``, by itself, and by ``rig.index`` and ``uv``.
+            key: what the rig's pixels, masks and cameras are; empty: unknown, so nothing may be kept.
+            map: any map-like callable, over parts that do not depend on each other.
+        """
+        ...
+
+
 @dataclass(frozen=True)
 class HullStereo:
     """Depth at given pixels: where the ray enters the visual hull, then the best correlation up to a limb behind it.
@@ -100,10 +127,10 @@ class HullStereo:
             return keep.arrays("stereo", (*key, first), lambda: self._chunk(rig, space, uv, first))
 
         depth = [np.zeros(x.shape[:2], np.float32) for x in uv]
-        for found in map(part, starts):
+        for arrays in map(part, starts):
             for v, out in enumerate(depth):
-                frames = found[f"frames{v}"]
-                out[:, frames] = found[f"depth{v}"]
+                frames = arrays[f"frames{v}"]
+                out[:, frames] = arrays[f"depth{v}"]
         return depth
 
     def _chunk(self, rig: Rig, space: Space, uv: Sequence[np.ndarray], first: int) -> dict[str, np.ndarray]:
@@ -228,13 +255,13 @@ class Space:
         box = cls(P, K, rig.cameras, order, unit, low, dims, near, far)
         # where anything is ever occupied, from a few moments
         full = np.flatnonzero((rig.index >= 0).sum(1) >= stereo.min_views)
-        found = []
+        occupied = []
         for s in full[:: max(1, len(full) // 12)]:
             present = np.flatnonzero(rig.index[s] >= 0)
             masks = box.masks(rig, int(s), present, round(coarse / unit * 160))
             grid = carve(masks, masks, P[present], low, coarse, dims, 4, stereo.min_views, stereo.misses, near)
-            found.append(np.argwhere(grid))
-        corners = np.concatenate(found) if found else np.zeros((0, 3), int)
+            occupied.append(np.argwhere(grid))
+        corners = np.concatenate(occupied) if occupied else np.zeros((0, 3), int)
         if len(corners) == 0:
             raise ValueError(
                 "masks: expected foreground that the views agree on; their visual hull is empty. Check masks, camera "

@@ -1,7 +1,17 @@
-"""From recordings to offsets: tracking, lifting, routes, and what is checked before."""
+"""From recordings to offsets: tracking, lifting, routes, and what is checked before.
+
+tracking.py     masks, point tracks and descriptors of one video
+lift.py         positions in space from pixels and depth
+stages.py       the slots of a run, and what stands in them
+routes.py       which way from a scene to offsets, in which stages
+kept_pairs.py   pairs of videos kept on disk
+dense_depth.py  depth maps of synchronised recordings
+check.py        otsync check: what commonly goes wrong in a recording
+"""
 
 from .check import check_scene
 from .dense_depth import depth_maps
-from .routes import Stages, Synchronized, synchronize_scene
+from .routes import Synchronized, synchronize_scene
+from .stages import Stages, stages_from
 
-__all__ = ["Stages", "Synchronized", "check_scene", "depth_maps", "synchronize_scene"]
+__all__ = ["Stages", "Synchronized", "check_scene", "depth_maps", "stages_from", "synchronize_scene"]

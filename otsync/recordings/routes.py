@@ -7,7 +7,7 @@ Routes::
     stereo    a static rig            the epipolar route, then hull and stereo at its offsets, then the tracks route
 
 Rolling shutters of declared readout are undone once on every route: pixels where pairs are compared
-(:func:`otsync.synchronize`), positions after lifting (:class:`otsync.lift.Lift`), which needs the images' own pixels. Hull
+(:func:`otsync.synchronize`), positions after lifting (:class:`otsync.recordings.lift.Lift`), which needs the images' own pixels. Hull
 and stereo compare rows of several cameras as if they were of one moment: what moves gets a depth that mixes moments up
 to half the sum of both readouts apart.
 
@@ -25,57 +25,23 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..align.likelihood import LikelihoodScan
-from ..align.slot import Aligner
 from ..clocks.shutter import check_within_a_frame
 from ..compute.threads import MapLike
-from ..costs.linear import Cosine, Labels
-from ..costs.positions import CurveDistance
-from ..epipolar.refine import EpipolarRefine
-from ..epipolar.scan import EpipolarScan
 from ..files.cache import Cache
-from ..files.digest import content_key
+from ..files.digest import content_key, sequence_key
 from ..geometry import seen_pixels
 from ..io.scene import Scene
-from ..match.candidates import Candidates
-from ..match.slot import Matcher
-from ..priors.stereo import HullStereo, Rig
-from ..progress import Stopwatch, Tell
-from ..refine.slot import Refiner
-from ..refine.splines import SplineRefine
-from ..sync.graph import Graph
+from ..priors.slots import cache_key
+from ..priors.stereo import Rig
+from ..progress import Progress, Tell
 from ..sync.verb import synchronize
 from ..types import Offsets, Status, TrackSet, Video
 from .kept_pairs import KeptPairs
-from .lift import Lift, depth_at
-from .tracking import Selection, Tracking, pixel_tracks, track_labels
+from .lift import depth_at
+from .stages import Stages, with_labels
+from .tracking import pixel_tracks, track_labels
 
 Route = Literal["auto", "tracks", "epipolar", "stereo"]
-
-COLOUR = 3.0
-"""Weight of the colour histograms beside the curve distance: what separates limbs that run close together."""
-
-LABELS = 3.0
-"""Weight of given labels: a track of another thing costs as much as the largest distance in space."""
-
-
-@dataclass(frozen=True)
-class Stages:
-    """The objects in the slots of every stage."""
-
-    tracking: Tracking = field(default_factory=Tracking)
-    selection: Selection = field(default_factory=Selection)
-    stereo: HullStereo = field(default_factory=HullStereo)
-    lift: Lift = field(default_factory=Lift)
-    graph: Graph = field(default_factory=Graph)
-    epipolar_matcher: Matcher = field(default_factory=lambda: Candidates(20, None))
-    epipolar_aligner: Aligner = field(default_factory=EpipolarScan)
-    epipolar_refiner: Refiner = field(default_factory=EpipolarRefine)
-    matcher: Matcher = field(
-        default_factory=lambda: Candidates(2, 200, (Cosine(weight=COLOUR, center=False), CurveDistance()))
-    )
-    aligner: Aligner = field(default_factory=LikelihoodScan)
-    refiner: Refiner = field(default_factory=SplineRefine)
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,54 +87,40 @@ def synchronize_scene(
     chosen, why = choose_route(scene, route, stages)
     for line in why:
         tell(line)
-    clock = Stopwatch(tell)
-    raw = track_all(scene, stages, cache, map, tell)
-    clock.lap("tracks")
+    progress = Progress(tell)
+    with progress.stage("tracks"):
+        raw = track_all(scene, stages, cache, map, tell)
     if chosen == "tracks":
-        lifted = lift_given(scene, raw, stages, cache, map)
-        clock.lap("lift")
-        offsets = pairs_in_space(lifted, reference, stages, cache, map)
-        clock.lap("synchronise")
-        return Synchronized(without_times(offsets), tuple(lifted), chosen, why, None, clock.seconds)
-    flat = [select(video, r, stages, scene.frame) for video, r in zip(scene.videos, raw, strict=True)]
-    first = without_times(pairs_in_pixels(flat, reference, stages, cache, map))
-    clock.lap("epipolar")
+        with progress.stage("lift"):
+            lifted = lift_given(scene, raw, stages, cache, map)
+        with progress.stage("synchronise"):
+            offsets = pairs_in_space(lifted, reference, stages, cache, map)
+        return Synchronized(without_times(offsets), tuple(lifted), chosen, why, None, progress.seconds)
+    with progress.stage("epipolar"):
+        flat = [select(video, r, stages, scene.frame) for video, r in zip(scene.videos, raw, strict=True)]
+        first = without_times(pairs_in_pixels(flat, reference, stages, cache, map))
+    epipolar = Synchronized(first, tuple(flat), "epipolar", why, None, progress.seconds)
     if chosen == "epipolar":
-        return Synchronized(first, tuple(flat), chosen, why, None, clock.seconds)
+        return epipolar
     doubt = _too_doubtful(first, stages)
     if doubt:
-        why = (*why, doubt)
         tell(doubt)
-        return Synchronized(first, tuple(flat), "epipolar", why, None, clock.seconds)
-    depth = stereo_depth(scene, flat, first, stages, cache, map)
-    lifted = [stages.lift(t, z) for t, z in zip(flat, depth, strict=True)]
-    clock.lap("stereo")
+        return replace(epipolar, why=(*why, doubt))
+    with progress.stage("stereo"):
+        depth = stereo_depth(scene, flat, first, stages, cache, map)
+        lifted = [stages.lift(t, z) for t, z in zip(flat, depth, strict=True)]
     bare = [t.name for t in lifted if len(t) == 0]
     if bare:
-        line = f"stereo found no depth for {', '.join(bare)}: the epipolar answer stands"
-        tell(line)
-        return Synchronized(first, tuple(flat), "epipolar", (*why, line), None, clock.seconds)
-    offsets = without_times(pairs_in_space(lifted, reference, stages, cache, map))
-    clock.lap("synchronise")
+        doubt = f"stereo found no depth for {', '.join(bare)}: the epipolar answer stands"
+        tell(doubt)
+        return replace(epipolar, why=(*why, doubt))
+    with progress.stage("synchronise"):
+        offsets = without_times(pairs_in_space(lifted, reference, stages, cache, map))
     if _flagged(offsets) > _flagged(first):
-        line = "the lifted tracks leave more doubt than the pixels did: the epipolar answer stands"
-        tell(line)
-        return Synchronized(first, tuple(flat), "epipolar", (*why, line), None, clock.seconds)
-    return Synchronized(offsets, tuple(lifted), chosen, why, first, clock.seconds)
-
-
-def with_labels(stages: Stages, scene: Scene) -> Stages:
-    """The stages with the cost of labels in both matchers, when every video of the scene has labels."""
-    if not scene.labels or any(labels is None for labels in scene.labels):
-        return stages
-
-    def told(matcher: Matcher) -> Matcher:
-        costs = getattr(matcher, "costs", None)
-        if costs is None or any(isinstance(c, Labels) for c in costs):
-            return matcher
-        return replace(matcher, costs=(*costs, Labels(weight=LABELS)))  # type: ignore[type-var]
-
-    return replace(stages, epipolar_matcher=told(stages.epipolar_matcher), matcher=told(stages.matcher))
+        doubt = "the lifted tracks leave more doubt than the pixels did: the epipolar answer stands"
+        tell(doubt)
+        return replace(epipolar, why=(*why, doubt))
+    return Synchronized(offsets, tuple(lifted), chosen, why, first, progress.seconds)
 
 
 def choose_route(scene: Scene, route: Route, stages: Stages) -> tuple[str, tuple[str, ...]]:
@@ -222,7 +174,7 @@ def track_all(
         found = stages.tracking(video, masks, cache)
         if labels is not None:
             size, uv = (video.camera.width, video.camera.height), found["uv"]
-            key = (_digest(labels), size, content_key(uv))
+            key = (sequence_key(labels), size, content_key(uv))
             found |= cache.arrays("labels", key, lambda: {"labels": track_labels(labels, uv, size)})
         done.append(video.name)
         spent = time.perf_counter() - started
@@ -295,7 +247,7 @@ def lift_given(
         keep = rich(found["uv"], video.camera.width, video.fps or 30.0)
         uv = found["uv"][keep]
         flat = select(video, found, replace(stages, selection=rich), scene.frame)
-        key = (stages.tracking.key(video, None), _digest(video.depth), content_key(uv))
+        key = (stages.tracking.key(video, None), sequence_key(video.depth or []), content_key(uv))
         depth = cache.arrays("depth", key, lambda: {"z": depth_at(video.depth or [], flat, uv)})["z"]
         lifted = stages.lift(flat, depth)
         chosen = lifted.take(stages.selection(seen_pixels(lifted), video.camera.width, video.fps or 30.0))
@@ -331,7 +283,7 @@ def rig_at(
     poses = [
         (c.K.tobytes(), c.w2c.tobytes(), None if c.distortion is None else c.distortion.tobytes()) for c in rig.cameras
     ]
-    return rig, (*pixels, stages.tracking.masker, stages.tracking.width, content_key(*poses))
+    return rig, (*pixels, cache_key(stages.tracking.masker), stages.tracking.width, content_key(*poses))
 
 
 def without_times(offsets: Offsets) -> Offsets:
@@ -361,8 +313,3 @@ def _too_doubtful(first: Offsets, stages: Stages) -> str:
     if len(doubtful) > len(first) / 2:
         return f"no stereo: the epipolar offsets of {', '.join(doubtful)} are doubtful"
     return ""
-
-
-def _digest(frames: Any) -> str:
-    digest = getattr(frames, "digest", None)
-    return digest() if digest is not None else content_key(*[None if f is None else np.asarray(f) for f in frames])

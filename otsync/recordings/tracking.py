@@ -1,4 +1,4 @@
-"""From a video's priors to its track set: which point tracks to keep, what describes them, where they are in space."""
+"""Tracking one video: masks, point tracks and descriptors, each kept on disk; and which tracks are worth keeping."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..files.cache import Cache
-from ..files.digest import content_key
-from ..priors.features import Describer, LabHistogram
-from ..priors.masks import FlowResidual, GivenMasks, Masker, MedianBackground
+from ..files.digest import content_key, sequence_key
+from ..priors.features import LabHistogram
+from ..priors.masks import FlowResidual, GivenMasks, MedianBackground
 from ..priors.points import ChainedFlow
+from ..priors.slots import Describer, Masker, Tracker, cache_key
 from ..priors.working import WIDTH, WorkingFrames
 from ..types import Camera, TrackSet, Video
 
@@ -78,17 +79,17 @@ def track_labels(
         uv: pixels of the images as they are, with distortion, nan unseen. size: width and height of those images.
     """
     seen = np.isfinite(uv[..., 0])
-    found = np.zeros(seen.shape, np.int64)
+    under = np.zeros(seen.shape, np.int64)
     for k in range(uv.shape[1]):
         at = np.flatnonzero(seen[:, k])
         if len(at):
             image = np.asarray(images[k])
             h, w = image.shape
             x, y = np.floor(uv[at, k] * np.array([w, h]) / np.array(size)).astype(int).T
-            found[at, k] = image[np.clip(y, 0, h - 1), np.clip(x, 0, w - 1)]
-    names, index = np.unique(found, return_inverse=True)
+            under[at, k] = image[np.clip(y, 0, h - 1), np.clip(x, 0, w - 1)]
+    names, index = np.unique(under, return_inverse=True)
     votes = np.zeros((len(uv), len(names)), int)
-    np.add.at(votes, (np.nonzero(seen)[0], index.reshape(found.shape)[seen]), 1)
+    np.add.at(votes, (np.nonzero(seen)[0], index.reshape(under.shape)[seen]), 1)
     votes[:, names == 0] = 0
     winner = votes.argmax(1)
     sure = votes.max(1) * 2 > seen.sum(1)
@@ -114,13 +115,14 @@ class Tracking:
 
     Args:
         masker: default: given masks where there are any, else the median background of a static camera, else the
-            flow residual of a moving one.
-        features: colours, or :class:`otsync.priors.Daisy`; any object with that call.
+            flow residual of a moving one. One that is named is used even where masks are given.
+        points: optical flow that is chained. features: colours, or :class:`otsync.priors.Daisy`. Any object with the
+            call of its slot (:mod:`otsync.priors.slots`) will do.
         width: working resolution; larger frames are reduced to it.
     """
 
     masker: Masker | None = None
-    points: ChainedFlow = field(default_factory=ChainedFlow)
+    points: Tracker = field(default_factory=ChainedFlow)
     features: Describer = field(default_factory=LabHistogram)
     width: int = WIDTH
 
@@ -133,8 +135,8 @@ class Tracking:
         """
         cache = cache or Cache()
         frames = WorkingFrames(video.frames, (video.camera.width, video.camera.height), self.width)
-        content = self.key(video, masks)
         fps = video.fps or 30.0
+        priors = [cache_key(prior) for prior in (self.masker, self.points, self.features)]
 
         def track() -> dict[str, np.ndarray]:
             started = time.perf_counter()
@@ -146,7 +148,7 @@ class Tracking:
             spent = np.diff([started, masked, tracked, time.perf_counter()])
             return {"uv": frames.to_full(uv).astype(np.float32), "features": features, "seconds": spent}
 
-        return cache.arrays("tracks", (content, self, fps), track)
+        return cache.arrays("tracks", (self.key(video, masks), *priors, self.width, fps), track)
 
     def masks(
         self, video: Video, given: Sequence[np.ndarray] | None = None, cache: Cache | None = None
@@ -158,19 +160,16 @@ class Tracking:
         if masker is None:
             moves = video.camera.w2c.ndim == 3
             masker = GivenMasks(given) if given is not None else FlowResidual() if moves else MedianBackground()
-        told = "given" if isinstance(masker, GivenMasks) else masker
 
         def compute() -> dict[str, np.ndarray]:
-            found = masker(frames, video.camera)
-            return {"bits": np.packbits(found, axis=2), "width": np.array(found.shape[2])}
+            foreground = masker(frames, video.camera)
+            return {"bits": np.packbits(foreground, axis=2), "width": np.array(foreground.shape[2])}
 
-        kept = cache.arrays("masks", (self.key(video, given), told, self.width), compute)
-        return PackedMasks(kept["bits"], int(kept["width"]))
+        packed = cache.arrays("masks", (self.key(video, given), cache_key(masker), self.width), compute)
+        return PackedMasks(packed["bits"], int(packed["width"]))
 
     def key(self, video: Video, masks: Sequence[np.ndarray] | None) -> str:
         """What the pixels and poses of a video are, for the cache."""
-        pixels = getattr(video.frames, "digest", None)
-        content = pixels() if pixels is not None else content_key(*[np.asarray(f) for f in video.frames])
-        mask_digest = getattr(masks, "digest", None)
         poses = video.camera.w2c if video.camera.w2c.ndim == 3 else None
-        return content_key(content, mask_digest() if mask_digest else masks is None, video.camera.K, poses)
+        given = None if masks is None else sequence_key(masks)
+        return content_key(sequence_key(video.frames), given, video.camera.K, poses)

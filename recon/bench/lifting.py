@@ -174,7 +174,7 @@ def matched(sources: Sequence[dict[str, TrackSet]], cameras: Sequence[Any]) -> l
     from otsync.match.anchored import AnchoredFGW
     from otsync.match.candidates import Candidates
     from otsync.match.dense import FusedGromovWasserstein, OptimalTransport
-    from otsync.recordings.routes import COLOUR
+    from otsync.recordings.stages import COLOUR
 
     both = (Cosine(weight=COLOUR, center=False), CurveDistance())
     matchers: dict[str, tuple[Any, int | None]] = {

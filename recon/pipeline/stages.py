@@ -38,8 +38,9 @@ MANY: dict[str, Any] = {"count": 700, "min_life": 10, "apart": 4.0}
 def lifted_tracks(scene: Scene, offsets: Offsets, cache: Any, map: MapLike, progress: Progress) -> tuple[TrackSet, ...]:
     """Tracks in space of every video that has some: by given depth, else by hull and stereo at the offsets."""
     from otsync.recordings import routes as recordings
+    from otsync.recordings.tracking import Selection
 
-    stages = replace(recordings.Stages(), selection=recordings.Selection(**MANY))
+    stages = replace(recordings.Stages(), selection=Selection(**MANY))
     raw = recordings.track_all(scene, stages, cache, map, progress.tell)
     flat: list[TrackSet | None] = []
     for video, found in zip(scene.videos, raw, strict=True):

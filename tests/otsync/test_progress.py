@@ -1,4 +1,4 @@
-"""Bars: on a terminal, for what takes its time; nothing elsewhere, and nothing changed."""
+"""Bars on a terminal and nowhere else, which change nothing; notes and times of stages."""
 
 from __future__ import annotations
 
@@ -63,3 +63,16 @@ def test_simulations_and_benchmarks_are_counted(attach, tmp_path):
     told = terminal.getvalue()
     assert "shutters, clean, 2 videos:   0%" in told and "0/2" in told
     assert [a == b for a, b in zip(few, more, strict=True)] == [False] * 3 + [True] * 3  # of many videos the first seed
+
+
+def test_stages_are_timed_and_notes_are_told_once():
+    told = []
+    kept = progress.Progress(told.append)
+    for _ in range(2):
+        with kept.stage("reading"):
+            kept.note("one frame is damaged")
+    assert kept.notes == ["one frame is damaged"] and list(kept.seconds) == ["reading"]
+    assert [line.split(":")[0] for line in told] == ["note", "reading", "reading"]
+    with pytest.raises(KeyError), kept.stage("writing"):
+        raise KeyError
+    assert list(kept.seconds) == ["reading"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +12,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from otsync.cli import main
 from otsync.files.arrays import write_npz
-from otsync.io import ImageFrames, VideoFrames, describe_folder, open_scene
-from otsync.io.document import FORMAT, VERSION, write_document
+from otsync.io import READERS, ImageFrames, VideoFrames, describe_folder, find_reader, open_scene, readers
+from otsync.io.document import FORMAT, VERSION, document, write_document
 from otsync.io.frames import _Errors
 from otsync.io.images import read_depth, read_image, read_mask
+from otsync.io.mend import keep_frames
+from otsync.plugins import forget, register
 from tests.recording_world import ring
 
 GUARD = settings(
@@ -288,14 +292,14 @@ def test_sizes_that_a_damaged_video_makes_up_are_no_lack_of_memory():
 def test_init_names_what_is_missing(folder):
     (folder / "scene.json").unlink()
     write_video(folder / "third.mp4", [3000 * k for k in range(10)])
-    document = describe_folder(folder)
-    assert [v["name"] for v in document["videos"]] == ["third", "left", "right"]
-    assert any("left" in m and "fps" in m for m in document["missing"])
-    assert not any("third" in m and "fps" in m for m in document["missing"])
-    (folder / "scene.json").write_text(json.dumps(document))
+    described = describe_folder(folder)
+    assert [v["name"] for v in described["videos"]] == ["third", "left", "right"]
+    assert any("left" in m and "fps" in m for m in described["missing"])
+    assert not any("third" in m and "fps" in m for m in described["missing"])
+    (folder / "scene.json").write_text(json.dumps(described))
     with pytest.raises(ValueError, match="missing"):
         open_scene(folder)
-    with pytest.raises(ValueError, match="video files"):
+    with pytest.raises(ValueError, match=r"panoptic: .*ims/.*video-files: .*image-folders: "):
         describe_folder(folder / "left")
 
 
@@ -334,3 +338,82 @@ def test_the_papers_scene_opens(data):
     assert {len(v.frames) for v in scene.videos} == {150}
     assert scene.videos[3].frames[149].shape == (360, 640, 3)
     assert sum(m is not None for m in scene.masks) == 14
+
+
+def test_the_first_reader_that_claims_a_folder_takes_it_and_a_named_one_goes_before(folder):
+    (folder / "scene.json").unlink()
+    assert find_reader(folder)[0] == "image-folders"
+    write_video(folder / "third.mp4", [3000 * k for k in range(10)])
+    assert find_reader(folder)[0] == "videos-and-images"
+    assert [v["name"] for v in describe_folder(folder, reader="video-files")["videos"]] == ["third"]
+    assert [v["name"] for v in describe_folder(folder, reader="image-folders")["videos"]] == ["left", "right"]
+    with pytest.raises(ValueError, match=r"panoptic: train_meta.json .*; found none"):
+        find_reader(folder, "panoptic")
+    with pytest.raises(ValueError, match=r"reader: expected one of panoptic, .*; found 'panoptik'"):
+        find_reader(folder, "panoptik")
+
+
+def test_an_option_that_a_reader_does_not_take_is_refused(folder):
+    (folder / "scene.json").unlink()
+    assert describe_folder(folder, fps=25.0)["videos"][0]["fps"] == 25.0
+    write_video(folder / "third.mp4", [3000 * k for k in range(10)])
+    with pytest.raises(ValueError, match="fps: the reader video-files does not take it"):
+        describe_folder(folder, reader="video-files", fps=25.0)
+
+
+class Slides:
+    """Folders that hold a file named slides.txt."""
+
+    def claims(self, folder):
+        return (folder / "slides.txt").is_file()
+
+    def describe(self, folder, *, fps=10.0):
+        return document([entry("left", fps=fps), entry("right", fps=fps)], "stage")
+
+
+@pytest.mark.parametrize("thing", [Slides, Slides()], ids=["class", "object"])
+def test_a_registered_reader_is_asked_first_and_opens_its_folders(folder, thing):
+    (folder / "scene.json").unlink()
+    (folder / "slides.txt").touch()
+    register("readers", "slides")(thing)
+    try:
+        assert next(iter(readers())) == "slides"
+        scene = open_scene(folder)
+        assert (scene.names, scene.frame, scene.videos[0].fps) == (("left", "right"), "stage", 10.0)
+        assert describe_folder(folder, fps=20.0)["videos"][0]["fps"] == 20.0
+        (folder / "slides.txt").unlink()
+        with pytest.raises(ValueError, match="missing"):
+            open_scene(folder)
+        with pytest.raises(ValueError, match=r"slides: Folders that hold a file named slides.txt"):
+            open_scene(folder, reader="slides")
+    finally:
+        forget(thing)
+    assert "slides" not in readers()
+
+
+def test_the_readers_of_otsync_are_asked_from_the_most_special_to_the_most_general():
+    assert list(readers()) == [reader.name for reader in READERS]
+    assert [reader.name for reader in READERS] == ["panoptic", "videos-and-images", "video-files", "image-folders"]
+
+
+def test_init_says_which_reader_took_the_folder(folder, capsys):
+    (folder / "scene.json").unlink()
+    assert main(["init", str(folder), "--fps", "30"]) == 1
+    assert "(reader: image-folders)" in capsys.readouterr().out
+    assert main(["init", str(folder), "--force", "--reader", "video-files"]) == 2
+    assert "video-files: video files" in capsys.readouterr().err
+
+
+def test_what_is_cut_from_a_scene_keeps_masks_labels_and_frames_together(folder):
+    for name in ("seg", "who"):
+        (folder / name).mkdir()
+        for k in range(12):
+            Image.fromarray(np.full((24, 32), k, np.uint8)).save(folder / name / f"f{k}.png")
+    rewrite(folder, entry("left", masks="seg/*.png", labels="who/*.png"), entry("right"))
+    scene = keep_frames(open_scene(folder), [[2, 5, 6], range(12)])
+    assert [int(f[0, 0, 0]) for f in scene.videos[0].frames] == [25, 55, 65]
+    assert scene.masks[0] is not None and len(scene.masks[0]) == 3
+    assert scene.labels[0] is not None
+    assert [int(labels[0, 0]) for labels in scene.labels[0]] == [2, 5, 6]
+    assert scene.labels[1] is None
+    assert keep_frames(replace(scene, labels=()), [[0], [1]]).labels == ()

@@ -268,6 +268,16 @@ def test_tracking_is_kept_by_the_pixels(slide, tmp_path):
     assert len(list(tmp_path.iterdir())) > len(written)
 
 
+def test_masks_are_kept_by_what_they_hold(slide, tmp_path):
+    """Given with the video, or put into the slot: other masks are never taken for them."""
+    frames, corner = slide
+    video, cache = Video(frames, CAMERA, 30.0, name="v"), Cache(tmp_path)
+    some, others = list(inside(corner, 0)), list(inside(corner, 5))
+    for given in (some, others):
+        for masks in (Tracking().masks(video, given, cache), Tracking(GivenMasks(given)).masks(video, None, cache)):
+            np.testing.assert_array_equal(np.stack(list(masks)), given)
+
+
 def test_lift_inverts_projection_and_drops_jumps():
     camera = ring(3, width=640, height=360)[1]
     xyz = paths(np.arange(60) / 30, 10, 4)

@@ -14,7 +14,7 @@ from otsync.priors import Cache
 from otsync.priors.dense import consistent, mask_pixels, neighbourhood
 from otsync.priors.stereo import HullStereo
 from otsync.recordings.dense_depth import depth_maps, reduced
-from otsync.recordings.routes import Stages
+from otsync.recordings.stages import Stages
 from otsync.types import Camera, Offsets, Video
 from tests.recording_world import FPS, H, W, exact_depth, paths, render, ring
 

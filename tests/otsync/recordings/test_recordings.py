@@ -20,10 +20,12 @@ import pytest
 from otsync.cli import main
 from otsync.files.digest import content_key
 from otsync.io import open_scene
-from otsync.priors import Cache
+from otsync.plugins import forget, register
+from otsync.priors import Cache, ChainedFlow, Daisy, MedianBackground
 from otsync.recordings.kept_pairs import KeptPairs, pack, unpack
-from otsync.recordings.routes import Stages, choose_route, synchronize_scene, with_labels, without_times
-from otsync.recordings.tracking import track_labels
+from otsync.recordings.routes import choose_route, synchronize_scene, without_times
+from otsync.recordings.stages import Stages, stages_from, with_labels
+from otsync.recordings.tracking import Tracking, track_labels
 from otsync.sync.pairs import Job, run
 from otsync.types import Offsets
 from tests.otsync.epipolar.test_epipolar import world
@@ -150,6 +152,44 @@ def test_routes_and_their_reasons(recording):
     many = replace(scene, videos=tuple(moving) * 2, masks=(None,) * 8)
     route, why = choose_route(many, "auto", Stages())
     assert route == "epipolar" and any("cameras move" in line for line in why)
+
+
+def test_priors_are_spelled_as_the_shell_spells_them():
+    base = Stages(selection=replace(Stages().selection, count=7))
+    assert stages_from(base) == base
+    made = stages_from(base, masks="median-background:threshold=20", points="chained-flow:every=5", features="daisy")
+    assert made.selection == base.selection
+    assert made.tracking == Tracking(MedianBackground(threshold=20), ChainedFlow(every=5), Daisy())
+    with pytest.raises(ValueError, match=r"--features: expected some of lab-histogram, daisy; found 'dino'"):
+        stages_from(features="dino")
+    with pytest.raises(ValueError, match=r"--points: 'chained-flow:pace=3' cannot be made"):
+        stages_from(points="chained-flow:pace=3")
+
+
+class Everything:
+    """A masker of a stranger's: all pixels."""
+
+    cache_key = "everything"
+
+    def __init__(self):
+        self.calls = []
+
+    def __call__(self, frames, camera):
+        self.calls.append(len(frames))
+        return np.ones((len(frames), frames.size[1], frames.size[0]), bool)
+
+
+def test_a_registered_masker_goes_in_its_slot_and_is_kept_by_its_own_key(recording, tmp_path):
+    masker = Everything()
+    register("maskers")(masker)
+    try:
+        tracking = stages_from(masks="everything").tracking
+        video, cache = open_scene(recording).videos[0], Cache(tmp_path)
+        for _ in range(2):
+            assert all(mask.all() for mask in tracking.masks(video, None, cache))
+        assert masker.calls == [60]
+    finally:
+        forget(masker)
 
 
 @pytest.mark.slow

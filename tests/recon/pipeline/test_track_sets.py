@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-import otsync.recordings.routes
 import recon.pipeline.stages
 from otsync.files.cache import Cache
-from otsync.files.digest import content_key
+from otsync.files.digest import content_key, sequence_key
 from otsync.io import open_scene
 from otsync.progress import Progress
 from otsync.recordings.routes import Stages
@@ -186,7 +185,7 @@ def test_frames_without_a_depth_map_are_part_of_the_key(given):
     maps = [np.asarray(z) for z in scene.videos[0].depth]
     some = [None, *maps[1:]]
     assert key(some) == key([None, *(z.copy() for z in maps[1:])]) != key(maps)
-    assert otsync.recordings.routes._digest(some) != otsync.recordings.routes._digest(maps)
+    assert sequence_key(some) != sequence_key(maps)
 
 
 def test_a_scene_begins_from_depth_of_some_frames(given):

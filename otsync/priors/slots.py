@@ -1,0 +1,50 @@
+"""The slots of tracking, and what otsync and plugins ask of the objects that go into them.
+
+A prior is a frozen dataclass (or any callable) with its parameters as fields. Its results are kept on disk under a key
+of its input and of itself: all its fields count, unless it declares ``cache_key``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ..types import Camera
+from .working import WorkingFrames
+
+
+class Masker(Protocol):
+    """The ``masker`` slot: which pixels move."""
+
+    def __call__(self, frames: WorkingFrames, camera: Camera) -> Bool[np.ndarray, "T h w"]:
+        """Foreground at working resolution. ``camera``: of the frames at full resolution, its poses known."""
+        ...
+
+
+class Tracker(Protocol):
+    """The ``points`` slot: points of the foreground followed through the frames of a video."""
+
+    def __call__(self, frames: WorkingFrames, masks: Sequence[np.ndarray], fps: float) -> Float[np.ndarray, "N T 2"]:
+        """Working pixel indices (centre of the first pixel at 0) of every track, nan where it is not followed.
+
+        ``masks``: (h,w) foreground per frame. ``fps``: of the video; frame counts are given at 30.
+        """
+        ...
+
+
+class Describer(Protocol):
+    """The ``features`` slot: what tells a track from others, whichever camera sees it."""
+
+    def __call__(
+        self, frames: WorkingFrames, masks: Sequence[np.ndarray], uv: Float[np.ndarray, "N T 2"], fps: float
+    ) -> Float[np.ndarray, "N D"]:
+        """One vector a track, compared by its direction; none is all zeros. ``uv`` as a :class:`Tracker` gives it."""
+        ...
+
+
+def cache_key(prior: Any) -> Any:
+    """What the cache tells a prior's results by: its ``cache_key`` where it declares one, else all it holds."""
+    return getattr(prior, "cache_key", prior)
