@@ -5,7 +5,7 @@ BIN    := $(VENV)/bin
 PIP    := $(BIN)/pip --disable-pip-version-check install --quiet -c constraints.txt
 WORKERS ?= 2
 
-.PHONY: demo test test-all bench stability lint format clean
+.PHONY: demo test test-all bench docs stability lint format clean
 .DELETE_ON_ERROR:
 
 $(VENV)/.core: pyproject.toml constraints.txt
@@ -35,6 +35,15 @@ lint: $(VENV)/.test
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+$(VENV)/.docs: $(VENV)/.core
+	$(PIP) -e '.[docs]'
+	touch $@
+
+docs: $(VENV)/.docs  ## the pages of docs/ as HTML in site/; fails on warnings, and on pages that load from a network
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	$(BIN)/python -m tests.docs.offline site
+	@echo "wrote site/; look at it: $(BIN)/python -m http.server --directory site"
+
 stability: $(VENV)/.test  ## docs/stability.md, from the catalogue of hard cases
 	$(BIN)/python -m otsync.bench.hard_cases.page
 
@@ -43,4 +52,4 @@ format: $(VENV)/.test
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info demo bench/out
+	rm -rf $(VENV) build dist *.egg-info demo bench/out site
