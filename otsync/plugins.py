@@ -172,7 +172,7 @@ def entries(group: str) -> dict[str, EntryPoint]:
 
 def short_name(thing: Any) -> str:
     """How the shell spells a thing: its ``name`` where it has one, else its class's or function's, with hyphens."""
-    given = getattr(thing, "name", None)
+    given = None if isinstance(thing, type) else getattr(thing, "name", None)  # a class's is a field's default
     if isinstance(given, str) and given:
         return given
     name = getattr(thing, "__name__", None) or type(thing).__name__

@@ -3,6 +3,7 @@
 core.py    the paper's ablation and its DTW, import time, the cost of no effect
 match.py   every matcher at every size; match_limits.py: what matching promises
 sync.py    aligners, refiners and graphs; sync_acceptance.py: what synchronisation promises
+hard_cases/  the catalogue of hard cases, and running it
 panoptic.py  the paper's protocol on a truly synchronised recording
 record.py  tables on disk, machine and versions, the gate against a committed baseline
 """
@@ -17,8 +18,14 @@ from typing import Any
 
 from ..plugins import entries, registered
 
-OWN = ("core", "match", "sync")
-"""Suites that need nothing but this package."""
+OWN = {
+    "core": "core",
+    "match": "match",
+    "sync": "sync",
+    "hard-cases": "hard_cases.run",
+    "panoptic": "panoptic",
+}
+"""Our own suites, and where they are."""
 
 
 def suites() -> dict[str, Callable[[], Any]]:
@@ -28,7 +35,7 @@ def suites() -> dict[str, Callable[[], Any]]:
     ValueError names two suites of one name; a call raises it where a plugin does not import.
     """
     loaders: dict[str, Callable[[], Any]] = {
-        name: partial(importlib.import_module, f"{__name__}.{name}") for name in OWN
+        name: partial(importlib.import_module, f"{__name__}.{place}") for name, place in OWN.items()
     }
     others = [(name, partial(_load, point)) for name, point in entries("benchmarks").items()]
     others += [(name, partial(_given, suite)) for name, suite in registered("benchmarks").items()]

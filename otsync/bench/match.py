@@ -29,7 +29,7 @@ from ..plugins import ENVIRONMENT, available, loaded_files
 from ..progress import counted, say
 from ..simulate import matching_world
 from ..types import Matches, TrackSet
-from . import record
+from . import match_limits, record
 from .record import table, write_rows
 
 SIZES = (200, 500, 1000, 2000, 5000, 20_000, 50_000)
@@ -93,22 +93,30 @@ def run(
     out: Path,
     *,
     sizes: tuple[int, ...] = SIZES,
-    seeds: int = 2,
-    first_seed: int = 9000,
+    seeds: int | None = None,
+    first_seed: int | None = None,
     limit: float = 60.0,
     only: tuple[str, ...] = (),
+    promises: bool = False,
     gate: bool = False,
     rebase: bool = False,
 ) -> int:
     """Measure every matcher at every size; print the table, write CSV, JSON and the plot.
 
     Args:
-        seeds: worlds per cell; fixed, and nothing is tuned on them.
+        seeds: worlds per cell, from ``first_seed`` on; nothing is tuned on them. Default: 2 from 9000; the promises' own.
+        promises: measure the limits of matching (:mod:`otsync.bench.match_limits`) instead.
         limit: CPU seconds per world; a matcher is not tried at sizes where it is expected to take longer.
         only: names of matchers; default: all of :func:`contenders`.
         gate: compare with the committed baseline, 1 when something got worse. rebase: make this run the baseline.
             Neither looks at matchers without a row in :data:`MATCHERS`, or at other packages' without one there.
     """
+    if promises:
+        if only:
+            raise ValueError("only, promises: expected one of them; found both. The promises are of AnchoredFGW.")
+        chosen = {"seeds": seeds, "first_seed": first_seed}
+        return match_limits.run(out, **{name: value for name, value in chosen.items() if value is not None})
+    seeds, first_seed = 2 if seeds is None else seeds, 9000 if first_seed is None else first_seed
     every, rows = contenders(), []  # type: dict[str, tuple[MatcherLike, int]], list[dict[str, Any]]
     if not set(only) <= set(every):
         raise ValueError(f"only: expected some of {', '.join(every)}; found {', '.join(set(only) - set(every))}.")

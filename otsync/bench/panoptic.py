@@ -75,16 +75,19 @@ class Protocol:
 
 
 def run(
-    scene: str | os.PathLike[str],
     out: Path,
     *,
+    scene: str | os.PathLike[str],
     json: bool = False,
     cache: Path | None = None,
+    first_seed: int | None = None,
     protocol: Protocol | None = None,
     routes: tuple[str, ...] = ("paper", "default", "depth-free"),
 ) -> int:
     """Measure, print the table, write CSV, JSON and a plot to ``out``; with ``json`` one line on standard output."""
     protocol = protocol or Protocol()
+    if first_seed is not None:
+        protocol = replace(protocol, seed=first_seed)
     tell: Callable[[str], None] = (lambda text: None) if json else print
     opened = open_scene(scene)
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import dataclasses
+import inspect
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import tyro
 
-SUITES = {
-    "core": "otsync.bench.core",
-    "match": "otsync.bench.match",
-    "sync": "otsync.bench.sync",
-    "raster": "recon.bench_raster",
-}
+from ..bench import suites
+
+BENCH_OPTIONS = ("scene", "gate", "rebase", "promises", "first_seed", "seeds", "only", "json", "cache")
+"""Options that a suite may take: each is handed on when it is set, and refused by suites that do not take it."""
+
+
+def suite_names() -> Any:
+    """The type of the suite: one of those that there are when the command line is parsed."""
+    return Literal[(*suites(), "all")]
 
 
 @dataclass
@@ -22,12 +27,15 @@ class Bench:
 
     Example: otsync bench sync --out bench/out --gate
 
+    Your own matcher through the catalogue of hard cases: otsync --plugin mine.py bench hard-cases --only my-matcher
+
     On a truly synchronised recording: otsync bench panoptic recording/ --json
     """
 
-    suite: tyro.conf.Positional[Literal["core", "match", "sync", "raster", "panoptic", "all"]]
+    suite: tyro.conf.Positional[suite_names()]
+    """Which benchmark; "all": every one that needs no recording."""
     scene: tyro.conf.Positional[Path | None] = None
-    """For panoptic: a truly synchronised recording (its folder or scene.json). "all" leaves it out."""
+    """For panoptic: a truly synchronised recording (its folder or scene.json)."""
     out: Path = Path("bench/out")
     """Folder for CSV, JSON and plots."""
     gate: bool = False
@@ -37,52 +45,59 @@ class Bench:
     promises: bool = False
     """For sync and match: measure what is promised, on fresh seeds, instead of the tables."""
     first_seed: int | None = None
-    """For core, match and sync: where the seeds begin; for panoptic: its seed; default: the suite's own."""
+    """For core, match, sync and panoptic: where the seeds begin; default: the suite's own."""
     seeds: int | None = None
     """For core, match and sync: how many seeds; default: the suite's own."""
+    only: tuple[str, ...] = ()
+    """For match and hard-cases: names of the solvers to run; default: all."""
     json: bool = False
     """For panoptic: one line of JSON on standard output instead of tables."""
     cache: Path | None = None
     """For panoptic: where tracks and depth are kept; default: stages in --out."""
 
     def run(self) -> int:
-        import importlib
+        self._check()
+        defaults = {field.name: field.default for field in dataclasses.fields(self)}
+        given = {n: getattr(self, n) for n in BENCH_OPTIONS if getattr(self, n) != defaults[n]}
+        every = suites()
+        if self.suite != "all":
+            return self._run(self.suite, every[self.suite](), given)
+        loaded = {name: load() for name, load in every.items()}
+        alone = {name: suite for name, suite in loaded.items() if not needs_more(suite)}
+        return max(self._run(name, suite, given) for name, suite in alone.items())
 
+    def _run(self, name: str, suite: Any, given: dict[str, Any]) -> int:
+        takes = inspect.signature(suite.run).parameters
+        anything = any(p.kind is p.VAR_KEYWORD for p in takes.values())
+        for option in given:
+            if option not in takes and not anything:
+                options = ", ".join(spelled(o) for o in BENCH_OPTIONS if o in takes) or "none of them"
+                raise ValueError(f"{spelled(option)}: benchmark {name} does not take it. It takes {options}.")
+        if "scene" in needs_more(suite) and "scene" not in given:
+            raise ValueError(f"scene: expected a recording: otsync bench {name} SCENE.")
+        return suite.run(self.out, **given)
+
+    def _check(self) -> None:
         if self.gate and self.rebase:
             raise ValueError("--gate, --rebase: expected one of them; a run is no judge of itself.")
-        drawn = self._seeds()
-        if self.suite == "panoptic":
-            if self.scene is None:
-                raise ValueError("scene: expected a recording: otsync bench panoptic SCENE.")
-            from ..bench import panoptic
-
-            protocol = panoptic.Protocol() if self.first_seed is None else panoptic.Protocol(seed=self.first_seed)
-            return panoptic.run(self.scene, self.out, json=self.json, cache=self.cache, protocol=protocol)
-        if self.promises:
-            from ..bench import match_limits
-            from ..bench import sync as sync_bench
-
-            if self.suite not in ("match", "sync"):
-                raise ValueError(f"--promises: expected suite match or sync; found {self.suite}.")
-            if self.suite == "match":
-                return match_limits.run(self.out, **drawn)
-            return sync_bench.run(self.out, promises=True, **drawn)
-        suites = SUITES.values() if self.suite == "all" else [SUITES[self.suite]]
-        modules = [importlib.import_module(name) for name in suites]
-        return max(module.run(self.out, gate=self.gate, rebase=self.rebase, **drawn) for module in modules)
-
-    def _seeds(self) -> dict[str, Any]:
-        """The options that choose seeds, as far as they are given. ValueError where nothing would heed them."""
-        drawn = {k: v for k, v in (("first_seed", self.first_seed), ("seeds", self.seeds)) if v is not None}
-        for name, value in drawn.items():
-            option, least = f"--{name.replace('_', '-')}", int(name == "seeds")
-            heeded = ("core", "match", "sync", *(("panoptic",) if name == "first_seed" else ()))
-            if self.suite not in heeded:
-                raise ValueError(f"{option}: expected with suite {', '.join(heeded)}; found {self.suite}.")
-            if self.gate or self.rebase:
+        for name, least in (("first_seed", 0), ("seeds", 1)):
+            value = getattr(self, name)
+            if value is not None and value < least:
+                raise ValueError(f"{spelled(name)}: expected {least} or more; found {value}.")
+        for name in ("first_seed", "seeds", "only", "promises"):
+            if (self.gate or self.rebase) and getattr(self, name) not in (None, (), False):
                 raise ValueError(
-                    f"{option}: expected without --gate and --rebase: a baseline is of the suite's own seeds."
+                    f"{spelled(name)}: expected without --gate and --rebase: a baseline is of the suite's own runs."
                 )
-            if value < least:
-                raise ValueError(f"{option}: expected {least} or more; found {value}.")
-        return drawn
+
+
+def needs_more(suite: Any) -> set[str]:
+    """What a suite must be given besides the folder that it writes to."""
+    parameters = inspect.signature(suite.run).parameters.values()
+    required = [p for p in parameters if p.default is p.empty and p.kind is not p.VAR_KEYWORD]
+    return {p.name for p in required[1:]}
+
+
+def spelled(option: str) -> str:
+    """As on the command line."""
+    return option if option == "scene" else f"--{option.replace('_', '-')}"

@@ -249,7 +249,7 @@ def run(
     """Measure, print, and write raster.csv, raster.json and raster.png to the folder `out`; returns an exit code.
 
     gate: return 1 when a ratio is below its floor or fell behind the committed baseline.
-    with_fit: measure the toy fit of :mod:`recon.toy` too. rebase: make this run the baseline.
+    with_fit: measure the toy fit of :mod:`recon.bench.toy` too. rebase: make this run the baseline.
     """
     out = Path(out)
     names, skipped = backends()

@@ -220,5 +220,3 @@ def test_a_foreign_callable_needs_nothing():
     assert offsets.seconds[1] == pytest.approx(truth.offsets[1] - truth.offsets[0], abs=0.05)
     with pytest.raises(ValueError, match="fits no rates"):
         synchronize(tracks, refiner=lambda a, b, m, alignment: alignment, rate="fit")
-
-
