@@ -44,6 +44,11 @@ class Graph:
         for name in ("extra", "complete", "starts"):
             if getattr(self, name) < 0:
                 raise ValueError(f"Graph.{name}: expected a number >= 0; found {getattr(self, name)}.")
+        for name, switch, off in (("complete", "extra", 0), ("starts", "curves", False)):
+            if getattr(self, switch) == off and getattr(self, name) != type(self).__dataclass_fields__[name].default:
+                raise ValueError(
+                    f"Graph.{name}, Graph.{switch}: expected one of them; {name} is not used with {switch}={off}. Leave it out."
+                )
 
     def pairs(self, n: int, centre: int) -> list[Pair]:
         """Sorted pairs (a, b) with a < b: a star around ``centre`` and rings that add ``extra`` pairs a video."""

@@ -1,0 +1,422 @@
+"""No option is silently ignored: each changes what comes out, is refused, or is on a short list with the reason.
+
+The table below is held against the commands' own fields, so that a new option without a row fails.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from otsync.cli import main
+from otsync.cli.commands import OWN
+from otsync.plugins import short_name
+from otsync.simulate import matching_world, simulate
+from tests.options.walk import options_of
+from tests.recording_world import write_recording
+
+REFUSED = "refused"
+
+REASONS = {
+    "sync workers": "results do not depend on it (tests/otsync/sync/test_sync.py); 0 is refused",
+    "sync recording.workers": "results do not depend on it (tests/otsync/recordings/test_recordings.py)",
+    "sync graph.starts": "more starts of a search: they matter where the obvious ones fail (tests/otsync/sync/test_graph.py)",
+    "match matcher:FusedGromovWasserstein.device": "where products are computed, not what; an unknown one is refused below",
+    "match matcher:GromovWasserstein.device": "as of FusedGromovWasserstein",
+}
+"""Options that change nothing that can be compared, and why that is right."""
+
+COSTS = ("AnchoredFGW", "FusedGromovWasserstein", "PartialFGW", "EntropicFGW", "OptimalTransport", "NearestNeighbor")
+
+
+def slot(kind: str, name: str, **values: object) -> dict[str, list[str]]:
+    """Rows of an algorithm's options: each set alone beside the algorithm at its defaults."""
+    return {
+        f"{kind}:{name}.{field}": [f"--{kind}.{field.replace('_', '-')}", *str(value).split()]
+        for field, value in values.items()
+    }
+
+
+MATCHER_OPTIONS = (
+    slot("matcher", "AnchoredFGW", anchors=40, cells=60, mass=0.4, alpha=2.0, tau=0.2, beta=0.2, landmarks=20, rounds=1,
+         partners=2, seed=3)
+    | slot("matcher", "FusedGromovWasserstein", alpha=3.0, max_iter=2, tol=0.5)
+    | slot("matcher", "PartialFGW", mass=0.3, alpha=3.0, tol=10.0)
+    | slot("matcher", "EntropicFGW", reg=0.09, alpha=3.0, max_iter=2, tol=1.0)
+    | slot("matcher", "GromovWasserstein", max_iter=2, tol=0.5)
+    | slot("matcher", "OptimalTransport", reg=0.3)
+)  # fmt: skip
+
+SCAN, FIT = "aligner:LikelihoodScan", "refiner:SplineRefine"
+ALIGNER_OPTIONS = (
+    slot("aligner", "LikelihoodScan", max_lag=0.1, min_overlap=2.5, peaks=1, limit=10)
+    | slot("aligner", "DTW", cost="velocity")
+    | {"aligner:DTW.open_ends": ["--aligner.open-ends"]}
+    | slot("aligner", "ConstantShift", cost="velocity", min_overlap=3.25, max_lag=0.1)
+    | {
+        f"{SCAN}.trust.{name}": [f"--aligner.trust.{name.replace('_', '-')}", value]
+        for name, value in {
+            "evidence": "1e9", "margin": "10", "disagreement": "-1", "alias": "-1", "overlap": "1e9", "matches": "1e9",
+            "motion": "1e9", "rate_gain": "-1",
+        }.items()
+    }
+)  # fmt: skip
+REFINER_OPTIONS = (
+    slot("refiner", "SplineRefine", windows="0.3 0.2", smoothing=3.0, limit=10)
+    | {
+        f"{FIT}.trust.{name}": [f"--refiner.trust.{name.replace('_', '-')}", value]
+        for name, value in {
+            "moved": "-1", "spread": "-1", "correlation": "2", "blur": "-1", "overlap": "1e9", "matches": "1e9",
+        }.items()
+    }
+)  # fmt: skip
+NOT_READ = {
+    **{f"{SCAN}.trust.{name}": "aligner" for name in ("moved", "spread", "correlation", "blur", "rate_sigmas")},
+    **{f"{FIT}.trust.{name}": "refiner" for name in ("disagreement", "alias", "motion", "rate_gain")},
+}
+
+
+def run(args: list[str]) -> tuple[int, str, str]:
+    """(exit code, standard output, standard error) of ``otsync`` in this process."""
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            code = main(args)
+        except SystemExit as stop:
+            code = int(stop.code or 0)
+    return code, out.getvalue(), err.getvalue()
+
+
+def answer(args: list[str]) -> str:
+    """What a command prints as JSON, without wall times."""
+    code, out, err = run(args)
+    assert code in (0, 1), err
+
+    def plain(x):
+        if isinstance(x, dict):
+            return {k: plain(v) for k, v in x.items() if k not in ("seconds", "refine_seconds")}
+        return [plain(v) for v in x] if isinstance(x, list) else x
+
+    return json.dumps(plain(json.loads(out)))
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory) -> list[str]:
+    """Two videos of 260 tracks, as files."""
+    folder = tmp_path_factory.mktemp("pair")
+    a, b, _ = matching_world(260, seed=3, frames=16)
+    a.save(folder / "a.npz")
+    b.save(folder / "b.npz")
+    return [str(folder / "a.npz"), str(folder / "b.npz")]
+
+
+@pytest.fixture(scope="module")
+def films(tmp_path_factory) -> list[str]:
+    """Five videos of 100 frames, as files."""
+    folder = tmp_path_factory.mktemp("films")
+    tracks, _ = simulate("softball", preset="clean", videos=5, frames=100, seed=3, max_offset=10)
+    for t in tracks:
+        t.take(np.arange(0, len(t), 2)).save(folder / f"{t.name}.npz")
+    return [str(p) for p in sorted(folder.glob("*.npz"))]
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("recording")
+    write_recording(folder, [0.0, 3.0, -2.0], frames=45)
+    return folder
+
+
+def test_every_option_has_a_row():
+    walked = {f"{command} {option}" for command, place in OWN.items() for option in options_of(place)}
+    missing, gone = walked - set(ROWS), set(ROWS) - walked
+    assert not missing and not gone, f"without a row: {sorted(missing)}; no option any more: {sorted(gone)}"
+
+
+def matching(option: str) -> list[str]:
+    name = option.partition(".")[0]
+    return [f"{name.partition(':')[0]}:{short_name(type(name.partition(':')[2], (), {}))}"]
+
+
+@pytest.mark.parametrize("option", sorted(MATCHER_OPTIONS))
+def test_options_of_matchers_change_the_matches(option, pair):
+    base = ["match", *pair, "--json", *matching(option)]
+    assert answer(base) != answer([*base, *MATCHER_OPTIONS[option]])
+
+
+def test_restarts_of_the_anchored_matcher(tmp_path):
+    """They matter where the first start looks mirrored: features that say nothing of the side."""
+    a, b, _ = matching_world(260, seed=3, frames=16)
+    rng = np.random.default_rng(0)
+    for name, t in (("a", a), ("b", b)):
+        vague = type(t)(t.xyz, t.seen, rng.normal(size=(len(t), 4)), fps=30, name=name)
+        vague.save(tmp_path / f"{name}.npz")
+    base = ["match", str(tmp_path / "a.npz"), str(tmp_path / "b.npz"), "--json", "matcher:anchored-fgw"]
+    assert answer(base) != answer([*base, "--matcher.restarts", "1"])
+
+
+def test_algorithms_in_the_slot_of_matchers_differ(pair):
+    names = sorted({matching(option)[0] for option in MATCHER_OPTIONS} | {"matcher:nearest-neighbor"})
+    answers = [answer(["match", *pair, "--json", name]) for name in names]
+    assert len(set(answers)) == len(names) == 7
+
+
+@pytest.mark.parametrize("name", COSTS)
+def test_costs_are_not_for_the_shell_and_are_refused(name, pair):
+    code, _, err = run(["match", *pair, f"matcher:{short_name(type(name, (), {}))}", "--matcher.costs", "x"])
+    assert code == 2 and "costs" in err
+
+
+@pytest.mark.parametrize("name", ["fused-gromov-wasserstein", "gromov-wasserstein"])
+def test_an_unknown_device_is_refused(name, pair):
+    code, _, err = run(["match", *pair, f"matcher:{name}", "--matcher.device", "abacus"])
+    assert code == 2 and "device" in err
+
+
+def test_the_other_options_of_match(pair, tmp_path):
+    base = ["match", *pair, "--json"]
+    assert answer(base) != answer([*base, "--budget", "0.15"])
+    assert answer(base) != answer(["match", *pair[::-1], "--json"])
+    run([*base, "--out", str(tmp_path / "m.csv")])
+    assert (tmp_path / "m.csv").read_text().startswith("a,b,score\n")
+    assert run(["match", *pair])[1] != run(base)[1]
+
+
+@pytest.mark.parametrize("option", sorted(ALIGNER_OPTIONS))
+def test_options_of_aligners_change_the_offsets(option, films, tmp_path):
+    base = ["sync", *films[:2], "--json", "--rematch", "0", "--out", str(tmp_path), *matching(option)]
+    end = [] if "LikelihoodScan" in option else ["refiner:unrefined"]
+    assert answer([*base, *end]) != answer([*base, *ALIGNER_OPTIONS[option], *end])
+
+
+@pytest.mark.parametrize("option", sorted(REFINER_OPTIONS))
+def test_options_of_refiners_change_the_offsets(option, films, tmp_path):
+    base = ["sync", *films[:2], "--json", "--rematch", "0", "--out", str(tmp_path), *matching(option)]
+    assert answer(base) != answer([*base, *REFINER_OPTIONS[option]])
+
+
+@pytest.mark.parametrize(
+    "option",
+    [["--refiner.trust.evidence", "1e9"], ["--refiner.trust.margin", "1e9"], ["--graph.no-curves"]],
+)
+def test_what_decides_where_some_pairs_do_not_vouch_for_themselves(option, films, tmp_path):
+    """Then the summed curves tell, by the refiner's limits."""
+    base = ["sync", *films, "--json", "--rematch", "0", "--out", str(tmp_path)]
+    sure = sorted(pair["stats"].get("evidence", 0.0) for pair in json.loads(answer(base))["pairs"])
+    graph, end = (option, []) if "graph" in option[0] else ([], option)
+
+    def decided(least: float, graph: list[str], end: list[str]) -> str:
+        scan = ["aligner:likelihood-scan", "--aligner.trust.evidence", f"{least:.9g}"]
+        return answer([*base, *graph, *scan, "refiner:spline-refine", *end])
+
+    assert any(decided(least, [], []) != decided(least, graph, end) for least in (sure[4], sure[6], sure[8]))
+
+
+def test_rates_of_long_clips(tmp_path):
+    tracks, _ = simulate("softball", preset="clean", videos=2, frames=660, rates=[1, 1.002], offsets=[0, 0.3], seed=9)
+    for t in tracks:
+        t.take(np.arange(0, len(t), 2)).save(tmp_path / f"{t.name}.npz")
+    base = ["sync", *map(str, sorted(tmp_path.glob("*.npz"))), "--json", "--rematch", "0", "--out", str(tmp_path)]
+    fixed = answer(base)
+    assert (
+        fixed != answer([*base, "--rate", "fit"]) == answer([*base, "refiner:spline-refine", "--refiner.rate", "fit"])
+    )
+    assert fixed != answer([*base, "refiner:spline-refine", "--refiner.trust.rate-sigmas", "1e9"])
+    code, _, err = run([*base, "--rate", "fixed", "refiner:spline-refine", "--refiner.rate", "fit"])
+    assert code == 2 and "rate, refiner" in err
+    code, _, err = run([*base, "--rate", "fit", "refiner:unrefined"])
+    assert code == 2 and "rate" in err and "Unrefined" in err
+
+
+@pytest.mark.parametrize("option", sorted(NOT_READ))
+def test_limits_that_nobody_reads_are_refused(option, films, tmp_path):
+    flag = f"--{NOT_READ[option]}.trust.{option.rpartition('.')[2].replace('_', '-')}"
+    code, _, err = run(["sync", *films[:2], "--out", str(tmp_path / "o"), *matching(option), flag, "0.777"])
+    assert code == 2 and option.rpartition(".")[2] in err and not (tmp_path / "o").exists()
+
+
+def test_the_graph(films, tmp_path):
+    base = ["sync", *films, "--json", "--rematch", "0", "--out", str(tmp_path)]
+    ring = [*base, "--graph.complete", "3", "--graph.extra", "1"]
+    assert answer(base) != answer([*base, "--graph.extra", "0"])
+    assert answer([*base, "--graph.extra", "1"]) != answer(ring)
+    assert answer(ring) != answer([*ring, "--graph.seed", "4"])
+    for options in (["--graph.extra", "0", "--graph.complete", "3"], ["--graph.no-curves", "--graph.starts", "9"]):
+        code, _, err = run([*base, *options])
+        assert code == 2 and "Graph." in err
+
+
+def test_the_other_options_of_sync(films, tmp_path):
+    out = ["--out", str(tmp_path / "o")]
+    base = ["sync", *films[:3], "--json", *out]
+    first = answer(base)
+    assert (tmp_path / "o" / "offsets.json").is_file() and first != run(base[:-3] + base[-2:])[1]
+    assert first != answer([*base, "--rematch", "0"])
+    assert first != answer([*base, "--reference", "video1"])
+    assert first == answer([*base, "--workers", "2"])
+    assert run([*base, "--workers", "0"])[0] == 2
+    truth = tmp_path / "o" / "offsets.json"
+    assert "error_frames" in answer([*base, "--truth", str(truth)])
+    assert first != answer(["sync", *films[:2], *base[4:]])
+    for option in (["--recording.route", "stereo"], ["--recording.workers", "1"], ["--recording.cameras", "a"]):
+        code, _, err = run([*base, *option])
+        assert code == 2 and "--recording" in err and "track sets" in err
+
+
+@pytest.mark.parametrize(
+    "option",
+    [
+        ["matcher:nearest-neighbor"], ["aligner:dtw"], ["refiner:unrefined"], ["--graph.extra", "0"], ["--rematch", "0"],
+        ["--rate", "fit"], ["--workers", "2"],
+    ],
+)  # fmt: skip
+def test_what_the_route_of_a_recording_decides_is_refused(option, recording, tmp_path):
+    code, _, err = run(["sync", str(recording), "--out", str(tmp_path / "o"), *option])
+    name = option[0].lstrip("-").partition(":")[0].partition(".")[0]
+    assert code == 2 and f"--{name}" in err and "recording" in err and not (tmp_path / "o").exists()
+
+
+def test_options_of_recordings(recording, tmp_path):
+    base = ["sync", str(recording), "--json", "--out", str(tmp_path / "o")]
+    first = answer(base)
+    assert first != answer([*base, "--recording.route", "epipolar"])
+    names = [video["name"] for video in json.loads(first)["videos"]]
+    assert first != answer([*base, "--recording.cameras", *names[:2]])
+    assert first == answer([*base, "--recording.workers", "1"])
+    assert run([*base, "--recording.workers", "-1"])[0] == 2
+    answer([*base, "--recording.cache", str(tmp_path / "kept")])
+    assert any((tmp_path / "kept").iterdir())
+    moved = tmp_path / "moved"
+    moved.mkdir()
+    document = json.loads((recording / "scene.json").read_text())
+    for video in document["videos"]:
+        video["frames"] = [
+            f"../{recording.name}/{p.parent.name}/{p.name}" for p in sorted(recording.glob(video["frames"]))
+        ]
+    shutil.copytree(recording, tmp_path / recording.name)
+    (moved / "scene.json").write_text(json.dumps(document))
+    outside = ["sync", str(moved), "--json", "--out", str(tmp_path / "m")]
+    assert run(outside)[0] == 2 and run([*outside, "--recording.allow-outside"])[0] in (0, 1)
+    assert run(["check", str(moved)])[1] != run(["check", str(moved), "--allow-outside"])[1]
+    broken = tmp_path / recording.name
+    frame = sorted(p for p in broken.rglob("*") if p.suffix in (".png", ".jpg"))[3]
+    frame.write_bytes(b"no image")
+    assert run(["check", str(broken)])[1] != run(["check", str(broken), "--no-every-frame"])[1]
+
+
+def test_options_of_init(recording, tmp_path):
+    folder = tmp_path / "images"
+    for images in sorted(p for p in recording.iterdir() if p.is_dir()):
+        shutil.copytree(images, folder / images.name)
+
+    def document(*args: str) -> str:
+        run(["init", str(folder), "--force", *args])
+        return (folder / "scene.json").read_text()
+
+    plain = document()
+    assert plain != document("--fps", "25")
+    assert run(["init", str(folder)])[0] == 2  # it is there already
+    run(["init", str(folder), "--out", str(folder / "other.json")])
+    assert (folder / "other.json").is_file()
+    assert run(["init", str(folder), "--force", "--reader", "panoptic"])[0] == 2
+    assert run(["init", str(tmp_path / "nowhere")])[0] == 2
+
+
+def test_options_of_simulate_and_demo(tmp_path):
+    def world(*args: str) -> dict[str, bytes]:
+        out = tmp_path / "-".join(args or ("plain",)).replace("/", "_")
+        assert run(["simulate", str(out), "--frames", "20", "--videos", "2", *args])[0] == 0
+        return {p.name: p.read_bytes() for p in sorted(out.iterdir())}
+
+    plain = world()
+    for args in (
+        ["--motion", "boxes"], ["--preset", "hard"], ["--videos", "3"], ["--frames", "25"], ["--fps", "25"],
+        ["--max-offset", "5"], ["--seed", "8"],
+    ):  # fmt: skip
+        assert world(*args) != plain, args
+
+    def demo(*args: str) -> str:
+        out = tmp_path / "demo"
+        assert run(["demo", "--videos", "2", "--out", str(out), *args])[0] in (0, 1)
+        return (out / "offsets.json").read_text()
+
+    first = demo()
+    for args in (["--motion", "tennis"], ["--preset", "clean"], ["--videos", "3"], ["--seed", "4"]):
+        assert demo(*args) != first, args
+
+
+def test_options_of_bench_reach_a_suite_or_are_refused(tmp_path):
+    from otsync import plugins
+
+    class Spy:
+        name = "spy"
+
+        def run(self, out, **options):
+            seen.append((out, options))
+            return 0
+
+    class Plain:
+        name = "plain"
+
+        def run(self, out):
+            return 0
+
+    spy, plain, seen = Spy(), Plain(), []
+    plugins.register("benchmarks")(spy)
+    plugins.register("benchmarks")(plain)
+    try:
+        for args, expected in (
+            (["somewhere"], {"scene": Path("somewhere")}),
+            (["--gate"], {"gate": True}),
+            (["--rebase"], {"rebase": True}),
+            (["--promises"], {"promises": True}),
+            (["--first-seed", "3"], {"first_seed": 3}),
+            (["--seeds", "2"], {"seeds": 2}),
+            (["--only", "a", "b"], {"only": ("a", "b")}),
+            (["--json"], {"json": True}),
+            (["--cache", "kept"], {"cache": Path("kept")}),
+        ):
+            assert run(["bench", "spy", *args, "--out", str(tmp_path)])[0] == 0
+            assert seen.pop() == (tmp_path, expected)
+            code, _, err = run(["bench", "plain", *args])
+            assert code == 2 and next(iter(expected)).replace("_", "-") in err and "does not take it" in err
+    finally:
+        plugins.forget(spy, plain)
+
+
+def test_options_of_plugins():
+    assert run(["plugins", "--json"])[1] != run(["plugins"])[1]
+
+
+def rows() -> set[str]:
+    """Every option that a test above exercises, refuses, or gives a reason for."""
+    algorithms = {f"match {option}" for option in MATCHER_OPTIONS} | {f"match matcher:{n}.costs" for n in COSTS}
+    algorithms |= {f"match {option.partition('.')[0]}" for option in MATCHER_OPTIONS}
+    algorithms |= {"match matcher:NearestNeighbor", "match matcher:AnchoredFGW.restarts"}
+    algorithms |= {name for name in REASONS if name.startswith("match")}
+    pairs = {f"sync {o}" for o in (*ALIGNER_OPTIONS, *REFINER_OPTIONS, *NOT_READ)}
+    pairs |= {f"sync {o.partition('.')[0]}" for o in (*ALIGNER_OPTIONS, *REFINER_OPTIONS)}
+    pairs |= {f"sync {FIT}.trust.{n}" for n in ("evidence", "margin", "rate_sigmas")} | {f"sync {FIT}.rate"}
+    others = {
+        "match": "a b out budget json",
+        "sync": "tracks out reference truth rate rematch workers json refiner:Unrefined graph.extra graph.complete "
+        "graph.curves graph.starts graph.seed recording.route recording.cameras recording.cache "
+        "recording.allow_outside recording.workers",
+        "demo": "out motion preset videos seed",
+        "simulate": "out motion preset videos frames fps max_offset seed",
+        "init": "folder out reader fps force",
+        "check": "scene every_frame allow_outside",
+        "bench": "suite scene out gate rebase promises first_seed seeds only json cache",
+        "plugins": "json",
+    }
+    shared = {row.replace("match matcher", "sync matcher") for row in algorithms if "matcher:" in row}  # the same slot
+    return algorithms | shared | pairs | {f"{c} {o}" for c, names in others.items() for o in names.split()}
+
+
+ROWS = rows()
