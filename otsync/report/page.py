@@ -11,6 +11,7 @@ import numpy as np
 
 from ..files.arrays import atomic_write
 from ..types import Alignment, Matches, Offsets, Status, TrackSet
+from ..types.drawing import clips_of
 from . import figures
 
 DETAILED_PAIRS = 8
@@ -50,7 +51,7 @@ def write_report(
         "<p class=s>A positive offset means that the video started later than its reference. "
         "t<sub>world</sub> = rate · t<sub>video</sub> + offset.</p>",
         "<h2>On the common clock</h2>",
-        figures.clock_bars(offsets, _clips(offsets, tracks)),
+        figures.clock_bars(offsets, clips_of(tracks, len(offsets))),
         _remedies(offsets),
         _graph(offsets),
         extra,
@@ -188,13 +189,6 @@ def _cost_map(
 
     paper = DTW()(tracks[i], tracks[j], matches[key])
     return paper.cost, paper.path, origin
-
-
-def _clips(offsets: Offsets, tracks: Sequence[TrackSet] | None) -> list[tuple[float, float]]:
-    """First second and duration of every video on its own clock; a second where the tracks are not at hand."""
-    if tracks is None:
-        return [(0.0, 1.0)] * len(offsets)
-    return [(float(t.times[0]), float(t.times[-1] - t.times[0] + 1 / (t.fps or 1))) for t in tracks]
 
 
 def _footer(offsets: Offsets) -> str:
