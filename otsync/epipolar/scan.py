@@ -56,14 +56,15 @@ class EpipolarScan(Aligner):
     per sample is what denies a short overlap any reward. Per track the candidates form a mixture with an outlier
     floor, capped: one wrong candidate can neither veto nor carry an offset. A sum over candidates without the mixture
     fails (55 % > 2 frames); motion alone 18 %, position alone 39 %. Motion and position must be those of one
-    candidate: with a mixture for each, 8 of 630 pairs (fresh seeds) were off by more than 2 frames, with one for both 2.
+    candidate: with a mixture for each, 8 of 630 pairs (fresh seeds) were off by more than 2 frames, with one for both
+    2.
 
     A single pair cannot be certified (an alias of 65 frames kept a high margin): solve the graph of all pairs.
 
     Args:
         window: seconds. motion_scale, position_scale: s in pixels at 640 of width.
-        min_overlap, max_lag: seconds, as in :class:`otsync.ConstantShift`. min_seen: seconds that a candidate must be seen
-            in both videos to say anything.
+        min_overlap, max_lag: seconds, as in :class:`otsync.ConstantShift`.
+        min_seen: seconds that a candidate must be seen in both videos to say anything.
         weak, ambiguous: flags: rise of the peak over the median in (robust) deviations of the curve; its lead over the
             second peak as a share of the rise. They flag 1.6 % of the pairs of basketball (fresh seed).
     """

@@ -1,4 +1,4 @@
-"""``otsync check``: finds what commonly goes wrong in a recording before hours are spent on it, and says how to mend it."""
+"""``otsync check``: finds common faults of a recording before hours are spent on it, each with its remedy."""
 
 from __future__ import annotations
 
@@ -195,12 +195,12 @@ def _files(scene: Scene, every_frame: bool) -> Iterable[Finding]:
 def _clock(entry: dict[str, Any], video: Video, paths: Paths) -> Iterable[Finding]:
     """Declared fps against timestamps, and against the container's; a readout longer than a frame."""
     if entry.get("timestamps") is not None and entry.get("fps") is not None and len(video.frames) > 1:
-        told, seen = float(entry["fps"]), 1.0 / float(np.median(np.diff(video.times)))
-        if abs(told / seen - 1) > SAME_RATE:
+        declared, seen = float(entry["fps"]), 1.0 / float(np.median(np.diff(video.times)))
+        if abs(declared / seen - 1) > SAME_RATE:
             yield Finding(
                 "error",
                 video.name,
-                f"fps says {told:.4g}, timestamps say {seen:.4g}.",
+                f"fps says {declared:.4g}, timestamps say {seen:.4g}.",
                 "Timestamps win: delete fps, or correct the timestamps' unit (seconds).",
             )
     if "file" in entry and entry.get("fps") is not None:
@@ -238,7 +238,7 @@ def _cameras(entries: Sequence[dict[str, Any]]) -> dict[str, Camera]:
         try:
             out[str(entry.get("name", f"video{n}"))] = camera_from(entry.get("camera"))
         except (ValueError, TypeError, KeyError, OverflowError):
-            continue  # told by the video's own checks
+            continue  # the checks of each video report it
     return out
 
 
@@ -303,7 +303,7 @@ def _depth_units(
             assert video.depth is not None
             depth = np.asarray(video.depth[len(video.depth) // 2])
         except (ValueError, OSError):
-            continue  # told by the files' own check
+            continue  # the check of the files reports it
         if not (depth > 0).any():
             yield Finding("warning", name, "the middle depth map is empty.", "0 means unknown: check the files.")
             continue

@@ -12,8 +12,9 @@ CLOSE = 0.8
 
 @kernel()
 def apart_from_others(uv, apart, least, count):
-    """Greedy choice in the given order: skip a track that stays within ``apart`` of a chosen one over >= ``least`` frames.
+    """Greedy choice in the given order, without tracks that stay within ``apart`` of a chosen one.
 
+    Two tracks are compared where both are seen, in ``least`` frames or more.
     uv (N,T,2), nan unseen. Returns the chosen indices, at most ``count``.
     """
     N, T = uv.shape[0], uv.shape[1]

@@ -1,4 +1,4 @@
-"""What the verbs return: matches of a pair, alignment of a pair, offsets of all videos."""
+"""Results of the verbs: matches of a pair, alignment of a pair, offsets of all videos."""
 
 from __future__ import annotations
 
@@ -393,13 +393,13 @@ class Offsets:
             if seconds[v] != 0 and (v == reference or np.isfinite(seconds[v])):
                 none = "" if v == reference else " or null"
                 raise ValueError(
-                    f"videos, {videos[v]['name']}: offset_seconds: expected 0{none} of a video that is its own reference; "
-                    f"found {json.dumps(videos[v]['offset_seconds'])}"
+                    f"videos, {videos[v]['name']}: offset_seconds: expected 0{none} of a video that is its own "
+                    f"reference; found {json.dumps(videos[v]['offset_seconds'])}"
                 )
         if rates[reference] != 1:
             raise ValueError(
-                f"videos, {videos[reference]['name']}: rate: expected 1, since the clock of the reference is the world's; "
-                f"found {rates[reference]:g}"
+                f"videos, {videos[reference]['name']}: rate: expected 1, since the clock of the reference is the "
+                f"world's; found {rates[reference]:g}"
             )
         return cls(
             names=tuple(index),

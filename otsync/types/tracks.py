@@ -131,8 +131,8 @@ class TrackSet:
             if bad.any():
                 n, t = np.argwhere(bad)[0]
                 raise ValueError(
-                    f"{name}.{field}: expected finite values in visible samples; {int(bad.sum())} are not, the first in "
-                    f"track {n}, frame {t}. Mark unobserved samples in visible."
+                    f"{name}.{field}: expected finite values in visible samples; {int(bad.sum())} are not, the "
+                    f"first in track {n}, frame {t}. Mark unobserved samples in visible."
                 )
         if features:
             if self.features is None:

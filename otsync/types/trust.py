@@ -1,4 +1,4 @@
-"""When an answer is to be trusted: the one place where the thresholds behind the flags are written down.
+"""Thresholds behind the flags, in one place: when an answer is to be trusted.
 
 Lengths of time are seconds (the designs' frame counts at 30 fps); nothing has a unit of length.
 """
