@@ -59,6 +59,7 @@ class Trust:
                 raise ValueError(f"{owner}.{field.name}: expected a finite number; found {value}.")
             if field.name not in reads and value != field.default:
                 raise ValueError(
-                    f"{owner}.{field.name}: expected one of {', '.join(reads)}, which are what it reads; found {value:g}. "
-                    "Leave it out, or set it where it is read (the scan's limits in the aligner, the fit's in the refiner)."
+                    f"{owner}.{field.name}: expected one of {', '.join(reads)}, which are what it reads; found "
+                    f"{value:g}. Leave it out, or set it where it is read (the scan's limits in the aligner, the fit's "
+                    "in the refiner)."
                 )
