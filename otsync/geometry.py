@@ -1,4 +1,4 @@
-"""Two-view geometry of calibrated cameras: fundamental matrices, epipolar residuals, pixels with and without the lens."""
+"""Two-view geometry of calibrated cameras: fundamental matrices, epipolar residuals, lens distortion."""
 
 from __future__ import annotations
 
@@ -32,7 +32,10 @@ def fundamentals(a: Camera, b: Camera) -> Float[np.ndarray, "Fa Fb 3 3"]:
 def sampson(
     F: Float[np.ndarray, "3 3"], xa: Float[np.ndarray, "N 2"], xb: Float[np.ndarray, "N 2"]
 ) -> Float[np.ndarray, " N"]:
-    """Signed first-order distance in pixels of (x_a, x_b) to the epipolar constraint (Hartley and Zisserman, 11.4.3)."""
+    """Signed distance in pixels of (x_a, x_b) to the epipolar constraint, to first order.
+
+    (Hartley and Zisserman, Sec. 11.4.3.)
+    """
     ha, hb = (np.concatenate([x, np.ones((len(x), 1))], 1) for x in (xa, xb))
     la, lb = ha @ F.T, hb @ F
     norm = np.sqrt(la[:, 0] ** 2 + la[:, 1] ** 2 + lb[:, 0] ** 2 + lb[:, 1] ** 2)

@@ -1,4 +1,4 @@
-"""How good an answer is, given the truth: matches, and offsets."""
+"""Errors of an answer, given the truth: of matches, and of offsets."""
 
 from __future__ import annotations
 

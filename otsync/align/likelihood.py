@@ -13,7 +13,7 @@ from ..costs.linear import binary_scale, velocity
 from ..types import Alignment, Matches, Status, TrackSet, in_order
 from ..types.checks import positive
 from ..types.trust import Trust
-from .peaks import local_peaks, vertex
+from .peaks import separate_peaks, vertex
 from .slot import Aligner
 
 MIN_OVERLAP = 24 / 30
@@ -86,7 +86,7 @@ class LikelihoodScan(Aligner):
         score = curves.total
         if not np.isfinite(score).any():
             return unanswered(pair, matches)
-        tops = local_peaks(lags, score, round(APART * pair.fps), self.peaks)
+        tops = separate_peaks(score, round(APART * pair.fps), self.peaks, prefer=np.abs(lags))
         offset = float(pair.seconds(vertex(lags, score, tops[0])))
         stats = self._stats(pair, lags, curves, tops) | {"matches": float(len(matches))}
         stats["other_rate"], stats["other_rate_gain"] = other_rate(a, b, pair, matches, scale, self.max_lag)

@@ -26,28 +26,24 @@ def peak(lags: Int[np.ndarray, " K"], score: Float[np.ndarray, " K"]) -> float:
     return vertex(lags, score, int(top[np.argmin(np.abs(lags[top]))]))
 
 
-def separate_peaks(curve: Float[np.ndarray, " K"], apart: int) -> Int[np.ndarray, " P"]:
-    """Local maxima, best first, each at least ``apart`` from a better one; the global one is always among them."""
-    padded = np.concatenate([[-np.inf], curve, [-np.inf]])
-    local = np.flatnonzero((padded[1:-1] >= padded[:-2]) & (padded[1:-1] >= padded[2:]) & np.isfinite(curve))
-    chosen: list[int] = []
-    for k in local[np.argsort(-curve[local], kind="stable")]:
-        if all(abs(k - c) >= apart for c in chosen):
-            chosen.append(int(k))
-    return np.array(chosen, int)
+def separate_peaks(
+    score: Float[np.ndarray, " K"], apart: int, n: int | None = None, prefer: Float[np.ndarray, " K"] | None = None
+) -> list[int]:
+    """Indices of the ``n`` highest local maxima (default: all), best first, each at least ``apart`` from a higher one.
 
-
-def local_peaks(lags: Int[np.ndarray, " K"], score: Float[np.ndarray, " K"], apart: int, n: int) -> list[int]:
-    """Indices of the ``n`` highest local maxima at least ``apart`` lags from a higher one; the smallest |lag| on ties."""
+    The global maximum is always among them. Of equal scores the one of smaller ``prefer`` comes first; default: the
+    first one.
+    """
     padded = np.pad(score, 1, constant_values=-np.inf)
-    top = np.isfinite(score) & (score >= padded[:-2]) & (score >= padded[2:])
-    found: list[int] = []
-    for i in sorted(np.flatnonzero(top), key=lambda i: (-score[i], abs(lags[i]))):
-        if all(abs(lags[i] - lags[j]) >= apart for j in found):
-            found.append(int(i))
-        if len(found) == n:
+    local = np.flatnonzero(np.isfinite(score) & (score >= padded[:-2]) & (score >= padded[2:]))
+    rank = np.arange(len(score)) if prefer is None else prefer
+    chosen: list[int] = []
+    for i in sorted(local, key=lambda i: (-score[i], rank[i])):
+        if len(chosen) == n:
             break
-    return found
+        if all(abs(i - j) >= apart for j in chosen):
+            chosen.append(int(i))
+    return chosen
 
 
 def vertex(lags: Int[np.ndarray, " K"], score: Float[np.ndarray, " K"], i: int) -> float:

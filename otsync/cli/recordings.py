@@ -60,7 +60,7 @@ class Check:
     """
 
     scene: tyro.conf.Positional[Path]
-    """A scene.json, or a folder that holds one, or a folder in Panoptic layout."""
+    """A scene.json, a folder that holds one, or a calibrated folder that a reader knows (Panoptic)."""
     every_frame: bool = True
     """Decode every image; off: the first, the middle and the last."""
     allow_outside: bool = False

@@ -7,11 +7,20 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from ..geometry import seen_pixels
 from ..types import Matches, TrackSet
 from .splines import TrackSplines
 
 SAME_FPS = 1e-9
+"""Relative difference of frame rates that is rounding."""
+
+EVEN = 1e-3
+"""Frames that timestamps may lie beside an even grid: containers round them to ticks of a millisecond and less."""
+
+WHOLE = 1e-6
+"""Frames by which a clip may fall short of a whole number of them, for rounding."""
+
+USUAL_FPS = 30.0
+"""Rate of a single frame, which has none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,12 +57,12 @@ class CommonClock:
 def common_clock(a: TrackSet, b: TrackSet, matches: Matches) -> CommonClock:
     """Bring matched tracks on the slower of the two clocks.
 
-    Samples of a uniform clock of that rate are taken as they are; others (another fps, timestamps) come from the
-    track's spline, which never bridges a gap.
+    Samples of another clock (another fps, timestamps) come from the track's spline: see :func:`on_clock`.
     """
     i, j = matches.pairs.T
     fps = min(nominal_fps(a), nominal_fps(b))
-    return CommonClock(_on_grid(a.take(i), fps), _on_grid(b.take(j), fps), fps, float(a.times[0] - b.times[0]))
+    xa, xb = (on_clock(tracks, tracks.positions(), fps) for tracks in (a.take(i), b.take(j)))
+    return CommonClock(xa, xb, fps, float(a.times[0] - b.times[0]))
 
 
 def strongest(matches: Matches, limit: int) -> Matches:
@@ -69,32 +78,32 @@ def strongest(matches: Matches, limit: int) -> Matches:
 def nominal_fps(tracks: TrackSet) -> float:
     """Frames per second as declared, else from the timestamps' median step."""
     assert tracks.fps is not None or tracks.n_frames == 1
-    return tracks.fps or 30.0
+    return tracks.fps or USUAL_FPS
 
 
 def is_uniform(tracks: TrackSet) -> bool:
-    """Whether the frames lie on an even grid of the nominal rate, to a thousandth of a frame."""
+    """Whether the frames lie on an even grid of the nominal rate, to within :data:`EVEN` frames."""
     t = tracks.timestamps
     if t is None:
         return True
     grid = t[0] + np.arange(len(t)) / nominal_fps(tracks)
-    return bool(np.abs(t - grid).max() * nominal_fps(tracks) < 1e-3)
+    return bool(np.abs(t - grid).max() * nominal_fps(tracks) < EVEN)
 
 
-def _on_grid(tracks: TrackSet, fps: float) -> Float[np.ndarray, "M T 3"]:
+def on_clock(tracks: TrackSet, x: Float[np.ndarray, "N T D"], fps: float) -> Float[np.ndarray, "N T D"]:
+    """What ``tracks`` have at every frame, positions or pixels (nan where unseen), on an even clock of ``fps``.
+
+    Samples of a uniform clock of that rate are taken as they are; splines answer for others and never bridge a gap.
+    """
     if is_uniform(tracks) and abs(nominal_fps(tracks) / fps - 1) <= SAME_FPS:
-        return tracks.positions()
+        return x
     times = tracks.times
-    grid = times[0] + np.arange(int(np.floor((times[-1] - times[0]) * fps + 1e-6)) + 1) / fps
-    return TrackSplines(times, tracks.positions()).sample(grid)
+    grid = times[0] + np.arange(int(np.floor((times[-1] - times[0]) * fps + WHOLE)) + 1) / fps
+    return TrackSplines(times, in_space(x)).sample(grid)[..., : x.shape[2]]
 
 
-def on_clock(tracks: TrackSet, fps: float) -> Float[np.ndarray, "N T 2"]:
-    """Pixels on an even clock of ``fps``; nan where unseen. Splines answer for other clocks and never bridge gaps."""
-    uv = seen_pixels(tracks)
-    if is_uniform(tracks) and abs(nominal_fps(tracks) / fps - 1) <= SAME_FPS:
-        return uv
-    times = tracks.times
-    grid = times[0] + np.arange(int(np.floor((times[-1] - times[0]) * fps + 1e-6)) + 1) / fps
-    flat = np.concatenate([uv, np.where(np.isfinite(uv[..., :1]), 0.0, np.nan)], 2)
-    return TrackSplines(times, flat).sample(grid)[..., :2]
+def in_space(x: Float[np.ndarray, "N T D"]) -> Float[np.ndarray, "N T 3"]:
+    """Positions as they are; pixels with a third coordinate 0, for splines, which hold three."""
+    if x.shape[2] == 3:
+        return x
+    return np.concatenate([x, np.where(np.isfinite(x[..., :1]), 0.0, np.nan)], 2)

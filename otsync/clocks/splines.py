@@ -9,9 +9,24 @@ from scipy.interpolate import BSpline
 from scipy.linalg import solveh_banded
 
 DEGREE = 3
+
 KNOT_SECONDS = 2 / 30
+"""Distance of knots: two frames at 30 fps, about as fast as a limb turns."""
+
 SMOOTHING = 1.0
+"""λ at 30 fps: calms the jitter of a tracker; 10 and more bias the offset."""
+
+RIDGE = 1e-6
+"""Added to the penalty: it only decides where neither data nor third differences do."""
+
 BRIDGE_FRAMES = 2.5
+"""Longest step between two samples that a curve is believed across: one dropped frame, not two."""
+
+ON_SAMPLE = 1e-6
+"""Frames within which a time is that of a sample, for rounding."""
+
+WITHIN = 1e-9
+"""Share of a knot's distance by which the last time is kept inside the last interval."""
 
 
 class TrackSplines:
@@ -23,7 +38,7 @@ class TrackSplines:
 
     Args:
         times: (T,) seconds, increasing. xyz: (M,T,3), nan where unobserved.
-        knot_seconds: knot spacing, at least one frame. smoothing: λ at 30 fps (≥ 10 biases the offset).
+        knot_seconds: knot spacing, at least one frame. smoothing: λ at 30 fps.
 
     Reference: Eilers and Marx, Flexible smoothing with B-splines and penalties, 1996.
     """
@@ -56,8 +71,7 @@ class TrackSplines:
         values = np.where(seen[..., None], xyz - mean[:, None], 0.0)
         basis = self._design(self.times, DEGREE)
         differences = np.diff(np.eye(self.n), 3, axis=0) if self.n > 3 else np.zeros((1, self.n))
-        # the ridge only decides where neither data nor third differences do
-        regular = penalty * differences.T @ differences + 1e-6 * np.eye(self.n)
+        regular = penalty * differences.T @ differences + RIDGE * np.eye(self.n)
         bands = np.zeros((len(xyz), DEGREE + 1, self.n))
         for d in range(DEGREE + 1):
             product = basis[:, : self.n - d].multiply(basis[:, d:])
@@ -110,10 +124,10 @@ class TrackSplines:
         """Where ``t`` lies between two consecutive samples that were seen and are at most 2.5 frames apart."""
         times = self.times
         # a time within rounding of a sample needs that sample alone
-        left = np.clip(np.searchsorted(times, t + 1e-6 * self.frame, side="right") - 1, 0, len(times) - 1)
-        on_sample = np.abs(t - times[left]) <= 1e-6 * self.frame
+        left = np.clip(np.searchsorted(times, t + ON_SAMPLE * self.frame, side="right") - 1, 0, len(times) - 1)
+        on_sample = np.abs(t - times[left]) <= ON_SAMPLE * self.frame
         right = np.where(on_sample, left, np.minimum(left + 1, len(times) - 1))
-        inside = (t >= times[0] - 1e-6 * self.frame) & (t <= times[-1] + 1e-6 * self.frame)
+        inside = (t >= times[0] - ON_SAMPLE * self.frame) & (t <= times[-1] + ON_SAMPLE * self.frame)
         inside &= times[right] - times[left] <= BRIDGE_FRAMES * self.frame
         return self.seen[:, left] & self.seen[:, right] & inside
 
@@ -122,7 +136,7 @@ class TrackSplines:
         return np.where(self.support(t)[..., None], self.value(t), np.nan)
 
     def _inside(self, t: np.ndarray) -> np.ndarray:
-        return np.clip(t, self.times[0], self.times[-1] - 1e-9 * self.step)
+        return np.clip(t, self.times[0], self.times[-1] - WITHIN * self.step)
 
     def _design(self, t: np.ndarray, degree: int) -> sparse.csr_array:
         knots = self.knots if degree == DEGREE else self.knots[1:-1]

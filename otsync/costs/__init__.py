@@ -1,4 +1,4 @@
-"""What matchers minimise: features, curves in space, positions at known times, labels."""
+"""Costs that matchers minimise: features, curves in space, positions at known times, labels."""
 
 from .linear import Cosine, Cost, Labels, track_distance
 from .positions import CurveDistance, MedianPosition, SynchronousDistance

@@ -86,7 +86,7 @@ def curve_distances(A, B, pairs_a, pairs_b, share):
 
 
 @kernel()
-def synchronous_distances(A, B, pairs_a, pairs_b, at, least):
+def paired_frame_distances(A, B, pairs_a, pairs_b, at, least):
     """Mean distance of A[i,t] and B[j,at[t]] (at -1: none) over frames that both see; nan below ``least`` of them."""
     out = np.full(len(pairs_a), np.nan)
     for p in range(len(pairs_a)):

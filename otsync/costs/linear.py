@@ -1,4 +1,4 @@
-"""What matchers and aligners minimise: array functions at the bottom, cost objects for the matchers' ``costs`` slot."""
+"""Costs of matching and aligning: functions of arrays, and objects for the matchers' ``costs`` slot."""
 
 from __future__ import annotations
 
@@ -249,7 +249,7 @@ def memberships(a: TrackSet, b: TrackSet) -> tuple[Float[np.ndarray, "Na L"], Fl
         classes = classes[classes >= 0]
         p, q = ((x[:, None] == classes).astype(float) for x in (a.labels, b.labels))
         return p, q
-    found = []
+    rows = []
     for name, tracks in (("a", a), ("b", b)):
         weights = np.asarray(tracks.labels, float)
         if not np.isfinite(weights).all() or (weights < 0).any():
@@ -257,8 +257,8 @@ def memberships(a: TrackSet, b: TrackSet) -> tuple[Float[np.ndarray, "Na L"], Fl
         top = weights.max(1, keepdims=True, initial=0.0)
         weights = weights / np.where(top > 0, top, 1.0)
         total = weights.sum(1, keepdims=True)
-        found.append(weights / np.where(total > 0, total, 1.0))
-    return found[0], found[1]
+        rows.append(weights / np.where(total > 0, total, 1.0))
+    return rows[0], rows[1]
 
 
 def factored_pairs(
@@ -277,6 +277,6 @@ def total_cost(costs: tuple[Cost, ...], a: TrackSet, b: TrackSet) -> Float[np.nd
     total = np.zeros((len(a), len(b)))
     for cost in costs:
         if not (np.isfinite(cost.weight) and cost.weight >= 0):
-            raise ValueError(f"costs: expected weights >= 0; found {cost}.")
+            raise ValueError(f"costs: expected weights >= 0; found {cost}. Give a weight of 0 to leave a cost out.")
         total += cost.weight * cost.matrix(a, b)
     return total

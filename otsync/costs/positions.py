@@ -91,7 +91,7 @@ class SynchronousDistance:
     def pairs(
         self, a: TrackSet, b: TrackSet, i: Int[np.ndarray, " P"], j: Int[np.ndarray, " P"]
     ) -> Float[np.ndarray, " P"]:
-        from .kernels import synchronous_distances
+        from .kernels import paired_frame_distances
 
         xa, xb = positions_in_common_frame(a, b)
         ta, tb = a.times, self.rate * b.times + self.offset
@@ -99,7 +99,7 @@ class SynchronousDistance:
         at = np.clip(np.round(np.interp(ta, tb, np.arange(len(tb)))).astype(int), 0, len(tb) - 1)
         at = np.where(np.abs(tb[at] - ta) <= 0.51 * max(step, _step(tb, alone=0.0)), at, -1)
         least = max(2, round(self.min_overlap / step))
-        distance = synchronous_distances(xa, xb, i, j, at, least)
+        distance = paired_frame_distances(xa, xb, i, j, at, least)
         return capped(distance, self.scale * scene_scale(xa, xb), self.cap)
 
 

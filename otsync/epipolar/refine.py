@@ -7,18 +7,46 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..clocks.common import nominal_fps, on_clock
+from ..clocks.common import in_space, nominal_fps, on_clock
 from ..clocks.splines import TrackSplines
 from ..geometry import fundamentals, seen_pixels
 from ..refine.slot import Refiner
 from ..types import Alignment, Matches, Status, TrackSet, in_order
 from ..types.trust import Trust
-from .scan import EpipolarScan, unit_of
+from .scan import MAD, EpipolarScan, unit_of
 
 MATCHES = 200
 """Most candidate pairs that are fitted."""
 
-LEAST_SIGMA = 0.03 / 30
+LEAST_SHARE, LEAST_CANDIDATES = 0.05, 3
+"""Share of its tracks' mixtures that a candidate must have to be fitted, and how many such candidates a fit needs."""
+
+MIN_SEEN = 12 / 30
+"""Seconds that a candidate must be seen in both videos to be fitted."""
+
+SPREAD_ITERATIONS = 4
+"""Steps of the fits with other windows: they start from the answer."""
+
+BY_RESIDUAL = 2.0
+"""Robust deviations at which a residual counts half (Cauchy's weight)."""
+
+BY_CANDIDATE = 1.5
+"""Median rms residuals at which a candidate counts a quarter: it does not move like its partner."""
+
+LEAST_HALF = 3
+"""Frames on either side that a mean needs to be removed, however few a second there are."""
+
+CONVERGED = 1e-4
+"""Frames below which a step is the last."""
+
+UNKNOWN_SIGMA = 0.5
+"""Sigma in frames where the fit left its start, so that the scan's whole-frame answer stands."""
+
+LEAST_SIGMA = 0.03
+"""Frames added to sigma in squares: what is left on clean tracks, from splines and calibration."""
+
+TINY = 1e-9
+"""Pixels added to scales of residuals, which may all be 0."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +59,8 @@ class EpipolarRefine(Refiner):
     splines, never bridged over gaps.
 
     Args:
-        windows: half windows of detrending, s: the answer's, and those whose answers tell its spread. reach: largest step from the start, s; beyond it the start stays, MOVED.
+        windows: half windows of detrending, s: the answer's, and those whose answers tell its spread.
+        reach: largest step from the start, s; beyond it the start stays, MOVED.
     """
 
     windows: tuple[float, ...] = (20 / 30, 10 / 30, 40 / 30)
@@ -51,12 +80,14 @@ class EpipolarRefine(Refiner):
             flags = in_order((*alignment.flags, Status.NO_OVERLAP))
             return replace(alignment, flags=flags)
         offset, sigma = problem.solve(alignment.offset, self.windows[0], self.iterations, self.reach)
-        others = [problem.solve(offset, w, 4, self.reach)[0] for w in self.windows[1:] if np.isfinite(offset)]
+        others = [
+            problem.solve(offset, w, SPREAD_ITERATIONS, self.reach)[0] for w in self.windows[1:] if np.isfinite(offset)
+        ]
         spread = max((abs(o - offset) for o in others if np.isfinite(o)), default=0.0)
         sigma = float(np.hypot(sigma, spread))
         raised = list(alignment.flags)
         if not np.isfinite(offset) or abs(offset - alignment.offset) > self.reach:
-            offset, sigma = alignment.offset, 0.5 / fps
+            offset, sigma = alignment.offset, UNKNOWN_SIGMA / fps
             raised.append(Status.MOVED)
         stats = alignment.stats | {
             "moved": abs(offset - alignment.offset),
@@ -67,7 +98,7 @@ class EpipolarRefine(Refiner):
         return replace(
             alignment,
             offset=float(offset),
-            sigma=float(np.hypot(sigma, LEAST_SIGMA)),
+            sigma=float(np.hypot(sigma, LEAST_SIGMA / fps)),
             flags=ordered,
             stats=stats,
         )
@@ -90,19 +121,17 @@ class _Problem:
         cls, refine: EpipolarRefine, a: TrackSet, b: TrackSet, matches: Matches, offset: float, fps: float
     ) -> _Problem | None:
         assert a.camera is not None and b.camera is not None
-        xa, xb = on_clock(a, fps), on_clock(b, fps)
+        xa, xb = (on_clock(tracks, seen_pixels(tracks), fps) for tracks in (a, b))
         F = fundamentals(a.camera, b.camera)
         lag = round((offset - float(a.times[0] - b.times[0])) * fps)
         share = refine.scan.support(xa, xb, F, matches.pairs, lag, fps, unit_of(a, b))
         best = np.argsort(-share, kind="stable")[:MATCHES]
-        best = best[share[best] > 0.05]
-        if len(best) < 3:
+        best = best[share[best] > LEAST_SHARE]
+        if len(best) < LEAST_CANDIDATES:
             return None
         i, j = matches.pairs[best].T
         used, where = np.unique(j, return_inverse=True)
-        uv = seen_pixels(b)[used]
-        flat = np.concatenate([uv, np.where(np.isfinite(uv[..., :1]), 0.0, np.nan)], 2)
-        splines = TrackSplines(b.times, flat).take(where)
+        splines = TrackSplines(b.times, in_space(seen_pixels(b)[used])).take(where)
         times = a.times[0] + np.arange(xa.shape[1]) / fps
         return cls(xa[i], splines, times, F, float(b.times[0]), fps, share[best])
 
@@ -121,21 +150,21 @@ class _Problem:
 
     def solve(self, offset: float, window: float, iterations: int, reach: float) -> tuple[float, float]:
         """Offset and one sigma (clustered by match and by second), s; nan when nothing overlaps."""
-        start, step, half = offset, 0.5 / self.fps, max(3, round(window * self.fps))
+        start, step, half = offset, 0.5 / self.fps, max(LEAST_HALF, round(window * self.fps))
         sigma = float("nan")
         for _ in range(iterations):
             e = self.residual(offset)
             J = (self.residual(offset + step) - self.residual(offset - step)) / (2 * step)
             known = np.isfinite(e) & np.isfinite(J)
             R, J = detrended(e, known, half), detrended(J, known, half)
-            enough = known.sum(1) >= 12
+            enough = known.sum(1) >= MIN_SEEN * self.fps
             known &= enough[:, None]
             if not known.any():
                 return float("nan"), float("nan")
-            scale = 1.4826 * float(np.median(np.abs(R[known]))) + 1e-9
+            scale = MAD * float(np.median(np.abs(R[known]))) + TINY
             rms = np.sqrt((R**2 * known).sum(1) / np.maximum(known.sum(1), 1))
-            level = 1.5 * float(np.median(rms[enough])) + 1e-9
-            w = known / (1 + (R / (2 * scale)) ** 2) * (self.weight / (1 + (rms / level) ** 2) ** 2)[:, None]
+            level = BY_CANDIDATE * float(np.median(rms[enough])) + TINY
+            w = known / (1 + (R / (BY_RESIDUAL * scale)) ** 2) * (self.weight / (1 + (rms / level) ** 2) ** 2)[:, None]
             curvature = float((w * J * J).sum())
             if curvature <= 0:
                 return float("nan"), float("nan")
@@ -145,7 +174,7 @@ class _Problem:
             blocks = np.add.reduceat(pull.sum(0), np.arange(0, pull.shape[1], max(1, round(self.fps))))
             sigma = float(np.sqrt((by_match**2).sum() + (blocks**2).sum()) / curvature)
             offset += float(np.clip(move, -step, step))
-            if abs(move) < 1e-4 / self.fps or abs(offset - start) > reach:
+            if abs(move) < CONVERGED / self.fps or abs(offset - start) > reach:
                 break
         return offset, sigma
 

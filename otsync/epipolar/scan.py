@@ -12,33 +12,59 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..align.likelihood import MIN_OVERLAP
+from ..align.likelihood import APART, MIN_OVERLAP
 from ..align.peaks import peak, separate_peaks
 from ..align.slot import Aligner
 from ..clocks.common import nominal_fps, on_clock
-from ..geometry import fundamentals
+from ..geometry import fundamentals, seen_pixels
 from ..types import Alignment, Matches, Status, TrackSet, in_order
 
-MIXTURE_CAP, FLOOR, TRACK_CAP = 80.0, -1.0, 32.0
-"""Per track: the most that one candidate counts, the outlier's floor, the most that the track counts."""
+MIXTURE_CAP = 80.0
+"""Nats that one candidate counts at most: beyond them the exponential says nothing more, and could overflow."""
+
+FLOOR = -1.0
+"""Nats of the outlier, the candidate that every track has besides its own: none of them can veto an offset."""
+
+TRACK_CAP = 32.0
+"""Nats towards which a track's evidence levels off: none carries an offset alone."""
+
+INDEPENDENT = 8
+"""Samples of a smooth track at 30 fps that count as one: neighbours tell the same."""
+
+MIN_WINDOW = 12 / 30
+"""Seconds within a window that a candidate must be seen in both videos for the window to count."""
+
+LEAST_SAMPLES = 3
+"""Samples that a variance needs, however few frames a second there are."""
+
+PEAKS = 8
+"""Peaks that are kept as hypotheses."""
+
+SIGMA, LEAST_MARGIN = 0.15, 0.03
+"""Sigma in frames of a peak without rivals; it grows with the inverse of the margin, down to the least one."""
+
+MAD = 1.4826
+"""Standard deviation of normal noise over its median absolute deviation."""
 
 
 @dataclass(frozen=True)
 class EpipolarScan(Aligner):
     """Evidence of every lag from ``uv`` and the calibration alone.
 
-    Per candidate pair and lag: -n/16 [log(1 + V/s²) - median over lags], n samples (at least ``min_overlap``), summed
+    Per candidate pair and lag: -n/16 [log(1 + V/s²) - median over lags], n samples (at least ``min_seen``), summed
     for V the residual's variance in windows (``motion``) and its raw mean square (``position``). Removing the level
     per sample is what denies a short overlap any reward. Per track the candidates form a mixture with an outlier
     floor, capped: one wrong candidate can neither veto nor carry an offset. A sum over candidates without the mixture
     fails (55 % > 2 frames); motion alone 18 %, position alone 39 %. Motion and position must be those of one
-    candidate: with a mixture for each, 8 of 630 pairs (fresh seeds) were off by more than 2 frames, with one for both 2.
+    candidate: with a mixture for each, 8 of 630 pairs (fresh seeds) were off by more than 2 frames, with one for both
+    2.
 
     A single pair cannot be certified (an alias of 65 frames kept a high margin): solve the graph of all pairs.
 
     Args:
         window: seconds. motion_scale, position_scale: s in pixels at 640 of width.
         min_overlap, max_lag: seconds, as in :class:`otsync.ConstantShift`.
+        min_seen: seconds that a candidate must be seen in both videos to say anything.
         weak, ambiguous: flags: rise of the peak over the median in (robust) deviations of the curve; its lead over the
             second peak as a share of the rise. They flag 1.6 % of the pairs of basketball (fresh seed).
     """
@@ -60,7 +86,7 @@ class EpipolarScan(Aligner):
                 raise ValueError(f"{name}: expected pixels (uv) and a camera for the epipolar scan; one is missing.")
         assert a.camera is not None and b.camera is not None
         fps = min(nominal_fps(a), nominal_fps(b))
-        xa, xb = on_clock(a, fps), on_clock(b, fps)
+        xa, xb = (on_clock(tracks, seen_pixels(tracks), fps) for tracks in (a, b))
         origin = float(a.times[0] - b.times[0])
         least = max(2, round(self.min_overlap * fps))
         lags = np.arange(-(xb.shape[1] - least), xa.shape[1] - least + 1)
@@ -116,7 +142,7 @@ class EpipolarScan(Aligner):
             int(lags[-1]),
             least,
             window,
-            max(3, round(12 * fps / 30)),
+            max(LEAST_SAMPLES, round(MIN_WINDOW * fps)),
             mean,
             count,
         )
@@ -125,8 +151,7 @@ class EpipolarScan(Aligner):
             level = np.log1p(mean[kind] / (scale * unit) ** 2)
             known = np.isfinite(level)
             if known.any():
-                # samples of a smooth track are not independent: one in eight counts, at the 30 fps of that choice
-                weight = count[kind] / 16 * (30 / fps)
+                weight = count[kind] / (2 * INDEPENDENT) * (30 / fps)
                 out.append(np.where(known, -weight * (level - np.median(level[known])), -np.inf))
         return out
 
@@ -148,8 +173,8 @@ class EpipolarScan(Aligner):
         lag = peak(lags, total)
         best = int(np.argmax(total))
         level = float(np.median(total))
-        spread = 1.4826 * float(np.median(np.abs(total - level))) + 1e-12
-        peaks = separate_peaks(total, max(2, round(4 * fps / 30)))[:8]
+        spread = MAD * float(np.median(np.abs(total - level))) + 1e-12
+        peaks = separate_peaks(total, max(2, round(APART * fps)), PEAKS)
         strength = float(total[best] - level)
         margin = 1.0 if len(peaks) < 2 else float((total[peaks[0]] - total[peaks[1]]) / max(strength, 1e-12))
         flags = []
@@ -165,7 +190,7 @@ class EpipolarScan(Aligner):
         hypotheses[0, 0] = origin + lag / fps
         return Alignment(
             origin + lag / fps,
-            sigma=0.3 / max(margin, 0.03) / fps * 0.5,
+            sigma=SIGMA / max(margin, LEAST_MARGIN) / fps,
             hypotheses=hypotheses,
             curve=curve,
             fps=fps,

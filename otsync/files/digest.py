@@ -97,7 +97,7 @@ def _parts(x: Any) -> list[Any]:
 
 
 def _defined_as(name: str, x: types.FunctionType) -> bool:
-    found: Any = sys.modules.get(x.__module__)
+    thing: Any = sys.modules.get(x.__module__)
     for part in x.__qualname__.split("."):
-        found = getattr(found, part, None)
-    return found is x
+        thing = getattr(thing, part, None)
+    return thing is x

@@ -33,14 +33,17 @@ def read_labels(path: str | os.PathLike[str]) -> Int[np.ndarray, "H W"]:
     values = np.asarray(_decode(path))
     if values.ndim != 2 or values.dtype.kind not in "iu":
         raise ValueError(
-            f"{path}: expected labels (H,W) as whole numbers; found {values.dtype} of {values.shape}. Save one number a "
-            "pixel in a grey PNG."
+            f"{path}: expected labels (H,W) as whole numbers; found {values.dtype} of {values.shape}. Save one "
+            "number a pixel in a grey PNG."
         )
     return values
 
 
 def read_depth(path: str | os.PathLike[str], scale: float) -> Float[np.ndarray, "H W"]:
-    """Depth along z in world units, 0 where unknown: 16-bit PNG times ``scale``, ``.npy``, or ``.npz`` with one array."""
+    """Depth along z in world units, 0 where unknown: what the file holds times ``scale``.
+
+    A 16-bit PNG, ``.npy``, or ``.npz`` with one array.
+    """
     suffix = os.path.splitext(path)[1].lower()
     if suffix == ".npy":
         values = read_npy(path)

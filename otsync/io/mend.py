@@ -1,4 +1,4 @@
-"""Parts of a scene: some frames of its videos, and those of them that can be read at all."""
+"""Parts of a scene: some of its frames, and which frames cannot be read."""
 
 from __future__ import annotations
 
@@ -14,7 +14,10 @@ from .scene import Scene
 
 
 def cut(scene: Scene, first: int, stop: int) -> Scene:
-    """Frames ``first`` to ``stop`` (exclusive) of every video, at the times they had. ValueError where there are none."""
+    """Frames ``first`` to ``stop`` (exclusive) of every video, at the times they had.
+
+    ValueError for a video without such frames.
+    """
     for video in scene.videos:
         if not 0 <= first < min(stop, len(video.frames)):
             raise ValueError(
@@ -48,7 +51,7 @@ def keep_frames(scene: Scene, index: Sequence[Sequence[int]]) -> Scene:
 
 
 def unreadable(video: Video, masks: Sequence[Any] | None = None) -> dict[int, str]:
-    """Frames that nothing can be made of, and why: damaged, of another size than the camera says, or with NaN.
+    """Frames that are of no use, and why: damaged, of another size than the camera says, or with NaN.
 
     Every frame is decoded once, its mask and depth map too.
     """

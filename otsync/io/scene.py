@@ -1,4 +1,4 @@
-"""``scene.json``: which videos, which clocks, which cameras; and the :class:`Scene` it describes.
+"""``scene.json``: the videos of a recording with their clocks and cameras; and the :class:`Scene` it describes.
 
 A document::
 
@@ -91,7 +91,11 @@ def open_scene(path: str | os.PathLike[str], *, reader: str | None = None, allow
 
 
 def read_document(path: str | os.PathLike[str], *, reader: str | None = None) -> tuple[dict[str, Any], Path]:
-    """The scene document behind ``path``, and the folder its paths are relative to. ``reader`` as in :func:`open_scene`."""
+    """The scene document behind ``path``, and the folder that its paths are relative to.
+
+    Args:
+        reader: as in :func:`open_scene`.
+    """
     path = Path(path)
     if reader is not None or (path.is_dir() and not (path / "scene.json").is_file()):
         return describe_folder(path, reader=reader), path
@@ -112,8 +116,8 @@ def scene_from_document(document: dict[str, Any], root: Path, *, allow_outside: 
         raise ValueError(f"scene.videos: expected a list of 1 to {MAX_VIDEOS} videos; found {_short(entries)}.")
     if document.get("missing"):
         raise ValueError(
-            f"scene.json: still missing: {_short(document['missing'])}. Write the file with otsync init, fill it in, then "
-            "delete 'missing'."
+            f"scene.json: still missing: {_short(document['missing'])}. Write the file with otsync init, fill it in, "
+            "then delete 'missing'."
         )
     builder = Paths(root, allow_outside)
     built = [_video(entry, n, builder) for n, entry in enumerate(entries)]
@@ -138,19 +142,19 @@ def _video(entry: Any, n: int, paths: Paths) -> tuple[Video, Sequence[np.ndarray
     where = f"scene.videos[{n}] ({name[:80]})"
     try:
         frames, timestamps, fps = video_frames(entry, paths)
-        keep = _range(entry, len(frames))
+        shown = _range(entry, len(frames))
         camera = camera_from(entry.get("camera"))
         if camera.w2c.ndim == 3 and len(camera.w2c) == len(frames):
-            camera = replace(camera, w2c=camera.w2c[keep.start : keep.stop])
+            camera = replace(camera, w2c=camera.w2c[shown.start : shown.stop])
         if timestamps is not None and len(timestamps) == len(frames):
-            timestamps = timestamps[keep.start : keep.stop]
+            timestamps = timestamps[shown.start : shown.stop]
 
         def cut(sequence: LazyFrames | None, what: str) -> LazyFrames | None:
             if sequence is None:
                 return None
             if len(sequence) != len(frames):
                 raise ValueError(f"{what}: expected {len(frames)} files, one a frame; found {len(sequence)}.")
-            return sequence if len(keep) == len(sequence) else FrameRange(sequence, keep)
+            return sequence if len(shown) == len(sequence) else FrameRange(sequence, shown)
 
         depth = cut(_depth(entry.get("depth"), paths), "depth")
         masks = cut(_images(entry.get("masks"), paths, read_mask, "mask"), "masks")
@@ -257,12 +261,12 @@ class Paths:
         if "*" in base:
             raise ValueError(f"frames: expected '*' in the file name only; found {_short(pattern)}.")
         folder = self.one(base or ".")
-        found = sorted(folder.glob(name), key=natural)[: MAX_FILES + 1] if folder.is_dir() else []
-        if not 0 < len(found) <= MAX_FILES:
+        files = sorted(folder.glob(name), key=natural)[: MAX_FILES + 1] if folder.is_dir() else []
+        if not 0 < len(files) <= MAX_FILES:
             raise FileNotFoundError(f"no files (or more than {MAX_FILES}) match {pattern!r} in {self.root}.")
         if self.allow_outside:
-            return found
-        return [self.one(f"{base}/{p.name}" if base else p.name) for p in found]
+            return files
+        return [self.one(f"{base}/{p.name}" if base else p.name) for p in files]
 
 
 def natural(path: Path) -> list[Any]:

@@ -53,7 +53,7 @@ class DenseStereo:
         than the hull's views see at their moment have empty maps. ``key``: what the pixels and masks are; without it
         nothing is kept.
         """
-        keep = cache if cache is not None and key else Cache()
+        store = cache if cache is not None and key else Cache()
         space = Space.of(self.stereo, rig)
         # the box of the hull, and with it where voxels lie, depends on all moments
         key = (*key, self, content_key(rig.index))
@@ -66,17 +66,17 @@ class DenseStereo:
 
         def moment(item: tuple[int, list[tuple[int, int]]]) -> dict[str, np.ndarray]:
             s, views = item
-            return keep.arrays("dense", (*key, s, tuple(views)), lambda: self._moment_maps(rig, space, s, views))
+            return store.arrays("dense", (*key, s, tuple(views)), lambda: self._moment_maps(rig, space, s, views))
 
-        found: dict[tuple[int, int], np.ndarray] = {}
+        made: dict[tuple[int, int], np.ndarray] = {}
         for (_, views), maps in zip(wanted.items(), map(moment, wanted.items()), strict=True):
-            found |= {(v, k): maps[f"depth{v}_{k}"] for v, k in views}
+            made |= {(v, k): maps[f"depth{v}_{k}"] for v, k in views}
         out = []
         for v, chosen in enumerate(frames):
             w, h = self.size(rig.frames[v])
             empty = np.zeros((h, w), np.float32)
             out.append(
-                np.stack([found.get((v, k), empty) for k in chosen]) if len(chosen) else np.zeros((0, h, w), np.float32)
+                np.stack([made.get((v, k), empty) for k in chosen]) if len(chosen) else np.zeros((0, h, w), np.float32)
             )
         return out
 
@@ -138,7 +138,10 @@ def mask_pixels(
 
 
 def neighbourhood(inside: Bool[np.ndarray, "h w"], reach: int) -> Int[np.ndarray, "N S"]:
-    """Per pixel of ``inside``, in row order, the numbers of the pixels around it, itself first; N where there is none."""
+    """Per pixel of ``inside``, in row order, the numbers of the pixels around it; N where there is none.
+
+    The pixel itself comes first.
+    """
     count = int(inside.sum())
     number = np.full(np.array(inside.shape) + 2 * reach, count)
     middle = (slice(reach, reach + inside.shape[0]), slice(reach, reach + inside.shape[1]))

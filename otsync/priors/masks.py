@@ -98,6 +98,6 @@ def tidy(changed: Bool[np.ndarray, "h w"], unit: float, min_area: int) -> Bool[n
     mask = cv2.morphologyEx(changed.astype(np.uint8), cv2.MORPH_OPEN, square(3))
     mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, square(9))
     _, component, stats, _ = cv2.connectedComponentsWithStats(mask)
-    keep = stats[:, cv2.CC_STAT_AREA] > min_area * unit**2
-    keep[0] = False
-    return keep[component]
+    large = stats[:, cv2.CC_STAT_AREA] > min_area * unit**2
+    large[0] = False
+    return large[component]

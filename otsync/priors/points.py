@@ -25,8 +25,8 @@ class ChainedFlow:
         grid: spacing of seeds in pixels; a seed closer than half of it to a living track is left out.
         every: frames between seedings. phase: the first one.
         agree: largest distance of the way there and back, in pixels, plus ``agree_share`` of the step's length.
-        min_life: frames below which a track is dropped. most: tracks that are returned, the longest-lived: 32 kB a frame,
-            so that memory stays bounded on long videos.
+        min_life: frames below which a track is dropped.
+        most: tracks that are returned, the longest-lived: 32 kB a frame, so that memory stays bounded on long videos.
         max_gap, join: tracks that end are joined to ones that begin up to ``max_gap`` frames later within ``join``
             pixels of where constant velocity leads; 0 frames: no joining.
     """
@@ -106,14 +106,14 @@ class ChainedFlow:
     def _dense(self, steps, T):
         """(N,T,2) of the tracks that live long enough, at most the ``most`` longest-lived, in order of their seeds."""
         life = np.bincount(np.concatenate([ids for _, ids, _ in steps]))
-        keep = np.flatnonzero(life >= min(self.min_life, T))
-        keep = np.sort(keep[np.argsort(-life[keep], kind="stable")[: self.most]])
+        chosen = np.flatnonzero(life >= min(self.min_life, T))
+        chosen = np.sort(chosen[np.argsort(-life[chosen], kind="stable")[: self.most]])
         row = np.full(len(life), -1)
-        row[keep] = np.arange(len(keep))
-        uv = np.full((len(keep), T, 2), np.nan, np.float32)
+        row[chosen] = np.arange(len(chosen))
+        uv = np.full((len(chosen), T, 2), np.nan, np.float32)
         for t, ids, x in steps:
-            kept = row[ids] >= 0
-            uv[row[ids[kept]], t] = x[kept]
+            lives = row[ids] >= 0
+            uv[row[ids[lives]], t] = x[lives]
         return uv
 
     def _step(self, x, there, back, mask, frames):

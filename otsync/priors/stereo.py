@@ -120,11 +120,11 @@ class HullStereo:
         space = Space.of(self, rig)
         starts = range(0, len(rig.index), self.chunk)
         # without a key of the pixels nothing may be kept: the tracks alone do not say which images they came from
-        keep = cache if key else Cache()
+        store = cache if key else Cache()
         key = (*key, self, content_key(rig.index, *uv))
 
         def part(first: int) -> dict[str, np.ndarray]:
-            return keep.arrays("stereo", (*key, first), lambda: self._chunk(rig, space, uv, first))
+            return store.arrays("stereo", (*key, first), lambda: self._chunk(rig, space, uv, first))
 
         depth = [np.zeros(x.shape[:2], np.float32) for x in uv]
         for arrays in map(part, starts):

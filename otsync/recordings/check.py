@@ -1,4 +1,4 @@
-"""``otsync check``: what commonly goes wrong in a recording, found before hours are spent on it, each with its remedy."""
+"""``otsync check``: finds common faults of a recording before hours are spent on it, each with its remedy."""
 
 from __future__ import annotations
 
@@ -10,14 +10,45 @@ from typing import Any, Literal
 
 import numpy as np
 
+from ..clocks.common import USUAL_FPS
 from ..clocks.shutter import LONGEST
 from ..geometry import common_target
 from ..io.frames import VideoFrames
 from ..io.scene import Paths, Scene, camera_from, read_document, scene_from_document, video_frames
 from ..types import Camera, Video
 
-MIRRORED = np.diag([1.0, -1.0, -1.0, 1.0])
+FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """From OpenGL's axes (x right, y up, z back) to OpenCV's."""
+
+ORTHONORMAL, LAST_ROW = 1e-3, 1e-6
+"""Largest errors of R Rᵀ, and of the last row of a pose: files round to a few digits."""
+
+MIDDLE = (0.25, 0.75)
+"""Shares of the image between which a principal point lies; K of another resolution leaves them."""
+
+FOCAL = (0.2, 20.0)
+"""Focal lengths in widths of the image: from a fisheye to a strong tele."""
+
+SQUARE = (0.8, 1.25)
+"""Ratios of the focal lengths: pixels are square but for rounding and old anamorphic video."""
+
+FEW_SECONDS = 1.6
+"""Clips below this length rarely hold motion enough (48 frames at 30 fps)."""
+
+SAME_RATE = 0.005
+"""Relative difference of frame rates that says nothing: 29.97 and 30 differ by a fifth of it."""
+
+DROPPED = 1.9
+"""Median steps that make a gap in the timestamps: a frame is missing."""
+
+FEW = 1 / 3
+"""Share of the cameras that may look away alone; of more the poses as a whole are in doubt."""
+
+DEPTH_RATIO = (0.2, 5.0)
+"""Median depth over the distance to where the cameras look; units differ by tens and more."""
+
+BEYOND = 0.5
+"""Images beside an image where the common target may still lie."""
 
 
 @dataclass(frozen=True)
@@ -42,32 +73,32 @@ def check_scene(
         document, root = read_document(path)
         entries = document.get("videos")
         if not isinstance(entries, list) or not all(isinstance(e, dict) for e in entries) or not entries:
-            raise ValueError(f"{path}: expected a list of videos.")
+            raise ValueError(f"{path}: expected a list of videos; found {str(entries)[:80]}.")
     except (ValueError, OSError) as error:
         return [Finding("error", "", str(error), "Mend the file, or write it anew with otsync init.")]
-    found: list[Finding] = []
+    findings: list[Finding] = []
     for item in document.get("missing") or ():
-        found.append(Finding("error", "", f"still missing: {item}.", "Fill it in, then delete 'missing'."))
+        findings.append(Finding("error", "", f"still missing: {item}.", "Fill it in, then delete 'missing'."))
     if len(entries) < 2:
-        found.append(Finding("error", "", "one video only.", "Add at least a second one."))
+        findings.append(Finding("error", "", "one video only.", "Add at least a second one."))
     for n, entry in enumerate(entries):
         name = str(entry.get("name", f"video{n}"))
         pose = list(_pose(entry, name))
-        found += pose
+        findings += pose
         if pose:
             continue
         try:
             one = scene_from_document({**document, "videos": [entry], "missing": []}, root, allow_outside=allow_outside)
         except (ValueError, OSError) as error:
-            found.append(Finding("error", name, str(error), ""))
+            findings.append(Finding("error", name, str(error), ""))
             continue
-        found += _intrinsics(one.videos[0])
-        found += _files(one, every_frame)
-        found += _clock(entry, one.videos[0], Paths(root, allow_outside))
+        findings += _intrinsics(one.videos[0])
+        findings += _files(one, every_frame)
+        findings += _clock(entry, one.videos[0], Paths(root, allow_outside))
     cameras = _cameras(entries)
-    found += _common_volume(cameras)
-    found += _depth_units(document, root, cameras, allow_outside)
-    return sorted(found, key=lambda f: f.severity)
+    findings += _common_volume(cameras)
+    findings += _depth_units(document, root, cameras, allow_outside)
+    return sorted(findings, key=lambda f: f.severity)
 
 
 def _pose(entry: dict[str, Any], name: str) -> Iterable[Finding]:
@@ -90,14 +121,14 @@ def _pose(entry: dict[str, Any], name: str) -> Iterable[Finding]:
             "It is perhaps camera-to-world with OpenGL axes, or with one axis flipped: negate columns 1 and 2 of c2w "
             "(OpenGL), or undo the flip, then invert to get w2c.",
         )
-    elif not np.allclose(R @ np.swapaxes(R, -1, -2), np.eye(3), atol=1e-3):
+    elif not np.allclose(R @ np.swapaxes(R, -1, -2), np.eye(3), atol=ORTHONORMAL):
         yield Finding(
             "error",
             name,
             f"camera.w2c holds no rotation (its scale is about {float(np.median(scale)):.4g}).",
             "Take scale and shear out of the upper 3x3.",
         )
-    if not np.allclose(w2c[..., 3, :], [0, 0, 0, 1], atol=1e-6):
+    if not np.allclose(w2c[..., 3, :], [0, 0, 0, 1], atol=LAST_ROW):
         yield Finding(
             "error",
             name,
@@ -108,21 +139,22 @@ def _pose(entry: dict[str, Any], name: str) -> Iterable[Finding]:
 
 def _intrinsics(video: Video) -> Iterable[Finding]:
     K, w, h = video.camera.K, video.camera.width, video.camera.height
-    if not (0.25 * w < K[0, 2] < 0.75 * w and 0.25 * h < K[1, 2] < 0.75 * h):
+    low, high = MIDDLE
+    if not (low * w < K[0, 2] < high * w and low * h < K[1, 2] < high * h):
         yield Finding(
             "error",
             video.name,
             f"the principal point ({K[0, 2]:.0f}, {K[1, 2]:.0f}) is far from the middle of {w} x {h} pixels.",
             "K probably belongs to another resolution: scale its first two rows by the ratio of the widths.",
         )
-    if not 0.2 * w < K[0, 0] < 20 * w:
+    if not FOCAL[0] * w < K[0, 0] < FOCAL[1] * w:
         yield Finding(
             "warning",
             video.name,
             f"a focal length of {K[0, 0]:.4g} pixels is odd for a width of {w}.",
             "Check the unit (pixels, not millimetres) and the resolution of K.",
         )
-    if not 0.8 < K[0, 0] / K[1, 1] < 1.25:
+    if not SQUARE[0] < K[0, 0] / K[1, 1] < SQUARE[1]:
         yield Finding(
             "warning", video.name, f"focal lengths {K[0, 0]:.4g} and {K[1, 1]:.4g} differ a lot.", "Check K's rows."
         )
@@ -132,7 +164,7 @@ def _files(scene: Scene, every_frame: bool) -> Iterable[Finding]:
     """Frames, masks, labels and depth that do not decode, and sizes that disagree with the camera."""
     video = scene.videos[0]
     n = len(video.frames)
-    if n < 48:
+    if n < FEW_SECONDS * (video.fps or USUAL_FPS):
         yield Finding("warning", video.name, f"{n} frames are few.", "Use clips of two seconds and more.")
     picks = range(n) if every_frame else sorted({0, n // 2, n - 1})
     labels = scene.labels[0] if scene.labels else None
@@ -163,19 +195,19 @@ def _files(scene: Scene, every_frame: bool) -> Iterable[Finding]:
 def _clock(entry: dict[str, Any], video: Video, paths: Paths) -> Iterable[Finding]:
     """Declared fps against timestamps, and against the container's; a readout longer than a frame."""
     if entry.get("timestamps") is not None and entry.get("fps") is not None and len(video.frames) > 1:
-        told, seen = float(entry["fps"]), 1.0 / float(np.median(np.diff(video.times)))
-        if abs(told / seen - 1) > 0.005:
+        declared, seen = float(entry["fps"]), 1.0 / float(np.median(np.diff(video.times)))
+        if abs(declared / seen - 1) > SAME_RATE:
             yield Finding(
                 "error",
                 video.name,
-                f"fps says {told:.4g}, timestamps say {seen:.4g}.",
+                f"fps says {declared:.4g}, timestamps say {seen:.4g}.",
                 "Timestamps win: delete fps, or correct the timestamps' unit (seconds).",
             )
     if "file" in entry and entry.get("fps") is not None:
         frames, _, _ = video_frames(entry, paths)
         if isinstance(frames, VideoFrames) and len(frames) > 1:
             seen = 1.0 / float(np.median(np.diff(frames.timestamps)))
-            if abs(float(entry["fps"]) / seen - 1) > 0.005:
+            if abs(float(entry["fps"]) / seen - 1) > SAME_RATE:
                 yield Finding(
                     "warning",
                     video.name,
@@ -191,11 +223,11 @@ def _clock(entry: dict[str, Any], video: Video, paths: Paths) -> Iterable[Findin
             f"camera.readout is {readout:g} s; a frame lasts {float(np.median(steps)):.4g} s.",
             "Give the seconds from the first to the last row (phones: 0.005 to 0.03), or leave it out.",
         )
-    if len(steps) and steps.max() > 1.9 * np.median(steps):
+    if len(steps) and steps.max() > DROPPED * np.median(steps):
         yield Finding(
             "warning",
             video.name,
-            f"{int((steps > 1.9 * np.median(steps)).sum())} gaps in the timestamps.",
+            f"{int((steps > DROPPED * np.median(steps)).sum())} gaps in the timestamps.",
             "Frames were dropped; nothing to do unless they are many.",
         )
 
@@ -206,7 +238,7 @@ def _cameras(entries: Sequence[dict[str, Any]]) -> dict[str, Camera]:
         try:
             out[str(entry.get("name", f"video{n}"))] = camera_from(entry.get("camera"))
         except (ValueError, TypeError, KeyError, OverflowError):
-            continue  # told by the video's own checks
+            continue  # the checks of each video report it
     return out
 
 
@@ -220,9 +252,9 @@ def _common_volume(cameras: dict[str, Camera]) -> Iterable[Finding]:
     names = [n for n, a in zip(cameras, astray, strict=True) if a]
     readings = {
         "They look like camera-to-world matrices: invert them.": lambda m: np.linalg.inv(m),
-        "They look like world-to-camera with OpenGL axes: negate rows 1 and 2.": lambda m: MIRRORED @ m,
+        "They look like world-to-camera with OpenGL axes: negate rows 1 and 2.": lambda m: FROM_OPENGL @ m,
         "They look like camera-to-world with OpenGL axes: negate columns 1 and 2, then invert.": lambda m: (
-            np.linalg.inv(m @ MIRRORED)
+            np.linalg.inv(m @ FROM_OPENGL)
         ),
     }
     for remedy, read in readings.items():
@@ -230,7 +262,7 @@ def _common_volume(cameras: dict[str, Camera]) -> Iterable[Finding]:
         if not _looking_away(again).any():
             yield Finding("error", "", "the cameras do not look at a common volume.", remedy)
             return
-    few = len(names) <= len(cameras) / 3
+    few = len(names) / len(cameras) <= FEW
     yield Finding(
         "warning" if few else "error",
         ", ".join(names) if few else "",
@@ -248,7 +280,8 @@ def _looking_away(cameras: list[Camera]) -> np.ndarray:
         local = w2c[:3, :3] @ target + w2c[:3, 3]
         u = camera.K @ local
         z = local[2]
-        inside = z > 1e-6 and -0.5 < u[0] / z / camera.width < 1.5 and -0.5 < u[1] / z / camera.height < 1.5
+        place = u[:2] / z / [camera.width, camera.height] if z > 1e-6 else np.array([np.inf, np.inf])
+        inside = bool((place > -BEYOND).all() and (place < 1 + BEYOND).all())
         away.append(not inside)
     return np.array(away)
 
@@ -270,13 +303,13 @@ def _depth_units(
             assert video.depth is not None
             depth = np.asarray(video.depth[len(video.depth) // 2])
         except (ValueError, OSError):
-            continue  # told by the files' own check
+            continue  # the check of the files reports it
         if not (depth > 0).any():
             yield Finding("warning", name, "the middle depth map is empty.", "0 means unknown: check the files.")
             continue
         expected = float(np.linalg.norm(np.atleast_2d(cameras[name].center)[0] - target))
         ratio = float(np.median(depth[depth > 0])) / max(expected, 1e-12)
-        if not 0.2 < ratio < 5:
+        if not DEPTH_RATIO[0] < ratio < DEPTH_RATIO[1]:
             power = 10.0 ** -round(float(np.log10(ratio)))
             yield Finding(
                 "error",

@@ -63,15 +63,15 @@ def pack(answer: Answer) -> dict[str, np.ndarray]:
         "refined": _words(answer.refined) | _numbers(answer.refined),
     }
     out = {"told": np.array(json.dumps(told)), "pairs": matches.pairs, "score": np.asarray(matches.score, float)}
-    for name, found in (("scanned", answer.scanned), ("refined", answer.refined)):
-        out[f"{name}_hypotheses"] = np.asarray(found.hypotheses, float)
-        if found.curve is not None:
-            out[f"{name}_curve"] = np.asarray(found.curve, float)
+    for name, alignment in (("scanned", answer.scanned), ("refined", answer.refined)):
+        out[f"{name}_hypotheses"] = np.asarray(alignment.hypotheses, float)
+        if alignment.curve is not None:
+            out[f"{name}_curve"] = np.asarray(alignment.curve, float)
     return out
 
 
 def unpack(pair: tuple[int, int], arrays: dict[str, np.ndarray]) -> Answer:
-    """What :func:`pack` kept."""
+    """The answer that :func:`pack` made arrays of."""
     told = json.loads(str(arrays["told"]))
 
     def words(of: dict[str, Any]) -> dict[str, Any]:
@@ -96,10 +96,10 @@ def unpack(pair: tuple[int, int], arrays: dict[str, np.ndarray]) -> Answer:
     return Answer(pair, matches, alignment("scanned"), alignment("refined"))
 
 
-def _words(found: Matches | Alignment) -> dict[str, Any]:
-    stats = {k: float(v) for k, v in found.stats.items()}
-    return {"flags": [f.code for f in found.flags], "stats": stats}
+def _words(result: Matches | Alignment) -> dict[str, Any]:
+    stats = {k: float(v) for k, v in result.stats.items()}
+    return {"flags": [f.code for f in result.flags], "stats": stats}
 
 
-def _numbers(found: Alignment) -> dict[str, float]:
-    return {k: float(getattr(found, k)) for k in ("offset", "rate", "sigma", "fps")}
+def _numbers(alignment: Alignment) -> dict[str, float]:
+    return {k: float(getattr(alignment, k)) for k in ("offset", "rate", "sigma", "fps")}

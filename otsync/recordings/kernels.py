@@ -6,20 +6,24 @@ import numpy as np
 
 from ..compute.jit import kernel
 
+CLOSE = 0.8
+"""Mean distance, as a share of the one that separates tracks, below which a track follows another all the same."""
+
 
 @kernel()
-def keep_apart(uv, apart, count):
-    """Greedy choice in the given order: skip a track that stays within ``apart`` of a kept one over >= 5 frames.
+def apart_from_others(uv, apart, least, count):
+    """Greedy choice in the given order, without tracks that stay within ``apart`` of a chosen one.
 
-    uv (N,T,2), nan unseen. Returns the kept indices.
+    Two tracks are compared where both are seen, in ``least`` frames or more.
+    uv (N,T,2), nan unseen. Returns the chosen indices, at most ``count``.
     """
     N, T = uv.shape[0], uv.shape[1]
-    kept = np.empty(min(count, N), np.int64)
+    chosen = np.empty(min(count, N), np.int64)
     n = 0
     for i in range(N):
         alone = True
         for q in range(n):
-            j = kept[q]
+            j = chosen[q]
             met, furthest, total = 0, 0.0, 0.0
             for t in range(T):
                 if np.isnan(uv[i, t, 0]) or np.isnan(uv[j, t, 0]):
@@ -28,12 +32,12 @@ def keep_apart(uv, apart, count):
                 met += 1
                 total += d
                 furthest = max(furthest, d)
-            if met >= 5 and (furthest < apart or total < 0.8 * apart * met):
+            if met >= least and (furthest < apart or total < CLOSE * apart * met):
                 alone = False
                 break
         if alone:
-            kept[n] = i
+            chosen[n] = i
             n += 1
             if n == count:
                 break
-    return kept[:n]
+    return chosen[:n]

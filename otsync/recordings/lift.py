@@ -11,6 +11,18 @@ from jaxtyping import Bool, Float
 from ..clocks.shutter import at_frame_times
 from ..types import TrackSet
 
+LATERAL = 0.5
+"""Pixels: the error of a tracked point across the line of sight."""
+
+DEPTH_SHARE = 0.004
+"""Error of a measured depth as a share of it, besides its scatter over time."""
+
+MAD = 1.4826
+"""Standard deviation of normal noise over its median absolute deviation."""
+
+FLAT = 0.05
+"""Largest range of the nine values around a point, as a share of their median: more is an outline."""
+
 
 @dataclass(frozen=True)
 class Lift:
@@ -50,18 +62,18 @@ class Lift:
         local = rays * z[..., None]
         xyz = smooth_in_time(camera.to_world(local), self.smooth * fps)
         seen = np.isfinite(xyz[..., 0])
-        # the lateral error of half a pixel and the scatter of the depth, which smoothing over ~2.7 samples calms
-        lateral = 0.5 * z / camera.K[0, 0]
-        sigma = np.where(seen, np.hypot(lateral, np.nan_to_num(rough, nan=0.0) * 1.4826 + 0.004 * z), np.nan)
-        keep = seen.sum(1) >= self.least
+        # smoothing over ~2.7 samples calms both the error across the line of sight and the scatter along it
+        lateral = LATERAL * z / camera.K[0, 0]
+        sigma = np.where(seen, np.hypot(lateral, np.nan_to_num(rough, nan=0.0) * MAD + DEPTH_SHARE * z), np.nan)
+        enough = seen.sum(1) >= self.least
         lifted = replace(
             tracks, xyz=np.where(seen[..., None], xyz, 0.0), visible=seen, sigma=np.where(seen, sigma, 0.0)
         )
-        return at_frame_times(lifted.take(np.flatnonzero(keep)))
+        return at_frame_times(lifted.take(np.flatnonzero(enough)))
 
 
 def depth_at(
-    maps: Sequence[np.ndarray | None], tracks: TrackSet, raw_uv: Float[np.ndarray, "N T 2"], edge: float = 0.05
+    maps: Sequence[np.ndarray | None], tracks: TrackSet, raw_uv: Float[np.ndarray, "N T 2"], edge: float = FLAT
 ) -> Float[np.ndarray, "N T"]:
     """Depth of every track sample from given maps: the median of the 3x3 pixels around it, 0 at edges and holes.
 

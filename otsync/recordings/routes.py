@@ -1,4 +1,4 @@
-"""From a scene of recordings to offsets: which route, in which stages, each kept on disk so that a run continues.
+"""From a scene of recordings to offsets: the routes, in stages that are kept on disk so that a run continues.
 
 Routes::
 
@@ -7,9 +7,9 @@ Routes::
     stereo    a static rig            the epipolar route, then hull and stereo at its offsets, then the tracks route
 
 Rolling shutters of declared readout are undone once on every route: pixels where pairs are compared
-(:func:`otsync.synchronize`), positions after lifting (:class:`otsync.recordings.lift.Lift`), which needs the images' own pixels. Hull
-and stereo compare rows of several cameras as if they were of one moment: what moves gets a depth that mixes moments up
-to half the sum of both readouts apart.
+(:func:`otsync.synchronize`), positions after lifting (:class:`otsync.recordings.lift.Lift`), which needs the images'
+own pixels. Hull and stereo compare rows of several cameras as if they were of one moment: what moves gets a depth that
+mixes moments up to half the sum of both readouts apart.
 
 Measured on basketball, 8 cameras of 120 frames of 640 x 360, two cores: the epipolar route 45 s cold, 3 s warm, 0.42 GB
 at most; the stereo route 25 s more, 0.79 GB. Longer clips take about 30 kB a frame and video for masks, and as much as
@@ -46,7 +46,7 @@ Route = Literal["auto", "tracks", "epipolar", "stereo"]
 
 @dataclass(frozen=True, eq=False)
 class Synchronized:
-    """What a run came to.
+    """The outcome of :func:`synchronize_scene`.
 
     Args:
         offsets: the answer. tracks: what it was made from.
@@ -151,7 +151,7 @@ def choose_route(scene: Scene, route: Route, stages: Stages) -> tuple[str, tuple
 
 
 def lacks_stereo(scene: Scene, stages: Stages) -> str:
-    """What hull and stereo need and the scene has not; empty when nothing is missing."""
+    """Why hull and stereo cannot be used on the scene; empty when they can."""
     moving = [v.name for v in scene.videos if v.camera.w2c.ndim == 3]
     if moving:
         return f"cameras move: {', '.join(moving)}"
@@ -171,15 +171,15 @@ def track_all(
 
     def one(item: tuple[Video, Any, Any]) -> dict[str, np.ndarray]:
         video, masks, labels = item
-        found = stages.tracking(video, masks, cache)
+        tracked = stages.tracking(video, masks, cache)
         if labels is not None:
-            size, uv = (video.camera.width, video.camera.height), found["uv"]
+            size, uv = (video.camera.width, video.camera.height), tracked["uv"]
             key = (sequence_key(labels), size, content_key(uv))
-            found |= cache.arrays("labels", key, lambda: {"labels": track_labels(labels, uv, size)})
+            tracked |= cache.arrays("labels", key, lambda: {"labels": track_labels(labels, uv, size)})
         done.append(video.name)
         spent = time.perf_counter() - started
-        tell(f"tracks {len(done)}/{len(scene.videos)}: {video.name}, {len(found['uv'])} tracks, {spent:.1f} s")
-        return found
+        tell(f"tracks {len(done)}/{len(scene.videos)}: {video.name}, {len(tracked['uv'])} tracks, {spent:.1f} s")
+        return tracked
 
     labels = scene.labels or (None,) * len(scene.videos)
     return list(map(one, list(zip(scene.videos, scene.masks, labels, strict=True))))
@@ -187,22 +187,22 @@ def track_all(
 
 def select(video: Video, raw: dict[str, np.ndarray], stages: Stages, frame: str) -> TrackSet:
     """The tracks of one video that are worth keeping, in undistorted pixels."""
-    keep = stages.selection(raw["uv"], video.camera.width, video.fps or 30.0)
-    if len(keep) == 0:
+    chosen = stages.selection(raw["uv"], video.camera.width, video.fps or 30.0)
+    if len(chosen) == 0:
         raise ValueError(
             f"video {video.name}: expected moving foreground to track; found no track that lives and moves enough. "
             "Check the masks, choose a part of the clip with motion, or leave this video out."
         )
     tracks = pixel_tracks(
-        raw["uv"][keep],
-        raw["features"][keep],
+        raw["uv"][chosen],
+        raw["features"][chosen],
         video.camera,
         fps=video.fps,
         timestamps=video.timestamps,
         name=video.name,
         frame=frame,
     )
-    return replace(tracks, labels=raw["labels"][keep]) if "labels" in raw else tracks
+    return replace(tracks, labels=raw["labels"][chosen]) if "labels" in raw else tracks
 
 
 def pairs_in_pixels(
@@ -242,21 +242,21 @@ def lift_given(
     """Tracks lifted by the depth maps that came with the recording, then chosen by their life in space."""
 
     def one(item: tuple[Video, dict[str, np.ndarray]]) -> TrackSet:
-        video, found = item
+        video, tracked = item
         rich = replace(stages.selection, count=3 * stages.selection.count, apart=0.5 * stages.selection.apart)
-        keep = rich(found["uv"], video.camera.width, video.fps or 30.0)
-        uv = found["uv"][keep]
-        flat = select(video, found, replace(stages, selection=rich), scene.frame)
+        chosen = rich(tracked["uv"], video.camera.width, video.fps or 30.0)
+        uv = tracked["uv"][chosen]
+        flat = select(video, tracked, replace(stages, selection=rich), scene.frame)
         key = (stages.tracking.key(video, None), sequence_key(video.depth or []), content_key(uv))
         depth = cache.arrays("depth", key, lambda: {"z": depth_at(video.depth or [], flat, uv)})["z"]
         lifted = stages.lift(flat, depth)
-        chosen = lifted.take(stages.selection(seen_pixels(lifted), video.camera.width, video.fps or 30.0))
-        if len(chosen) == 0:
+        best = lifted.take(stages.selection(seen_pixels(lifted), video.camera.width, video.fps or 30.0))
+        if len(best) == 0:
             raise ValueError(
                 f"video {video.name}: expected depth where things move; no track could be lifted. Check the depth "
                 "maps' scale and holes (otsync check), or use --route epipolar."
             )
-        return chosen
+        return best
 
     return list(map(one, list(zip(scene.videos, raw, strict=True))))
 

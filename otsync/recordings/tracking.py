@@ -18,6 +18,12 @@ from ..priors.slots import Describer, Masker, Tracker, cache_key
 from ..priors.working import WIDTH, WorkingFrames
 from ..types import Camera, TrackSet, Video
 
+TOGETHER = 5 / 30
+"""Seconds that two tracks must share to be told apart, or not."""
+
+SHORT_CLIP = 3
+"""A track that lives this part of a clip is kept too, or of short clips none would be."""
+
 
 @dataclass(frozen=True)
 class Selection:
@@ -37,17 +43,19 @@ class Selection:
 
     def __call__(self, uv: Float[np.ndarray, "N T 2"], width: int, fps: float) -> Int[np.ndarray, " K"]:
         """Indices into ``uv`` (pixels, nan unseen), by life."""
-        from .kernels import keep_apart
+        from .kernels import apart_from_others
 
         seen = np.isfinite(uv[..., 0])
         life = seen.sum(1)
-        unit = width / 640
-        least = min(self.min_life * fps / 30, uv.shape[1] / 3)
+        unit = width / WIDTH
+        least = min(self.min_life * fps / 30, uv.shape[1] / SHORT_CLIP)
         low = np.where(seen[..., None], uv, np.inf).min(1)
         high = np.where(seen[..., None], uv, -np.inf).max(1)
         good = (life >= least) & ((high - low).max(1) > self.extent * unit)
         order = np.flatnonzero(good)[np.argsort(-life[good], kind="stable")]
-        return order[keep_apart(np.ascontiguousarray(uv[order], np.float64), self.apart * unit, self.count)]
+        together = max(1, round(TOGETHER * fps))
+        rows = np.ascontiguousarray(uv[order], np.float64)
+        return order[apart_from_others(rows, self.apart * unit, together, self.count)]
 
 
 def pixel_tracks(

@@ -9,11 +9,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..types import Alignment, Offsets
+from ..types.drawing import CHOSEN, CURVE, GREY, draw_choice, draw_clock_bars, draw_score, plain
 
 MAP_PIXELS = 100
 """Longest side of an embedded cost map: eight of them keep the page below 400 KB."""
-
-CHOSEN, PATH, TRUTH, GREY = "#0a7d33", "#c22f2f", "#6b3fa0", "#8a8f98"
 
 
 def axes_of(width: float, height: float, columns: int = 1):
@@ -31,8 +30,7 @@ def svg(figure, label: str) -> str:
     """The figure as an <svg> element; the same input gives the same bytes."""
     import matplotlib
 
-    for text in figure.findobj(lambda artist: hasattr(artist, "set_parse_math")):
-        text.set_parse_math(False)  # names are data: a dollar sign in one is no formula
+    plain(figure)
     buffer = io.StringIO()
     with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "otsync", "font.size": 8}):
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
@@ -42,25 +40,9 @@ def svg(figure, label: str) -> str:
 
 
 def clock_bars(offsets: Offsets, clips: Sequence[tuple[float, float]]) -> str:
-    """Every video as a bar on the common clock; a whisker of two sigma at its start.
-
-    ``clips``: first second and duration of every video on its own clock.
-    """
+    """Every video as a bar on the common clock: see :func:`otsync.types.drawing.draw_clock_bars`."""
     figure, ax = axes_of(7.2, 0.9 + 0.24 * len(offsets))
-    for v, name in enumerate(offsets.names):
-        first, duration = clips[v]
-        start, sigma = offsets.seconds[v] + offsets.rates[v] * first, offsets.sigma[v]
-        if not np.isfinite(start) or offsets.component[v] != offsets.reference:
-            why = "no answer" if not np.isfinite(start) else "on a clock of its own group"
-            ax.text(0, v, f"{name}: {why}", va="center", fontsize=8, color=PATH)
-            continue
-        color = CHOSEN if offsets.status[v].ok else GREY
-        ax.barh(v, offsets.rates[v] * duration, left=start, height=0.62, color=color, alpha=0.85)
-        if np.isfinite(sigma) and sigma > 0:
-            ax.errorbar(start, v, xerr=2 * sigma, color="black", capsize=2, lw=1)
-    ax.set_yticks(range(len(offsets)), list(offsets.names))
-    ax.invert_yaxis()
-    ax.set_xlabel(f"seconds on the clock of {offsets.names[offsets.reference]} (grey: not to be trusted)")
+    draw_clock_bars(ax, offsets, clips)
     return svg(figure, "videos on the common clock")
 
 
@@ -89,28 +71,16 @@ def pair_figure(
     else:
         left.set_axis_off()
     if pair.curve is not None and len(pair.curve):
-        known_rows = pair.curve[np.isfinite(pair.curve[:, 1])]
-        right.plot(known_rows[:, 0] * pair.fps, known_rows[:, 1], color="#31507d", lw=1)
-        right.plot(pair.hypotheses[:, 0] * pair.fps, pair.hypotheses[:, 1], "v", ms=4, color=PATH, label="peaks")
-        right.set(xlabel="offset in frames", ylabel="score")
-        _mark(right, pair, truth)
+        draw_score(right, pair)
+        draw_choice(right, pair, truth)
     elif path is not None and len(path):
         values, counts = np.unique(path[:, 0] - path[:, 1], return_counts=True)
-        right.bar(values + origin * pair.fps, counts, color="#31507d", width=1)
+        right.bar(values + origin * pair.fps, counts, color=CURVE, width=1)
         right.set(xlabel="offset in frames", ylabel="frames of the path")
-        _mark(right, pair, truth)
+        draw_choice(right, pair, truth)
     else:
         right.set_axis_off()
     return svg(figure, "cost map and score")
-
-
-def _mark(ax, pair: Alignment, truth: float | None) -> None:
-    if np.isfinite(pair.offset):
-        ax.axvline(pair.frames, color=CHOSEN, lw=1, label="chosen")
-    if truth is not None:
-        ax.axvline(truth * pair.fps, color=TRUTH, lw=1, ls=":", label="true")
-    if ax.get_legend_handles_labels()[0]:
-        ax.legend(fontsize=6)
 
 
 def residual_bars(labels: Sequence[str], frames: np.ndarray, trusted: Sequence[bool]) -> str:

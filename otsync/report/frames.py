@@ -27,33 +27,33 @@ SHOWN_MATCHES = 25
 
 
 def write_recording_report(
-    path: str | os.PathLike[str], scene: Scene, found: Synchronized, *, truth: Sequence[float] | None = None
+    path: str | os.PathLike[str], scene: Scene, answer: Synchronized, *, truth: Sequence[float] | None = None
 ) -> None:
     """The report page with what the run did and what it looks like; still one file without a script."""
     write_report(
         path,
-        found.offsets,
-        found.tracks if found.route != "epipolar" else None,
+        answer.offsets,
+        answer.tracks if answer.route != "epipolar" else None,
         truth=truth,
         title="Synchronisation of a recording",
-        extra=sections(scene, found),
+        extra=sections(scene, answer),
     )
 
 
-def sections(scene: Scene, found: Synchronized) -> str:
+def sections(scene: Scene, answer: Synchronized) -> str:
     """HTML of the route, the contact sheets and the matches."""
-    seconds = ", ".join(f"{k} {v:.1f} s" for k, v in found.seconds.items())
+    seconds = ", ".join(f"{k} {v:.1f} s" for k, v in answer.seconds.items())
     parts = [
-        "<h2>How it was found</h2><p>" + "<br>".join(escape(line) for line in found.why) + "</p>",
+        "<h2>How it was found</h2><p>" + "<br>".join(escape(line) for line in answer.why) + "</p>",
         f"<p class=s>{escape(seconds)}</p>",
         "<h2>Before and after</h2><p class=s>One row a video, one column a moment. Before: frames of the same number. "
         "After: frames of the same world time. A blank has no frame then.</p>",
     ]
     zero = np.zeros(len(scene.videos))
-    for title, offsets in (("before", zero), ("after", found.offsets.seconds)):
+    for title, offsets in (("before", zero), ("after", answer.offsets.seconds)):
         sheet = contact_sheet(scene, offsets)
         parts.append(f"<p>{title}</p>{inline_image(sheet, f'contact sheet {title}')}")
-    matched = matches_drawn(scene, found)
+    matched = matches_drawn(scene, answer)
     if matched is not None:
         picture, text = matched
         parts.append(f"<h2>Matches</h2><p class=s>{escape(text)}</p>{inline_image(picture, 'matches on frames')}")
@@ -82,16 +82,16 @@ def contact_sheet(scene: Scene, offsets: np.ndarray) -> np.ndarray:
     return np.concatenate(rows)
 
 
-def matches_drawn(scene: Scene, found: Synchronized) -> tuple[np.ndarray, str] | None:
+def matches_drawn(scene: Scene, answer: Synchronized) -> tuple[np.ndarray, str] | None:
     """The best matches of the reference's surest pair, drawn on the frames of one moment."""
     import cv2
 
-    offsets, width = found.offsets, 2 * THUMB
+    offsets, width = answer.offsets, 2 * THUMB
     pairs = [(p, a) for p, a in offsets.alignments.items() if offsets.reference in p and len(offsets.matches[p])]
     if not pairs:
         return None
     (i, j), _ = min(pairs, key=lambda item: (not item[1].status.ok, item[1].sigma, item[0]))
-    a, b = found.tracks[i], found.tracks[j]
+    a, b = answer.tracks[i], answer.tracks[j]
     if a.uv is None or b.uv is None or not np.isfinite(offsets.between(i, j)):
         return None
     pairs_ij = offsets.matches[i, j].best(200).pairs

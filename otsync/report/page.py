@@ -11,6 +11,7 @@ import numpy as np
 
 from ..files.arrays import atomic_write
 from ..types import Alignment, Matches, Offsets, Status, TrackSet
+from ..types.drawing import clips_of
 from . import figures
 
 DETAILED_PAIRS = 8
@@ -19,7 +20,8 @@ DETAILED_PAIRS = 8
 STYLE = """
 body{font:15px/1.5 system-ui,sans-serif;margin:0 auto;max-width:62rem;padding:1rem;color:#1b1e23;background:#fff}
 h1{font-size:1.5rem;margin:.2rem 0}h2{font-size:1.15rem;margin:1.6rem 0 .4rem}h3{font-size:1rem;margin:1.1rem 0 .2rem}
-table{border-collapse:collapse;font-size:.86rem}td,th{padding:.22rem .6rem;text-align:right;border-bottom:1px solid #dfe3e8}
+table{border-collapse:collapse;font-size:.86rem}\
+td,th{padding:.22rem .6rem;text-align:right;border-bottom:1px solid #dfe3e8}
 td:first-child,th:first-child,td.t,th.t{text-align:left}.scroll{overflow-x:auto}.ok{color:#0a7d33}.no{color:#b3261e}
 svg{max-width:100%;height:auto}p.s{color:#555b66;font-size:.86rem}dt{font-weight:600}dd{margin:0 0 .5rem 1rem}
 """
@@ -50,7 +52,7 @@ def write_report(
         "<p class=s>A positive offset means that the video started later than its reference. "
         "t<sub>world</sub> = rate · t<sub>video</sub> + offset.</p>",
         "<h2>On the common clock</h2>",
-        figures.clock_bars(offsets, _clips(offsets, tracks)),
+        figures.clock_bars(offsets, clips_of(tracks, len(offsets))),
         _remedies(offsets),
         _graph(offsets),
         extra,
@@ -67,7 +69,8 @@ def write_page(path: str | os.PathLike[str], title: str, parts: Sequence[str]) -
     html = (
         "<!doctype html><html lang=en><head><meta charset=utf-8>"
         "<meta name=viewport content='width=device-width,initial-scale=1'>"
-        "<meta http-equiv=Content-Security-Policy content=\"default-src 'none';style-src 'unsafe-inline';img-src data:\">"
+        "<meta http-equiv=Content-Security-Policy "
+        "content=\"default-src 'none';style-src 'unsafe-inline';img-src data:\">"
         f"<title>{escape(title)}</title><style>{STYLE}</style></head><body>{''.join(parts)}</body></html>\n"
     )
     with atomic_write(path, "w") as stream:
@@ -190,18 +193,12 @@ def _cost_map(
     return paper.cost, paper.path, origin
 
 
-def _clips(offsets: Offsets, tracks: Sequence[TrackSet] | None) -> list[tuple[float, float]]:
-    """First second and duration of every video on its own clock; a second where the tracks are not at hand."""
-    if tracks is None:
-        return [(0.0, 1.0)] * len(offsets)
-    return [(float(t.times[0]), float(t.times[-1] - t.times[0] + 1 / (t.fps or 1))) for t in tracks]
-
-
 def _footer(offsets: Offsets) -> str:
     from .. import __version__
 
     stats = ", ".join(f"{k} {v:.4g}" for k, v in offsets.stats.items())
-    return f"<p class=s>otsync {__version__}, Python {platform.python_version()}, {platform.machine()}. {escape(stats)}</p>"
+    where = f"otsync {__version__}, Python {platform.python_version()}, {platform.machine()}"
+    return f"<p class=s>{where}. {escape(stats)}</p>"
 
 
 def number(x: float, digits: int) -> str:

@@ -1,4 +1,4 @@
-"""How figures move: band-limited wandering, a gait, gestures at events and cycles, as functions of real time."""
+"""Motions of figures as functions of real time: band-limited wandering, a gait, gestures at events and cycles."""
 
 from __future__ import annotations
 

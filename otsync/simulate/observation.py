@@ -1,4 +1,4 @@
-"""What one video observes of a world: the thing that effects turn into a worse one, and their random streams."""
+"""One video's observation of a world, which effects turn into a worse one; and their random streams."""
 
 from __future__ import annotations
 

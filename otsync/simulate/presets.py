@@ -10,7 +10,7 @@ from .features import FeatureModel
 
 @dataclass(frozen=True)
 class Preset:
-    """What a level means.
+    """One level of quality.
 
     Args:
         effects: applied in order. Depth errors are relative standard deviations, lengths metres, times seconds.

@@ -13,7 +13,6 @@ from .motions import TAU, Actor, Cycle, Gesture, Wander, event_times, posture, s
 
 Poses = tuple[np.ndarray, np.ndarray]
 BALL, BOX, RACKET = N_KINDS, N_KINDS + 1, N_KINDS + 2
-GRAVITY = 9.81
 
 
 @dataclass(frozen=True, eq=False)

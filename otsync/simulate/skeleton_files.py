@@ -82,8 +82,8 @@ def _numbers(words: list[str], path: Path, where: str, limit: float = MAX_LENGTH
 def read_bvh(path: Path) -> Clip:
     """A Biovision hierarchy. The root's position channels move it; those of other joints are refused."""
     text = read_text(path, "BVH")
-    head, found, motion = text.partition("MOTION")
-    if not found or not head.lstrip().startswith("HIERARCHY"):
+    head, marker, motion = text.partition("MOTION")
+    if not marker or not head.lstrip().startswith("HIERARCHY"):
         raise ValueError(f"{path}: expected BVH (HIERARCHY ... MOTION ...); found another file.")
     names, parents, offsets, tips, channels = _bvh_hierarchy(head.split(), path)
     lines = motion.split("\n", 3)

@@ -116,8 +116,8 @@ class Truth:
         """(Na,) whether some track of b lies within ``tolerance`` m on the same object."""
         sa, sb = self.surfaces[a], self.surfaces[b]
         known_a, known_b = sa.object >= 0, sb.object >= 0
-        found = np.zeros(len(sa), bool)
+        has_partner = np.zeros(len(sa), bool)
         if known_a.any() and known_b.any():
             where_a, where_b = (np.c_[s.position, 1e3 * s.object][k] for s, k in ((sa, known_a), (sb, known_b)))
-            found[known_a] = np.isfinite(cKDTree(where_b).query(where_a, distance_upper_bound=tolerance)[0])
-        return found
+            has_partner[known_a] = np.isfinite(cKDTree(where_b).query(where_a, distance_upper_bound=tolerance)[0])
+        return has_partner

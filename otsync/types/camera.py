@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from .drawing import short
+
 FPS_FACTOR = 3.0
 """Timestamps may disagree with the nominal rate by this factor; beyond it their unit is wrong."""
 
@@ -71,6 +73,12 @@ class Camera:
         if self.readout is not None and not (np.isfinite(self.readout) and self.readout >= 0):
             raise ValueError(f"Camera.readout: expected seconds >= 0; found {self.readout}.")
 
+    def __repr__(self) -> str:
+        pose = "static" if self.w2c.ndim == 2 else f"{len(self.w2c)} poses"
+        lens = "" if self.distortion is None else ", distortion"
+        readout = "" if self.readout is None else f", readout {self.readout:g} s"
+        return f"Camera({self.width} x {self.height}, focal {self.K[0, 0]:.4g} px, {pose}{lens}{readout})"
+
     @property
     def center(self) -> Float[np.ndarray, "*T 3"]:
         """Camera centre in the world, ``-Rᵀ t``."""
@@ -122,6 +130,13 @@ class Video:
             raise ValueError(f"Video.camera.w2c: expected {len(self.frames)} poses; found {len(self.camera.w2c)}.")
         if self.depth is not None and len(self.depth) != len(self.frames):
             raise ValueError(f"Video.depth: expected {len(self.frames)} maps; found {len(self.depth)}.")
+
+    def __repr__(self) -> str:
+        rate = "" if self.fps is None else f", {self.fps:.5g} fps"
+        size = f"{self.camera.width} x {self.camera.height}"
+        depth = "" if self.depth is None else ", depth"
+        moves = "" if self.camera.w2c.ndim == 2 else ", moving camera"
+        return f"Video({short(self.name)}, {len(self.frames)} frames of {size}{rate}{depth}{moves})"
 
     @property
     def times(self) -> Float[np.ndarray, " T"]:

@@ -1,4 +1,4 @@
-"""Options that are numbers, checked before the work: ValueError names the option, what was expected and what was found."""
+"""Checks of options that are numbers, before any work. ValueError names the option, what was expected and found."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How one clock reads on another: ``t_world = rate * t_own + offset``, written once."""
+"""One clock read on another: ``t_world = rate * t_own + offset``, written once."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 Source = Literal["given", "found", "fitted"]
-"""How a clock is known: told, found on the frozen scene, or refined by the fit."""
+"""Where a clock comes from: given by the user, found on the frozen scene, or refined by the fit."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What the verbs return: matches of a pair, alignment of a pair, offsets of all videos."""
+"""Results of the verbs: matches of a pair, alignment of a pair, offsets of all videos."""
 
 from __future__ import annotations
 
@@ -13,8 +13,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..files.arrays import read_json, write_json
+from . import drawing
+from .camera import Video
 from .clock import Clock
 from .status import Status, gravest, in_order
+from .tracks import TrackSet
 
 Stats = dict[str, float]
 
@@ -95,6 +98,12 @@ class Matches:
         plan = None if self.plan is None else self.plan.T
         return replace(self, pairs=self.pairs[:, ::-1], plan=plan)
 
+    def __repr__(self) -> str:
+        return drawing.matches_line(self)
+
+    def _repr_html_(self) -> str:
+        return drawing.matches_table(self)
+
 
 _NO_PEAKS = np.zeros((0, 2))
 
@@ -139,6 +148,28 @@ class Alignment:
     def frames(self) -> float:
         """The offset in frames of the common clock."""
         return self.offset * self.fps
+
+    def __repr__(self) -> str:
+        return drawing.alignment_line(self)
+
+    def _repr_html_(self) -> str:
+        return drawing.alignment_table(self)
+
+    def plot(self, *, truth: float | None = None, ax: Any = None) -> Any:
+        """Draw the score over offsets in frames, its peaks and the chosen offset; the matplotlib axes.
+
+        Args:
+            truth: the true offset in seconds, where it is known.
+            ax: axes to draw on; default: those of a new figure.
+
+        ValueError where there is neither a curve nor a peak.
+        """
+        if self.curve is None and not len(self.hypotheses):
+            raise ValueError("Alignment.curve: expected a score to draw; found neither curve nor peaks. Align again.")
+        ax = drawing.new_axes(5.0, 2.6) if ax is None else ax
+        drawing.draw_score(ax, self)
+        drawing.draw_choice(ax, self, truth)
+        return ax
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,6 +252,26 @@ class Offsets:
     def between(self, a: int, b: int) -> float:
         """offset(a, b) = offset_b - offset_a in seconds; nan when no chain of pairs links them."""
         return float(self.seconds[b] - self.seconds[a]) if self.component[a] == self.component[b] else math.nan
+
+    def __repr__(self) -> str:
+        return drawing.offsets_line(self)
+
+    def _repr_html_(self) -> str:
+        return drawing.offsets_table(self)
+
+    def plot(self, videos: Sequence[Video | TrackSet] | None = None, *, ax: Any = None) -> Any:
+        """Draw every video as a bar on the common clock, two sigma at its start; the matplotlib axes.
+
+        Args:
+            videos: in the order of ``names``, to tell how long they are; without them every bar is a second long.
+            ax: axes to draw on; default: those of a new figure.
+        """
+        if videos is not None and len(videos) != len(self):
+            raise ValueError(f"videos: expected {len(self)}, one per name; found {len(videos)}.")
+        ax = drawing.new_axes(7.2, 0.9 + 0.24 * len(self)) if ax is None else ax
+        drawing.draw_clock_bars(ax, self, drawing.clips_of(videos, len(self)))
+        drawing.plain(ax)
+        return ax
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write ``offsets.json``: unit, sign and reference in words; atomically."""
@@ -342,13 +393,13 @@ class Offsets:
             if seconds[v] != 0 and (v == reference or np.isfinite(seconds[v])):
                 none = "" if v == reference else " or null"
                 raise ValueError(
-                    f"videos, {videos[v]['name']}: offset_seconds: expected 0{none} of a video that is its own reference; "
-                    f"found {json.dumps(videos[v]['offset_seconds'])}"
+                    f"videos, {videos[v]['name']}: offset_seconds: expected 0{none} of a video that is its own "
+                    f"reference; found {json.dumps(videos[v]['offset_seconds'])}"
                 )
         if rates[reference] != 1:
             raise ValueError(
-                f"videos, {videos[reference]['name']}: rate: expected 1, since the clock of the reference is the world's; "
-                f"found {rates[reference]:g}"
+                f"videos, {videos[reference]['name']}: rate: expected 1, since the clock of the reference is the "
+                f"world's; found {rates[reference]:g}"
             )
         return cls(
             names=tuple(index),

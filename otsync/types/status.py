@@ -1,4 +1,4 @@
-"""What an answer is worth: one code per finding, whose text is the remedy."""
+"""Statuses of answers: one code per finding, whose text is the remedy."""
 
 from __future__ import annotations
 
@@ -82,17 +82,17 @@ class Status(StrEnum):
             raise ValueError(f"status: expected one of {known}; found {code!r}.") from None
 
 
-_GRAVITY = {status: rank for rank, status in enumerate(Status)}
+_RANK = {status: rank for rank, status in enumerate(Status)}
 
 
 def gravest(flags: Iterable[Status]) -> Status:
     """The gravest of ``flags`` (declaration order of :class:`Status`); ``OK`` when there are none."""
-    return max(flags, key=_GRAVITY.__getitem__, default=Status.OK)
+    return max(flags, key=_RANK.__getitem__, default=Status.OK)
 
 
 def in_order(flags: Iterable[Status]) -> tuple[Status, ...]:
     """``flags`` without repetition and without ``OK``, gravest first."""
-    return tuple(sorted(set(flags) - {Status.OK}, key=_GRAVITY.__getitem__, reverse=True))
+    return tuple(sorted(set(flags) - {Status.OK}, key=_RANK.__getitem__, reverse=True))
 
 
 class Refused(RuntimeError):

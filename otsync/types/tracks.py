@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 
 from ..files.arrays import MAX_BYTES, read_npz, write_npz
 from .camera import Camera, clock, frame_times
+from .drawing import short
 
 FORMAT, VERSION = "otsync.tracks", 1
 
@@ -82,7 +83,8 @@ class TrackSet:
 
     def __repr__(self) -> str:
         what = [f for f in ("xyz", "uv", "features", "sigma", "labels", "camera") if getattr(self, f) is not None]
-        return f"TrackSet({self.name!r}, {len(self)} tracks x {self.n_frames} frames, fps={self.fps}, {'+'.join(what)})"
+        size, rate = f"{len(self)} tracks x {self.n_frames} frames", "" if self.fps is None else f", {self.fps:.5g} fps"
+        return f"TrackSet({short(self.name)}, {size}{rate}, {'+'.join(what)})"
 
     @property
     def n_frames(self) -> int:
@@ -129,8 +131,8 @@ class TrackSet:
             if bad.any():
                 n, t = np.argwhere(bad)[0]
                 raise ValueError(
-                    f"{name}.{field}: expected finite values in visible samples; {int(bad.sum())} are not, the first in "
-                    f"track {n}, frame {t}. Mark unobserved samples in visible."
+                    f"{name}.{field}: expected finite values in visible samples; {int(bad.sum())} are not, the "
+                    f"first in track {n}, frame {t}. Mark unobserved samples in visible."
                 )
         if features:
             if self.features is None:

@@ -1,4 +1,4 @@
-"""When an answer is to be trusted: the one place where the thresholds behind the flags are written down.
+"""Thresholds behind the flags, in one place: when an answer is to be trusted.
 
 Lengths of time are seconds (the designs' frame counts at 30 fps); nothing has a unit of length.
 """
@@ -59,6 +59,7 @@ class Trust:
                 raise ValueError(f"{owner}.{field.name}: expected a finite number; found {value}.")
             if field.name not in reads and value != field.default:
                 raise ValueError(
-                    f"{owner}.{field.name}: expected one of {', '.join(reads)}, which are what it reads; found {value:g}. "
-                    "Leave it out, or set it where it is read (the scan's limits in the aligner, the fit's in the refiner)."
+                    f"{owner}.{field.name}: expected one of {', '.join(reads)}, which are what it reads; found "
+                    f"{value:g}. Leave it out, or set it where it is read (the scan's limits in the aligner, the fit's "
+                    "in the refiner)."
                 )

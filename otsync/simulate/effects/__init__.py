@@ -1,4 +1,4 @@
-"""What goes wrong between a surface and its tracks: each effect is an object ``(observation, rng) -> observation``.
+"""Effects between a surface and its tracks: each is an object ``(observation, rng) -> observation``.
 
 Effects stand in a tuple and are applied in order; what is not in the tuple is not computed. Every effect draws from a
 stream of its own, so that adding, removing or reordering others leaves its draws bit for bit as they are. An effect of

@@ -1,4 +1,4 @@
-"""What cameras and clocks do: frames of reference that are off, rows read one by one, clocks that wander."""
+"""Effects of cameras and clocks: frames of reference that are off, rows read one by one, clocks that wander."""
 
 from __future__ import annotations
 
@@ -100,6 +100,6 @@ class DroppedFrames:
     share: float = 0.05
 
     def __call__(self, obs: Observation, rng: np.random.Generator) -> Observation:
-        keep = rng.random(len(obs.times)) >= self.share
-        keep[0] = True
-        return replace(obs, xyz=obs.xyz[:, keep], visible=obs.visible[:, keep], times=obs.times[keep], regular=False)
+        stays = rng.random(len(obs.times)) >= self.share
+        stays[0] = True
+        return replace(obs, xyz=obs.xyz[:, stays], visible=obs.visible[:, stays], times=obs.times[stays], regular=False)

@@ -1,4 +1,4 @@
-"""What trackers do to tracks: lose them, invent them, mix them up, smooth them."""
+"""Effects of trackers: they lose tracks, invent them, mix them up, smooth them."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ import pytest
 
 from otsync import LikelihoodScan, Matches, Refused, Status, TrackSet, align
 from otsync.align.likelihood import Signal, evidence, noise_floor, statistics
-from otsync.align.peaks import local_peaks, vertex
+from otsync.align.peaks import separate_peaks, vertex
 from otsync.clocks.common import common_clock
 from otsync.simulate import simulate
 from tests.conftest import wiggle
@@ -180,7 +180,8 @@ def test_peaks_are_apart_and_ordered():
     lags = np.arange(-10, 11)
     score = np.zeros(21)
     score[[3, 5, 10, 17]] = 4, 5, 5, 3
-    assert local_peaks(lags, score, 4, 3) == [10, 5, 17]
+    assert separate_peaks(score, 4, 3, prefer=np.abs(lags)) == [10, 5, 17]
+    assert separate_peaks(score, 4, 3) == [5, 10, 17]
     assert vertex(lags, -((lags - 1.3) ** 2), 11) == pytest.approx(1.3)
 
 

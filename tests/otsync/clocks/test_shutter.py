@@ -13,8 +13,8 @@ from otsync import Camera, TrackSet, align, match, refine, synchronize
 from otsync.clocks.shutter import at_frame_times, rows
 from otsync.epipolar.refine import EpipolarRefine
 from otsync.epipolar.scan import EpipolarScan
+from otsync.files.digest import content_key
 from otsync.geometry import distort, undistort
-from otsync.recordings.kept_pairs import digest
 from otsync.recordings.lift import Lift
 from otsync.simulate import simulate
 from otsync.simulate.effects import LateralJitter, RollingShutter
@@ -258,7 +258,7 @@ def test_every_verb_undoes_it_and_none_twice():
     assert raw.offset == clean.offset and np.array_equal(raw.curve, clean.curve)
     assert refine(*tracks, given, raw, throw=False).offset == refine(*done, given, clean, throw=False).offset
     assert np.array_equal(synchronize(tracks).seconds, synchronize(done).seconds)
-    assert digest(tracks[0]) != digest(replace(tracks[0], camera=done[0].camera))
+    assert content_key(tracks[0]) != content_key(replace(tracks[0], camera=done[0].camera))
 
 
 def test_lifting_takes_the_images_pixels_and_returns_frames():

@@ -198,8 +198,8 @@ def test_mixture_is_capped_floored_and_ignores_order(seed):
 
 def test_separate_peaks_are_apart_and_ordered():
     curve = np.array([0, 3, 1, 2, 0, 5, 4.5, 4.8, 0.0])
-    assert separate_peaks(curve, 3).tolist() == [5, 1]
-    assert separate_peaks(curve, 1).tolist() == [5, 7, 1, 3]
+    assert separate_peaks(curve, 3) == [5, 1]
+    assert separate_peaks(curve, 1) == [5, 7, 1, 3]
 
 
 def test_detrending_removes_constants_and_keeps_gaps():

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from otsync.io.document import FORMAT, VERSION
-from otsync.recordings.check import MIRRORED, check_scene
+from otsync.recordings.check import FROM_OPENGL, check_scene
 from tests.recording_world import ring
 
 
@@ -67,8 +67,8 @@ def test_the_mirrored_camera_to_world_trap(sound):
     ("spoil", "remedy"),
     [
         (lambda m: np.linalg.inv(m), "camera-to-world matrices: invert"),
-        (lambda m: MIRRORED @ m, "negate rows 1 and 2"),
-        (lambda m: np.linalg.inv(m) @ MIRRORED, "negate columns 1 and 2"),
+        (lambda m: FROM_OPENGL @ m, "negate rows 1 and 2"),
+        (lambda m: np.linalg.inv(m) @ FROM_OPENGL, "negate columns 1 and 2"),
     ],
 )
 def test_poses_in_another_convention_are_recognised(sound, spoil, remedy):

@@ -247,7 +247,7 @@ def test_repeated_effects_draw_anew():
 
 # ---------------------------------------------------------------- presets and truth
 
-#: synchronization.md's table: bias, drift, camera drift, jitter, lateral, slow drift, frame, gaps, wrong, matches, features
+#: bias, drift, camera drift, jitter, lateral, slow drift, frame, gaps, wrong, matches, features of the promised levels
 TABLE = {
     "clean": (0.005, 0.002, 0, 0.001, 0.001, 0.002, (0, 0, 0), 0, 0, 120, 0.15),
     "mid": (0.02, 0.008, 0.004, 0.005, 0.003, 0.008, (0.01, 1, 0.03), 0.20, 0.15, 100, 0.35),

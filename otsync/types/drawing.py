@@ -1,0 +1,165 @@
+"""Results as a notebook shows them: a line of words, a small table, curves and bars on matplotlib axes.
+
+Names are a stranger's: they are escaped in HTML, and a dollar sign in one begins no formula.
+"""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+CHOSEN, PEAK, TRUTH, CURVE, GREY = "#0a7d33", "#c22f2f", "#6b3fa0", "#31507d", "#8a8f98"
+
+SHOWN = 3
+"""Videos that an ``Offsets`` names in its line."""
+
+LONGEST_NAME = 16
+"""Characters of a name in a line."""
+
+
+def short(text: str) -> str:
+    """A name in a line, quoted; long ones are cut."""
+    return repr(text if len(text) <= LONGEST_NAME else text[: LONGEST_NAME - 1] + "…")
+
+
+def codes(flags: Iterable[Any]) -> str:
+    """The codes of flags; ok without any."""
+    return ", ".join(flag.code for flag in flags) or "ok"
+
+
+def measured(value: float, sigma: float, unit: str, digits: int) -> str:
+    """``12.30 ± 0.06 frames``; without the error where it is not known."""
+    error = f" ± {sigma:.{digits}f}" if math.isfinite(sigma) else ""
+    return f"{value:.{digits}f}{error} {unit}"
+
+
+def matches_line(m: Any) -> str:
+    """:class:`otsync.Matches` in a line."""
+    scores = f", scores {m.score.min():.3g} to {m.score.max():.3g}" if len(m) else ""
+    plan = "" if m.plan is None else f", plan {m.plan.shape[0]} x {m.plan.shape[1]}"
+    return f"Matches({len(m)} pairs{scores}{plan}; {codes(m.flags)})"
+
+
+def alignment_line(a: Any) -> str:
+    """:class:`otsync.Alignment` in a line."""
+    if not math.isfinite(a.offset):
+        return f"Alignment(no offset; {codes(a.flags)})"
+    frames = f"{measured(a.frames, a.sigma * a.fps, 'frames', 2)} = " if math.isfinite(a.fps) else ""
+    rate = "" if a.rate == 1 else f", rate {a.rate:.6f}"
+    return f"Alignment({frames}{measured(a.offset, a.sigma, 's', 4)}{rate}; {codes(a.flags)})"
+
+
+def offsets_line(o: Any) -> str:
+    """:class:`otsync.Offsets` in a line: the first few videos, in frames, and how many are to be trusted."""
+    shown = [
+        f"{short(name)} {f'{frames:+.2f}' if math.isfinite(frames) else 'none'}"
+        for name, frames in zip(o.names[:SHOWN], o.frames, strict=False)
+    ]
+    more = [f"{len(o) - SHOWN} more"] if len(o) > SHOWN else []
+    trusted = sum(status.ok for status in o.status)
+    return f"Offsets(frames: {', '.join([*shown, *more])}; {trusted} of {len(o)} to be trusted)"
+
+
+def table(caption: str, head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A small HTML table; everything in it is escaped."""
+
+    def line(cells: Sequence[str], tag: str) -> str:
+        return "<tr>" + "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in cells) + "</tr>"
+
+    body = "".join(line(row, "td") for row in rows)
+    return f"<table><caption>{html.escape(caption)}</caption>{line(head, 'th')}{body}</table>"
+
+
+def matches_table(m: Any, rows: int = 5) -> str:
+    """:class:`otsync.Matches` as HTML: the best few."""
+    best = m.best(rows)
+    lines = [(str(i), str(j), f"{score:.4g}") for (i, j), score in zip(best.pairs, best.score, strict=True)]
+    return table(matches_line(m), ("track of a", "track of b", "score"), lines)
+
+
+def alignment_table(a: Any) -> str:
+    """:class:`otsync.Alignment` as HTML: its competing offsets."""
+    lines = [(f"{seconds * a.fps:.2f}", f"{seconds:.4f}", f"{score:.4g}") for seconds, score in a.hypotheses]
+    return table(alignment_line(a), ("offset, frames", "offset, s", "score"), lines)
+
+
+def offsets_table(o: Any) -> str:
+    """:class:`otsync.Offsets` as HTML: a row a video."""
+    lines = [
+        (
+            name,
+            "–" if not math.isfinite(o.seconds[v]) else f"{o.frames[v]:.2f}",
+            "–" if not math.isfinite(o.seconds[v]) else f"{o.seconds[v]:.4f}",
+            "–" if not math.isfinite(o.sigma[v]) else f"{o.sigma[v]:.4f}",
+            f"{o.rates[v]:g}",
+            o.names[o.component[v]],
+            codes(o.flags[v]),
+        )
+        for v, name in enumerate(o.names)
+    ]
+    head = ("video", "offset, frames", "offset, s", "± sigma, s", "rate", "on the clock of", "flags")
+    return table(f"Offsets of {len(o)} videos", head, lines)
+
+
+def new_axes(width: float, height: float) -> Any:
+    """Axes of a figure of pyplot's, which a notebook shows at the end of its cell."""
+    from matplotlib import pyplot
+
+    return pyplot.subplots(figsize=(width, height), layout="constrained")[1]
+
+
+def plain(artist: Any) -> None:
+    """Take every text of a figure or its axes as it is: names are data, a dollar sign in one is no formula."""
+    for text in artist.findobj(lambda each: hasattr(each, "set_parse_math")):
+        text.set_parse_math(False)
+
+
+def draw_score(ax: Any, pair: Any) -> None:
+    """The score over offsets, with its peaks and the offset that was chosen; all in frames."""
+    if pair.curve is not None:
+        known = pair.curve[np.isfinite(pair.curve[:, 1])]
+        ax.plot(known[:, 0] * pair.fps, known[:, 1], color=CURVE, lw=1)
+    ax.plot(pair.hypotheses[:, 0] * pair.fps, pair.hypotheses[:, 1], "v", ms=4, color=PEAK, label="peaks")
+    ax.set(xlabel="offset in frames", ylabel="score")
+
+
+def draw_choice(ax: Any, pair: Any, truth: float | None = None) -> None:
+    """Lines at the chosen and, where known, at the true offset (seconds), and what all colours mean."""
+    if np.isfinite(pair.offset):
+        ax.axvline(pair.frames, color=CHOSEN, lw=1, label="chosen")
+    if truth is not None:
+        ax.axvline(truth * pair.fps, color=TRUTH, lw=1, ls=":", label="true")
+    if ax.get_legend_handles_labels()[0]:
+        ax.legend(fontsize=6)
+
+
+def draw_clock_bars(ax: Any, offsets: Any, clips: Sequence[tuple[float, float]]) -> None:
+    """Every video as a bar on the common clock; a whisker of two sigma at its start.
+
+    ``clips``: first second and duration of every video on its own clock.
+    """
+    for v, name in enumerate(offsets.names):
+        first, duration = clips[v]
+        start, sigma = offsets.seconds[v] + offsets.rates[v] * first, offsets.sigma[v]
+        if not np.isfinite(start) or offsets.component[v] != offsets.reference:
+            why = "no answer" if not np.isfinite(start) else "on a clock of its own group"
+            ax.text(0, v, f"{name}: {why}", va="center", fontsize=8, color=PEAK)
+            continue
+        color = CHOSEN if offsets.status[v].ok else GREY
+        ax.barh(v, offsets.rates[v] * duration, left=start, height=0.62, color=color, alpha=0.85)
+        if np.isfinite(sigma) and sigma > 0:
+            ax.errorbar(start, v, xerr=2 * sigma, color="black", capsize=2, lw=1)
+    ax.set_yticks(range(len(offsets)), list(offsets.names))
+    ax.invert_yaxis()
+    ax.set_xlabel(f"seconds on the clock of {offsets.names[offsets.reference]} (grey: not to be trusted)")
+
+
+def clips_of(sources: Sequence[Any] | None, count: int) -> list[tuple[float, float]]:
+    """First second and duration of videos or track sets on their own clocks; a second each where there are none."""
+    if sources is None:
+        return [(0.0, 1.0)] * count
+    return [(float(s.times[0]), float(s.times[-1] - s.times[0] + 1 / (s.fps or 1))) for s in sources]
