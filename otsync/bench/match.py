@@ -171,7 +171,7 @@ def figures_of(rows: list[dict[str, Any]]) -> dict[str, float]:
 
 
 def worse(key: str, measured: float, baseline: float) -> bool:
-    """Accuracy may vary by .04 between platforms' roundings, the ratio to POT in the same run by two fifths."""
+    """Accuracy may vary by .04 with the rounding of platforms, the ratio to POT in the same run by two fifths."""
     return measured < baseline - 0.04 if key.endswith("p50") else measured < 0.6 * baseline
 
 

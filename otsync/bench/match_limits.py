@@ -44,9 +44,9 @@ def scene(name: str, n: int, seeds: range, options: dict[str, Any]) -> dict[str,
     qualities, flagged = [], 0
     for seed in counted(seeds, name, "world"):
         a, b, truth = matching_world(n, seed=seed, **options)
-        found = match(a, b, AnchoredFGW(), throw=False)
-        qualities.append(match_quality(found, truth))
-        flagged += not found.status.ok
+        matches = match(a, b, AnchoredFGW(), throw=False)
+        qualities.append(match_quality(matches, truth))
+        flagged += not matches.status.ok
     means = {key: float(np.mean([q[key] for q in qualities])) for key in qualities[0]}
     return {"scene": name, **means, "worst_p50": float(min(q["p50"] for q in qualities)), "flagged": flagged}
 
@@ -75,18 +75,9 @@ def units(seeds: int, seed: int, n: int = 2000) -> dict[str, Any]:
     for k in counted(range(seeds), "units", "world"):
         a, b, _ = matching_world(n, seed=seed + k)
         assert a.xyz is not None and b.xyz is not None
-        found = [
-            set(
-                map(
-                    tuple,
-                    match(
-                        replace(a, xyz=a.xyz * np.float32(u)), replace(b, xyz=b.xyz * np.float32(u)), throw=False
-                    ).pairs.tolist(),
-                )
-            )
-            for u in (1.0, 1e-6, 1e6)
-        ]
-        same += found[0] == found[1] == found[2]
+        scaled = [[replace(t, xyz=t.xyz * np.float32(unit)) for t in (a, b)] for unit in (1.0, 1e-6, 1e6)]
+        first, *rest = ({tuple(pair) for pair in match(*views, throw=False).pairs.tolist()} for views in scaled)
+        same += all(pairs == first for pairs in rest)
     return {"what": "identical matches with units x 1e-6 and x 1e6", "of": seeds, "count": same}
 
 
@@ -100,15 +91,15 @@ def track_distance_speed(n: int = 5000, frames: int = 150) -> list[dict[str, Any
     exact = np.linalg.norm(x[some[0]].astype(float) - x[some[1]].astype(float), axis=2).max(1)
     for name, solver in (("D_track in blocks", lambda: track_distance(x, seen)), ("numpy Gram", lambda: gram(x))):
         wall, cpu = time.perf_counter(), time.process_time()
-        found = solver()
+        distances = solver()
         spent = {"seconds": time.perf_counter() - wall, "cpu_seconds": time.process_time() - cpu}
-        error = np.abs(found[some[0], some[1]] - exact)[exact > 0] / exact[exact > 0]
+        error = np.abs(distances[some[0], some[1]] - exact)[exact > 0] / exact[exact > 0]
         rows.append({"what": name, "n": n, "frames": frames, **spent, "relative_error": float(error.max())})
     return rows
 
 
 def gram(x: np.ndarray) -> np.ndarray:
-    """max_t of ‖x_i‖² + ‖x_j‖² - 2 x_i·x_j: the textbook way, which cancels."""
+    """max_t of ‖x_i‖² + ‖x_j‖² - 2 x_i·x_j: the textbook formula, whose terms cancel."""
     best = np.zeros((len(x), len(x)), x.dtype)
     for t in range(x.shape[1]):
         p = x[:, t]

@@ -1,8 +1,8 @@
 """Where the background lies without depth: a floor and a shell around the scene, searched for by photo-consistency.
 
-A surface in its true place has the same colours in all cameras that see it. So the height and the tilt of the floor, and
-the centre and radius of the shell (the dome that cameras hang on, the walls of a hall, or just "far away"), are those at
-which the cameras' backgrounds agree best. Nothing assumes which axis points up.
+A surface in its true place has the same colours in all cameras that see it. So the height and the tilt of the floor,
+and the centre and radius of the shell (the dome that cameras hang on, the walls of a hall, or just "far away"), are
+those at which the cameras' backgrounds agree best. Nothing assumes which axis points up.
 """
 
 from __future__ import annotations

@@ -37,8 +37,8 @@ class Binding:
 
     rest int64 [N]: at which of the R rests each Gaussian was bound. nodes int64 [N,8] and weights [N,8] >= 0, of sum 1:
     the nearest node first, which is the heaviest. times float64 [R]: world seconds of the rests. positions [R,M,3] and
-    quats [R,M,4] (unit): the nodes' poses then, frozen, so that no step evaluates them again and a Gaussian's mean keeps
-    its meaning.
+    quats [R,M,4] (unit): the nodes' poses then, frozen, so that no step evaluates them again and a Gaussian's mean
+    keeps its meaning.
     """
 
     rest: Tensor
@@ -96,8 +96,8 @@ class Binding:
         return replace(self, rest=self.rest[index], nodes=self.nodes[index], weights=self.weights[index])
 
     def append(self, nodes: Tensor, weights: Tensor, time: float, positions: Tensor, quats: Tensor) -> Binding:
-        """With n more Gaussians, bound at world second `time` to nodes with poses [M,3], [M,4]: one more rest, unless an
-        earlier one is the same."""
+        """With n more Gaussians, bound at world second `time` to nodes with poses [M,3], [M,4]: one more rest, unless
+        an earlier one is the same."""
         same = [
             r
             for r in range(len(self.times))

@@ -28,7 +28,7 @@ class Change:
 
 
 def node_gradients(scaffold: Scaffold, gradients: Tensor) -> Tensor:
-    """How hard each node is pulled [M]: the mean of its Gaussians' `gradients` [N] >= 0, by the weights of their binding."""
+    """How hard each node is pulled [M]: the mean of its Gaussians' `gradients` [N] >= 0, weighted as they are bound."""
     nodes, w = scaffold.binding.nodes.reshape(-1), scaffold.binding.weights
     pull = torch.zeros(len(scaffold), dtype=w.dtype, device=w.device)
     total = pull.index_add(0, nodes, w.reshape(-1))
@@ -49,8 +49,8 @@ def grow(
 
     gradients [N]: norms of the gradients of the Gaussians' means [N,3], summed over steps. Of such a node's Gaussians
     the one pulled hardest becomes a node, if it is further than `apart` units from its nearest node. The new node moves
-    and turns as its Gaussian has been carried so far, at the rests too: the other Gaussians are carried nearly as before
-    (exactly so where all move rigidly). Neighbours and bindings are searched for again.
+    and turns as its Gaussian has been carried so far, at the rests too: the other Gaussians are carried nearly as
+    before (exactly so where all move rigidly). Neighbours and bindings are searched for again.
     """
     if gradients.shape != means.shape[:1] or len(means) != len(scaffold.binding):
         raise ValueError(

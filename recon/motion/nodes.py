@@ -72,8 +72,8 @@ class Grid:
         empty = np.flatnonzero(~seen.any(0))
         if len(empty):
             logger.warning(
-                "%d of %d frames of world time show no track, the first at second %.2f: the motion is bridged there. Are "
-                "the offsets right?",
+                "%d of %d frames of world time show no track, the first at second %.2f: the motion is bridged there. "
+                "Are the offsets right?",
                 *(len(empty), len(times), times[empty[0]]),
             )
         return cls(times, xyz, seen, video, centre, samples)
@@ -130,7 +130,7 @@ def _on_grid(t: np.ndarray, xyz: np.ndarray, grid: np.ndarray) -> tuple[np.ndarr
 
 
 def held(grid: Grid) -> Float[np.ndarray, "N G 3"]:
-    """World positions of the tracks on the grid; where unseen, a track rests where it was last seen, or first will be."""
+    """World positions of the tracks on the grid; an unseen track rests where it was last seen, or will be first."""
     frames = np.arange(len(grid.times))
     before = np.maximum.accumulate(np.where(grid.seen, frames, -1), axis=1)
     first = np.where(grid.seen.any(1), grid.seen.argmax(1), 0)

@@ -27,7 +27,7 @@ WINDOW = 4  # knots under a path's weights at any time
 MAX_KNOTS = 4096  # of one path: nine minutes at the default spacing; a longer span means a wrong offset
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Path(ABC):
     """A kind of curve on a uniform grid: `count` knots at start + i * spacing seconds (float64)."""
 
@@ -46,9 +46,13 @@ class Path(ABC):
                 "the videos, or set a wider spacing."
             )
 
+    def __repr__(self) -> str:
+        first, last = self.times[[0, -1]]
+        return f"{type(self).__name__}({self.count} knots, {first:.3f} to {last:.3f} s)"
+
     @classmethod
     def of(cls, first: float, last: float, spacing: float, margin: float = 0.0) -> Self:
-        """A path with knots over first..last seconds and `margin` seconds before and after: the largest believable offset."""
+        """A path over first..last seconds, and `margin` seconds before and after: the largest believable offset."""
         if not (math.isfinite(first) and math.isfinite(last) and last >= first and margin >= 0 and spacing > 0):
             raise ValueError(
                 "first, last, margin, spacing: expected finite seconds, last >= first, margin >= 0, spacing > 0; "
@@ -143,7 +147,7 @@ _ONE_HOT = np.zeros((4, 4, 4))
 _ONE_HOT[np.arange(4), np.arange(4), 0] = 1  # knot k of the window, whatever u
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class HermiteSpline(Path):
     """Cubic Hermite spline through its knots, C1, with tangents by finite differences (central; one-sided at the ends).
 
@@ -164,7 +168,7 @@ class HermiteSpline(Path):
         return seconds
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Sampled(Path):
     """The sample nearest in time, held beyond the ends: the "w/o spline" ablation, without a derivative in time."""
 
@@ -185,7 +189,7 @@ def path_arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 def path_from_arrays(arrays: Mapping[str, np.ndarray]) -> Path:
-    """The path whose :func:`path_arrays` these are; KeyError where they are missing, ValueError where they make none."""
+    """The path whose :func:`path_arrays` these are; KeyError where one is missing, ValueError where they make none."""
     kinds = {kind.__name__: kind for kind in (HermiteSpline, Sampled)}
     name, (start, spacing, count) = str(arrays["path"]), numbers(arrays, "path_knots", (3,)).double().tolist()
     if name not in kinds:

@@ -77,8 +77,8 @@ class PerGaussian:
     def warp(
         self, means: Tensor, quats: Tensor, t: Tensor | float, clocks: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Means [N,3] at world second `t` ([T,N,3] at T of them), and the quats as they are. All paths are in world time:
-        `clocks` do not matter."""
+        """Means [N,3] at world second `t` ([T,N,3] at T of them), and the quats as they are. All paths are in world
+        time: `clocks` do not matter."""
         return means + self.path.at(self.own_knots, t), quats
 
     def shifted(self, by: float, clocks: Tensor | None = None) -> PerGaussian:

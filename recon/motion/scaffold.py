@@ -74,7 +74,7 @@ class Scaffold:
         return self.knots.shape[1]
 
     def __repr__(self) -> str:
-        clocks = "world time" if self.clock is None else f"{len(torch.unique(self.clock))} clocks"
+        clocks = "world time" if self.clock is None else "the videos' own times"
         return (
             f"Scaffold({len(self)} nodes, {len(self.binding)} Gaussians, {clocks}, {self.path}, {self.blend}, "
             f"{self.knots.device})"
@@ -216,7 +216,7 @@ class Scaffold:
         return replace(self, binding=self.binding.take(index))
 
     def on(self, path: Path) -> Scaffold:
-        """The same motion on another path, sampled at its knots. On :class:`Sampled` it is the "w/o spline" ablation."""
+        """The same motion on another path, sampled at its knots; on :class:`Sampled`, the "w/o spline" ablation."""
         with torch.no_grad():
             times = torch.as_tensor(path.times, device=self.knots.device)
             return replace(

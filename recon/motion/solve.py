@@ -24,7 +24,8 @@ class Smoothness:
     """Weights of the solve, against a data term in which a sample per 1/30 s has weight 1.
 
     velocity: of neighbours that should move as parts of one body, per 1/30 s. acceleration: of second differences of
-    the knots. still: of first differences; where nothing else decides, a motion comes to rest within some fifteen knots.
+    the knots. still: of first differences; where nothing else decides, a motion comes to rest within some fifteen
+    knots.
     """
 
     velocity: float = 0.3
@@ -81,8 +82,8 @@ def solve_curves(
         Σ ρ(‖x_m(t) - sample‖) + λ_v Σ_(i,j) tie ‖ẋ_i - ẋ_j - ω × (x_i - x_j)‖² + λ_a Σ ‖Δ² knots‖² + λ_s Σ ‖Δ knots‖².
 
     ω(t) is the edge's angular velocity, from the seen neighbours' motion in the round before (0 in the first), so that
-    hidden nodes turn with their body instead of going straight on: with two bodies whose tracks live for 24 of 36 frames
-    points are followed to 0.7 cm over ten frames, without ω to 1.8 cm.
+    hidden nodes turn with their body instead of going straight on: with two bodies whose tracks live for 24 of 36
+    frames points are followed to 0.7 cm over ten frames, without ω to 1.8 cm.
     robust: the distance at which a sample counts half; rounds: of reweighting. Everything is equivariant under rigid
     motions and, with `robust` and the unit, under the scale of the world. Every node needs a sample.
     """

@@ -47,7 +47,7 @@ class Gaussians:
     def from_colors(
         cls, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, *, sh_degree: int = 0
     ) -> Gaussians:
-        """From activated values: scales >= 0 [N,3], opacities in 0..1 [N], colours [N,3] that are alike from everywhere.
+        """From activated values: scales >= 0 [N,3], opacities in 0..1 [N], colours [N,3], alike from all sides.
 
         sh_degree: 0..4, the degree to leave room for; coefficients above the constant are 0.
 
@@ -119,6 +119,6 @@ class Gaussians:
         for f in fields(self):
             if not getattr(self, f.name).isfinite().all():
                 raise ValueError(
-                    f"gaussians.{f.name}: expected finite values; found NaN or infinity. The fit has diverged: lower its rates."
+                    f"gaussians.{f.name}: expected finite values; found NaN or infinity. The fit has diverged."
                 )
         return self

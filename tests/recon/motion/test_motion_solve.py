@@ -163,7 +163,7 @@ def test_angular_velocities_are_those_of_the_seen():
 
 
 def test_rotations_follow_a_neighbourhood_round_and_round():
-    """A rigid cloud that turns three times: the nodes' rotations are the cloud's, even where neighbours are on a line."""
+    """A rigid cloud turns three times: the nodes' rotations are the cloud's, even where neighbours are on a line."""
     from scipy.spatial.transform import Rotation
 
     rng = np.random.default_rng(1)
