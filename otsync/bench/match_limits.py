@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from ..match.verb import match
 from ..metrics import match_quality
 from ..progress import counted
 from ..simulate import matching_world
+from ..types import TrackSet
 from .record import table, write_rows
 
 SCENES: dict[str, dict[str, float]] = {
@@ -67,17 +69,22 @@ def unrelated(pairs: int, seed: int, n: int = 1000) -> dict[str, Any]:
     return {"what": "unrelated scenes: no match", "of": pairs, "count": told}
 
 
+def scaled(tracks: TrackSet, unit: float) -> TrackSet:
+    """The same tracks in another unit of length."""
+    assert tracks.xyz is not None
+    return replace(tracks, xyz=tracks.xyz * np.float32(unit))
+
+
 def units(seeds: int, seed: int, n: int = 2000) -> dict[str, Any]:
     """How many worlds give identical matches when lengths are multiplied by 1e-6 and by 1e6."""
-    from dataclasses import replace
-
     same = 0
     for k in counted(range(seeds), "units", "world"):
         a, b, _ = matching_world(n, seed=seed + k)
-        assert a.xyz is not None and b.xyz is not None
-        scaled = [[replace(t, xyz=t.xyz * np.float32(unit)) for t in (a, b)] for unit in (1.0, 1e-6, 1e6)]
-        first, *rest = ({tuple(pair) for pair in match(*views, throw=False).pairs.tolist()} for views in scaled)
-        same += all(pairs == first for pairs in rest)
+        first, *others = (
+            {tuple(pair) for pair in match(scaled(a, unit), scaled(b, unit), throw=False).pairs.tolist()}
+            for unit in (1.0, 1e-6, 1e6)
+        )
+        same += all(pairs == first for pairs in others)
     return {"what": "identical matches with units x 1e-6 and x 1e6", "of": seeds, "count": same}
 
 

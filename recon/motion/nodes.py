@@ -129,15 +129,6 @@ def _on_grid(t: np.ndarray, xyz: np.ndarray, grid: np.ndarray) -> tuple[np.ndarr
     return np.where(seen[..., None], value, 0).astype(np.float32), seen
 
 
-def held(grid: Grid) -> Float[np.ndarray, "N G 3"]:
-    """World positions of the tracks on the grid; an unseen track rests where it was last seen, or will be first."""
-    frames = np.arange(len(grid.times))
-    before = np.maximum.accumulate(np.where(grid.seen, frames, -1), axis=1)
-    first = np.where(grid.seen.any(1), grid.seen.argmax(1), 0)
-    source = np.where(before < 0, first[:, None], before)
-    return np.take_along_axis(grid.xyz, source[..., None], 1).astype(float) + grid.centre
-
-
 def pick(
     xyz: Float[np.ndarray, "N G 3"],
     seen: Bool[np.ndarray, "N G"],

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from otsync.types import TrackSet
 from recon.motion.arrays import numbers
-from recon.motion.nodes import Grid, held
 from recon.motion.paths import Path, path_arrays, path_from_arrays
 from recon.motion.scaffold import Scaffold
 
@@ -34,39 +32,6 @@ class PerGaussian:
         with torch.no_grad():
             carried = [scaffold.warp(means, upright, float(t))[0] - means for t in path.times]
         return cls(path, torch.stack(carried))
-
-    @classmethod
-    def from_tracks(
-        cls,
-        tracks: Sequence[TrackSet],
-        offsets: np.ndarray,
-        means: Tensor,
-        times: Tensor | np.ndarray,
-        path: Path,
-        *,
-        frame_step: float,
-        rates: np.ndarray | None = None,
-    ) -> PerGaussian:
-        """Each Gaussian moves with the raw track that is nearest to its mean at its own world second.
-
-        times float64 [N]: seconds at which the means [N,3] hold. Only tracks seen then count (all, where none is seen),
-        and a track rests where it was not seen. frame_step: seconds of one frame of the reference.
-        """
-        from scipy.spatial import cKDTree
-
-        grid = Grid.of(tracks, offsets, frame_step, rates)
-        curves, place = held(grid), means.detach().cpu().numpy().astype(float)
-        t = np.asarray(times, float)
-        frame = np.clip(np.rint((t - grid.times[0]) / frame_step).astype(int), 0, len(grid.times) - 1)
-        knot_frames = np.clip(np.rint((path.times - grid.times[0]) / frame_step).astype(int), 0, len(grid.times) - 1)
-        own = np.zeros((path.count, len(place), 3))
-        for f in np.unique(frame):
-            here = np.flatnonzero(frame == f)
-            seen = np.flatnonzero(grid.seen[:, f])
-            seen = seen if len(seen) else np.arange(len(curves))
-            chosen = curves[seen[cKDTree(curves[seen, f]).query(place[here])[1]]]
-            own[:, here] = (chosen[:, knot_frames] - chosen[:, f, None]).transpose(1, 0, 2)
-        return cls(path, torch.as_tensor(own).to(means))
 
     def parameters(self) -> dict[str, Tensor]:
         return {"own_knots": self.own_knots}
