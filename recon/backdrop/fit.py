@@ -201,7 +201,7 @@ def colour_gain(
 def backdrop_of(
     fit: StaticFit, footage: Footage, gain: Float[np.ndarray, " 3"] | None = None, frame: int = 0
 ) -> Float[np.ndarray, "h w 3"]:
-    """What the camera of ``footage`` sees of the static scene, float32 in 0..1, times ``gain``."""
+    """The static scene as the camera of ``footage`` sees it, float32 in 0..1, times ``gain``."""
     with torch.no_grad():
         w2c, K = (torch.as_tensor(a, dtype=torch.float32)[None] for a in (footage.pose(frame), footage.K))
         seen = _render(fit.gaussians, w2c, K, footage.size, fit.near)[0].numpy()

@@ -21,7 +21,7 @@ PARALLEL = 0.02
 """Least curvature of the optical axes' common point, per camera: below, the axes are parallel and meet nowhere."""
 
 HEIGHTS, LEVEL, SPOTS = 41, 0.75, 48
-"""The search for a floor: heights; radius of the disc that is compared, in distances of the cameras; spots across it."""
+"""The search for a floor: heights; radius of the compared disc, in distances of the cameras; spots across it."""
 
 BELOW, ABOVE, LOWEST = 0.1, 0.05, 0.5
 """With points of what moves: heights from this far below to this far above their lowest, in distances of the cameras; a

@@ -84,7 +84,7 @@ class Gaussians:
         return int(self.sh.shape[1] ** 0.5) - 1
 
     def render(self, camera: Camera | Sequence[Camera], **options: Any) -> Rendering:
-        """What `camera` sees; options are those of :func:`recon.raster.render`.
+        """Render them as `camera` sees them; options are those of :func:`recon.raster.render`.
 
         Several cameras of one image size, and the T poses of a moving camera, become the C images of the rendering.
         A Camera is a pinhole here: one with distortion is refused (undistort its images), readout is ignored.

@@ -1,4 +1,4 @@
-"""What a scaffold is built with: tracks on a grid, the pick, the solver of curves, rotations; laws and oracles."""
+"""The parts of building a scaffold: tracks on a grid, the pick, the solver of curves, rotations; laws and oracles."""
 
 from __future__ import annotations
 
