@@ -121,7 +121,7 @@ class Gaussians4D:
         return torch.stack(paths, 1).cpu().numpy() if paths else np.zeros((len(self), 0, 3), np.float32)
 
     def render(self, camera: Camera, t: Tensor | float, **options: Any) -> Rendering:
-        """Render the scene at world time ``t`` for a static ``camera``; options are those of :func:`recon.raster.render`."""
+        """Render the scene at world time ``t`` for a static ``camera``; options: of :func:`recon.raster.render`."""
         if camera.w2c.ndim == 3:
             raise ValueError("camera: expected one pose; found one per frame. Take the pose of the frame you want.")
         options.setdefault("near_plane", self.near)
