@@ -1,4 +1,4 @@
-"""The baseline in figures: the paper's ablation and its DTW by class and band, import time, the cost of no effect."""
+"""The paper's ablation and its DTW by class and band, the time of `import otsync`, and the cost of absent effects."""
 
 from __future__ import annotations
 
@@ -42,9 +42,12 @@ def run(
     gate: bool = False,
     rebase: bool = False,
 ) -> int:
-    """Measure everything, print the tables, write CSV and JSON; seeds start at ``first_seed`` (nothing is tuned on them).
+    """Measure everything, print the tables, write CSV and JSON. 0, or 1 when the gate is missed.
 
-    ``gate``: compare with the committed baseline, 1 when something got worse. ``rebase``: make this the baseline.
+    Args:
+        n: tracks per video in the ablation, over ``worlds`` worlds. seeds: per class and band of the aligners' table.
+        first_seed: where seeds begin; nothing is tuned on them.
+        gate: compare with the committed baseline. rebase: make this run the baseline.
     """
     ablation = matching_ablation(n, range(first_seed, first_seed + worlds))
     print(f"Features alone against fused, N = {n}, mean of {worlds} fresh worlds:\n{table(ablation)}\n")
@@ -69,7 +72,7 @@ def run(
 
 
 def worse(key: str, measured: float, baseline: float) -> bool:
-    """Accuracy may vary by .03 between platforms' roundings, ratios and medians by a fifth."""
+    """Accuracy may vary by .03 with the rounding of platforms, ratios and medians by a fifth."""
     return measured < baseline - 0.03 if key == "p50_gain" else measured > 1.2 * baseline
 
 

@@ -1,4 +1,4 @@
-"""What effects cost: an effect that is not in the tuple costs nothing, and each one only its own time."""
+"""The time that effects take: one that is not in the tuple takes none, each other one only its own."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from ..simulate import PRESETS, simulate
 def effect_costs(motion: str = "juggle", tracks: int = 140, repeats: int = 15) -> list[dict[str, Any]]:
     """Milliseconds of two videos without effects, with each effect of the hardest preset alone, and with all.
 
-    The first row is a world whose preset has no effects, the second the same asked of the hardest preset by
-    ``effects=()``: their ratio is the price of an absent effect, 1 but for noise. Runs are interleaved, so that a busy
-    machine slows all rows alike; medians over ``repeats``.
+    The first row is a world whose preset has no effects, the second one of the hardest preset with ``effects=()``:
+    their ratio is the price of absent effects, 1 but for noise. Runs are interleaved, so that a busy machine slows all
+    rows alike; medians over ``repeats``.
     """
     brutal = PRESETS["brutal"]
     bare = replace(brutal, effects=())

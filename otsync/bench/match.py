@@ -104,7 +104,8 @@ def run(
     """Measure every matcher at every size; print the table, write CSV, JSON and the plot.
 
     Args:
-        seeds: worlds per cell, from ``first_seed`` on; nothing is tuned on them. Default: 2 from 9000; the promises' own.
+        seeds: worlds per cell, from ``first_seed`` on; nothing is tuned on them. Default: 2 from 9000; the promises'
+            own.
         promises: measure the limits of matching (:mod:`otsync.bench.match_limits`) instead.
         limit: CPU seconds per world; a matcher is not tried at sizes where it is expected to take longer.
         only: names of matchers; default: all of :func:`contenders`.
@@ -171,7 +172,7 @@ def figures_of(rows: list[dict[str, Any]]) -> dict[str, float]:
 
 
 def worse(key: str, measured: float, baseline: float) -> bool:
-    """Accuracy may vary by .04 between platforms' roundings, the ratio to POT in the same run by two fifths."""
+    """Accuracy may vary by .04 with the rounding of platforms, the ratio to POT in the same run by two fifths."""
     return measured < baseline - 0.04 if key.endswith("p50") else measured < 0.6 * baseline
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from ..match.verb import match
 from ..metrics import match_quality
 from ..progress import counted
 from ..simulate import matching_world
+from ..types import TrackSet
 from .record import table, write_rows
 
 SCENES: dict[str, dict[str, float]] = {
@@ -44,9 +46,9 @@ def scene(name: str, n: int, seeds: range, options: dict[str, Any]) -> dict[str,
     qualities, flagged = [], 0
     for seed in counted(seeds, name, "world"):
         a, b, truth = matching_world(n, seed=seed, **options)
-        found = match(a, b, AnchoredFGW(), throw=False)
-        qualities.append(match_quality(found, truth))
-        flagged += not found.status.ok
+        matches = match(a, b, AnchoredFGW(), throw=False)
+        qualities.append(match_quality(matches, truth))
+        flagged += not matches.status.ok
     means = {key: float(np.mean([q[key] for q in qualities])) for key in qualities[0]}
     return {"scene": name, **means, "worst_p50": float(min(q["p50"] for q in qualities)), "flagged": flagged}
 
@@ -67,26 +69,22 @@ def unrelated(pairs: int, seed: int, n: int = 1000) -> dict[str, Any]:
     return {"what": "unrelated scenes: no match", "of": pairs, "count": told}
 
 
+def scaled(tracks: TrackSet, unit: float) -> TrackSet:
+    """The same tracks in another unit of length."""
+    assert tracks.xyz is not None
+    return replace(tracks, xyz=tracks.xyz * np.float32(unit))
+
+
 def units(seeds: int, seed: int, n: int = 2000) -> dict[str, Any]:
     """How many worlds give identical matches when lengths are multiplied by 1e-6 and by 1e6."""
-    from dataclasses import replace
-
     same = 0
     for k in counted(range(seeds), "units", "world"):
         a, b, _ = matching_world(n, seed=seed + k)
-        assert a.xyz is not None and b.xyz is not None
-        found = [
-            set(
-                map(
-                    tuple,
-                    match(
-                        replace(a, xyz=a.xyz * np.float32(u)), replace(b, xyz=b.xyz * np.float32(u)), throw=False
-                    ).pairs.tolist(),
-                )
-            )
-            for u in (1.0, 1e-6, 1e6)
-        ]
-        same += found[0] == found[1] == found[2]
+        first, *others = (
+            {tuple(pair) for pair in match(scaled(a, unit), scaled(b, unit), throw=False).pairs.tolist()}
+            for unit in (1.0, 1e-6, 1e6)
+        )
+        same += all(pairs == first for pairs in others)
     return {"what": "identical matches with units x 1e-6 and x 1e6", "of": seeds, "count": same}
 
 
@@ -100,15 +98,15 @@ def track_distance_speed(n: int = 5000, frames: int = 150) -> list[dict[str, Any
     exact = np.linalg.norm(x[some[0]].astype(float) - x[some[1]].astype(float), axis=2).max(1)
     for name, solver in (("D_track in blocks", lambda: track_distance(x, seen)), ("numpy Gram", lambda: gram(x))):
         wall, cpu = time.perf_counter(), time.process_time()
-        found = solver()
+        distances = solver()
         spent = {"seconds": time.perf_counter() - wall, "cpu_seconds": time.process_time() - cpu}
-        error = np.abs(found[some[0], some[1]] - exact)[exact > 0] / exact[exact > 0]
+        error = np.abs(distances[some[0], some[1]] - exact)[exact > 0] / exact[exact > 0]
         rows.append({"what": name, "n": n, "frames": frames, **spent, "relative_error": float(error.max())})
     return rows
 
 
 def gram(x: np.ndarray) -> np.ndarray:
-    """max_t of ‖x_i‖² + ‖x_j‖² - 2 x_i·x_j: the textbook way, which cancels."""
+    """max_t of ‖x_i‖² + ‖x_j‖² - 2 x_i·x_j: the textbook formula, whose terms cancel."""
     best = np.zeros((len(x), len(x)), x.dtype)
     for t in range(x.shape[1]):
         p = x[:, t]

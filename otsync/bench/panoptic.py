@@ -2,7 +2,7 @@
 
 Shifts are whole frames, made by leaving out frames of the tracks (half-frame shifts: every second frame of both, odd
 shifts), so the truth is exact up to the rig's own synchronisation. Depth comes from all synchronised cameras, as the
-paper's did: the rows "paper" and "default" know more than a user with unsynchronised cameras would; "depth-free" does
+paper's did: the rows "paper" and "default" know more than a user with unsynchronised cameras does; "depth-free" does
 not use it. Errors are in frames of the clips.
 """
 
@@ -47,7 +47,9 @@ from .record import table, write_rows
 
 BANDS = ((1, 10), (11, 30), (31, 50))
 SHORT = (51, 100)
-NEAR = 0.15
+MATCH_RADIUS = 0.15
+"""m: matched tracks that are nearer to each other at the true time follow the same place."""
+
 PUBLISHED = {"route": "published", "pairs_by_band": [6.44, 8.57, 9.87], "graph_mean": 9.689, "graph_refined": 0.260}
 NOTE = (
     "Depth was built from the synchronised frames of all cameras, as the paper's was; the depth-free row does not use "
@@ -104,7 +106,7 @@ def run(
     write_rows(out, "panoptic_pairs", details, about)
     if matched:
         write_rows(out, "panoptic_matching", matched, about)
-        tell(f"Precision within {NEAR:g} m at the true time, by angle between the cameras:\n{table(matched)}")
+        tell(f"Precision within {MATCH_RADIUS:g} m at the true time, by angle between the cameras:\n{table(matched)}")
     _plot(out / "panoptic.svg", details)
     tell(f"published: pairs by band 6.44 / 8.57 / 9.87, many videos 9.689, after photometric refinement .260\n{NOTE}")
     if json:
@@ -184,7 +186,7 @@ class Material:
 def measure(
     material: Material, route: str, protocol: Protocol, map: MapLike
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """One row of figures, and a line per pair behind it."""
+    """One row of figures, and the line of every pair behind it."""
     solve, lifted = _solver(route, material.stages), route != "depth-free"
     V = len(material.scene.videos)
     rng = np.random.default_rng(protocol.seed)
@@ -209,8 +211,8 @@ def measure(
         T = material.frames
         starts = (0, shift) if later else (shift, 0)
         tracks = [material.clip(v, s, T, step, lifted) for v, s in zip((a, b), starts, strict=True)]
-        found = solve(tracks).alignments[0, 1]
-        error = found.frames - (starts[1] - starts[0]) / step
+        alignment = solve(tracks).alignments[0, 1]
+        error = alignment.frames - (starts[1] - starts[0]) / step
         names = material.scene.names
         angle = view_angle(material.scene.videos[a].camera, material.scene.videos[b].camera, target)
         return {
@@ -221,8 +223,8 @@ def measure(
             "angle": angle,
             "shift": shift if later else -shift,
             "error": _number(error),
-            "sigma": _number(found.sigma * found.fps),
-            "flags": " ".join(f.code for f in found.flags),
+            "sigma": _number(alignment.sigma * alignment.fps),
+            "flags": " ".join(f.code for f in alignment.flags),
         }
 
     details = list(counted(map(pair, jobs), f"{route}: pairs", "pair", len(jobs)))
@@ -236,7 +238,7 @@ def measure(
 
 
 def matching_table(material: Material, protocol: Protocol, map: MapLike) -> list[dict[str, Any]]:
-    """Share of matches whose tracks are within :data:`NEAR` at the true time (median over common frames), by angle."""
+    """Share of matches within :data:`MATCH_RADIUS` at the true time (median over common frames), by angle."""
     V = len(material.scene.videos)
     rng = np.random.default_rng(protocol.seed + 1)
     pairs = list(itertools.combinations(range(V), 2))
@@ -260,7 +262,7 @@ def matching_table(material: Material, protocol: Protocol, map: MapLike) -> list
         "two partners, features + curve, best 200": best(Candidates(2, 200, both), None),
         "the same again at synchronised times": best(Candidates(2, 200, both).at(Clock()), None),
     }
-    found: dict[str, list[tuple[float, float, int]]] = {name: [] for name in matchers}
+    by_matcher: dict[str, list[tuple[float, float, int]]] = {name: [] for name in matchers}
 
     def pair(item: tuple[int, int]) -> dict[str, tuple[float, float, int]]:
         a, b = (material.clip(int(v), 0, material.frames, 1, True) for v in item)
@@ -270,9 +272,9 @@ def matching_table(material: Material, protocol: Protocol, map: MapLike) -> list
     chosen = pairs[: protocol.matching]
     for answer in counted(map(pair, chosen), "matchers", "pair", len(chosen)):
         for name, value in answer.items():
-            found[name].append(value)
+            by_matcher[name].append(value)
     rows = []
-    for name, values in found.items():
+    for name, values in by_matcher.items():
         angle, precision, count = np.array(values).T
         row: dict[str, Any] = {"matching": name, "matches": round(float(count.mean()), 1)}
         for low, high in ((0, 55), (55, 95), (95, 120), (120, 181)):
@@ -289,7 +291,7 @@ def precision_near(a: TrackSet, b: TrackSet, matches: Matches) -> tuple[float, i
     together = np.isfinite(distance).sum(1) >= 5
     if not together.any():
         return 0.0, len(matches)
-    return float((np.nanmedian(distance[together], axis=1) < NEAR).mean()), len(matches)
+    return float((np.nanmedian(distance[together], axis=1) < MATCH_RADIUS).mean()), len(matches)
 
 
 def _solver(route: str, stages: Stages) -> Callable[[list[TrackSet]], Offsets]:
@@ -324,18 +326,18 @@ def _graph(
     length = min(protocol.graph_frames, material.frames)
     starts = rng.integers(0, min(30, material.frames - length) + 1, cameras)
     tracks = [material.clip(int(v), int(s), int(s) + length, 1, lifted) for v, s in zip(chosen, starts, strict=True)]
-    found = solve(tracks)
-    error = found.frames - (starts - starts[0])
+    offsets = solve(tracks)
+    error = offsets.frames - (starts - starts[0])
     return [
         {
             "route": route,
             "kind": kind,
-            "a": found.names[0],
-            "b": found.names[v],
+            "a": offsets.names[0],
+            "b": offsets.names[v],
             "shift": int(starts[v] - starts[0]),
             "error": _number(error[v]),
-            "sigma": _number(found.sigma[v] * found.fps[v]),
-            "flags": " ".join(f.code for f in found.flags[v]),
+            "sigma": _number(offsets.sigma[v] * offsets.fps[v]),
+            "flags": " ".join(f.code for f in offsets.flags[v]),
         }
         for v in range(1, cameras)
     ]

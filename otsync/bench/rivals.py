@@ -15,7 +15,7 @@ from ..types import Matches, TrackSet
 
 @dataclass(frozen=True)
 class OttJax:
-    """ott-jax: entropic FGW, ε relative to the cost."""
+    """ott-jax: entropic FGW with ε relative to the cost."""
 
     reg: float = 0.01
 
@@ -30,12 +30,11 @@ class OttJax:
         structure = [Geometry(cost_matrix=jnp.asarray(C, jnp.float32)) for C in (problem.Ca, problem.Cb)]
         fused = QuadraticProblem(*structure, Geometry(cost_matrix=jnp.asarray(problem.M)), fused_penalty=0.111)
         solver = GromovWasserstein(linear_solver=Sinkhorn(), epsilon=self.reg, relative_epsilon="mean")
-        found = solver(fused)
-        plan = np.asarray(found.matrix, float)
+        plan = np.asarray(solver(fused).matrix, float)
         stats = {"objective": problem.objective(plan)}
         return from_plan(plan, problem.gradient(plan), problem.p, problem.q, 1.0, stats, False)
 
 
 def installed() -> dict[str, tuple[MatcherLike, int]]:
-    """name -> (matcher, largest size) of the packages found."""
+    """name -> (matcher, largest size), of the packages that are installed."""
     return {"ott-jax": (OttJax(), 2000)} if find_spec("ott") else {}

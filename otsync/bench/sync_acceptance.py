@@ -1,4 +1,4 @@
-"""What synchronisation promises, measured on fresh seeds: each figure beside its bar."""
+"""Promises of synchronisation, measured on fresh seeds: each figure beside its bar."""
 
 from __future__ import annotations
 
@@ -47,10 +47,11 @@ def at_least(name: str, value: float, bar: float) -> Check:
 
 
 def answer(case: Case, refiner: SplineRefine | None = None) -> Alignment:
-    found = align(case.a, case.b, case.matches, throw=False)
-    if not np.isfinite(found.offset):
-        return found
-    return refine(case.a, case.b, case.matches, found, refiner, throw=False)
+    """Aligned and refined with the defaults; the scan's answer where it has no offset."""
+    coarse = align(case.a, case.b, case.matches, throw=False)
+    if not np.isfinite(coarse.offset):
+        return coarse
+    return refine(case.a, case.b, case.matches, coarse, refiner, throw=False)
 
 
 def pair_rows(seeds: Sequence[int], presets: Sequence[str] = ("mid", "hard", "brutal")) -> list[Row]:
@@ -58,17 +59,17 @@ def pair_rows(seeds: Sequence[int], presets: Sequence[str] = ("mid", "hard", "br
     rows: list[Row] = []
     for case in pair_cases(presets, seeds):
         started = time.process_time()
-        found = answer(case)
+        alignment = answer(case)
         rows.append(
             {
                 "preset": case.preset,
                 "class": case.motion,
                 "band": f"{BANDS[case.band][0]}-{BANDS[case.band][1]}",
                 "seed": case.seed,
-                "error": abs(found.offset * FPS - case.offset),
-                "sigma": found.sigma * FPS,
-                "trusted": found.status.ok,
-                "flags": " ".join(f.code for f in found.flags),
+                "error": abs(alignment.offset * FPS - case.offset),
+                "sigma": alignment.sigma * FPS,
+                "trusted": alignment.status.ok,
+                "flags": " ".join(f.code for f in alignment.flags),
                 "cpu_s": time.process_time() - started,
             }
         )
@@ -81,7 +82,7 @@ def errors(rows: Sequence[Row], trusted: bool | None = None, **where: str) -> np
 
 
 def pairs(rows: Sequence[Row]) -> Iterator[Check]:
-    """Bars of single pairs (issue item 1) and coverage of their sigmas (item 5)."""
+    """Single pairs: bars of their errors, and coverage of their sigmas."""
     e, t = errors(rows, preset="mid"), errors(rows, True, preset="mid")
     yield at_most("pair mid: mean", e.mean(), 0.06)
     yield at_most("pair mid: p90", np.quantile(e, 0.9), 0.15)
@@ -106,16 +107,16 @@ def coverage(name: str, error: np.ndarray, sigma: np.ndarray) -> Iterator[Check]
 
 
 def views(seeds: Sequence[int], videos: int = 8) -> Iterator[Check]:
-    """Many views (items 2 and 5): medians over moving classes, sigma of the graph."""
+    """Many views: medians over the moving classes, and coverage of the graph's sigmas."""
     for preset, bar in (("mid", 0.03), ("hard", 0.06), ("brutal", 0.3)):
         e, s, ok = [], [], []
         worlds = list(itertools.product(motions(), seeds))
         for motion, seed in counted(worlds, f"{videos} videos {preset}", "world"):
             tracks, truth, matches = many(motion, preset, videos, seed)
-            found = synchronize(tracks, matches=matches)
-            e += list(np.abs(found.seconds - truth.offsets)[1:] * FPS)
-            s += list(found.sigma[1:] * FPS)
-            ok += [status.ok for status in found.status[1:]]
+            offsets = synchronize(tracks, matches=matches)
+            e += list(np.abs(offsets.seconds - truth.offsets)[1:] * FPS)
+            s += list(offsets.sigma[1:] * FPS)
+            ok += [status.ok for status in offsets.status[1:]]
         error, sigma, trusted = np.array(e), np.array(s), np.array(ok)
         yield at_most(f"{videos} videos {preset}: median", float(np.nanmedian(error)), bar)
         yield Check(f"{videos} videos {preset}: share trusted", float(trusted.mean()), "", True)
@@ -125,21 +126,21 @@ def views(seeds: Sequence[int], videos: int = 8) -> Iterator[Check]:
 
 
 def thirty(seed: int) -> Iterator[Check]:
-    """30 videos of 150 frames, 100 given matches a pair, about 90 pairs (item 2)."""
+    """30 videos of 150 frames with 100 given matches per pair, about 90 pairs."""
     tracks, truth, matches = many("basketball", "mid", 30, seed, n=100)
     started = time.perf_counter()
-    found = synchronize(tracks, matches=matches)
+    offsets = synchronize(tracks, matches=matches)
     yield at_most(f"30 videos, {len(matches)} pairs: seconds (one process)", time.perf_counter() - started, 30)
-    yield at_most("30 videos: median error", float(np.median(np.abs(found.seconds - truth.offsets)[1:]) * FPS), 0.03)
+    yield at_most("30 videos: median error", float(np.median(np.abs(offsets.seconds - truth.offsets)[1:]) * FPS), 0.03)
 
 
 def juggling(seeds: Sequence[int], matches: int = 10) -> Iterator[Check]:
-    """Periodic motion, few matches, brutal tracks (item 3): curves of many pairs against each pair alone."""
+    """Periodic motion, few matches, brutal tracks: the curves of many pairs together against each pair alone."""
     star, graph, alone = [], [], []
     for seed in counted(seeds, "juggling", "world"):
         tracks, truth, given = many("juggle", "brutal", 8, seed, n=matches)
-        found = synchronize(tracks, matches=given)
-        graph += list(~(np.abs(found.seconds - truth.offsets)[1:] * FPS <= 2))
+        offsets = synchronize(tracks, matches=given)
+        graph += list(~(np.abs(offsets.seconds - truth.offsets)[1:] * FPS <= 2))
         for (i, j), m in given.items():
             one = answer(Case("juggle", "brutal", 0, seed, tracks[i], tracks[j], m, truth, truth.offset(i, j) * FPS))
             wrong = not abs(one.offset - truth.offset(i, j)) * FPS <= 2
@@ -151,16 +152,21 @@ def juggling(seeds: Sequence[int], matches: int = 10) -> Iterator[Check]:
     yield at_most(f"juggle, {matches} matches: graph, views over 2 frames", float(np.mean(graph)), 0.15)
 
 
+def judged(kind: str, case: Case) -> tuple[str, Alignment, float]:
+    """(kind, answer, error in frames) of a case."""
+    alignment = answer(case)
+    return kind, alignment, abs(alignment.offset * FPS - case.offset)
+
+
 def odd_cases(seeds: Sequence[int]) -> Iterator[tuple[str, Alignment, float]]:
-    """(kind, answer, error in frames) of the cases that must be flagged, or often are."""
+    """(kind, answer, error in frames) of cases that must be flagged, or often are."""
     for preset in ("mid", "hard"):
         for seed in seeds:
             for motion in motions():
                 name = label(motion)
                 rng = np.random.default_rng([seed, len(name), 11])
                 for n in (1, 2, 3, 4):
-                    case = pair_case(motion, preset, 1, seed, n=n)
-                    yield f"{n} matches", (found := answer(case)), abs(found.offset * FPS - case.offset)
+                    yield judged(f"{n} matches", pair_case(motion, preset, 1, seed, n=n))
                 for kind, offset, frames in (
                     ("no overlap", 160.0, 150),
                     ("overlap 50", 100.0, 150),
@@ -170,28 +176,24 @@ def odd_cases(seeds: Sequence[int]) -> Iterator[tuple[str, Alignment, float]]:
                         motion, preset=preset, frames=frames, offsets=[0, offset / FPS], seed=int(rng.integers(2**31))
                     )
                     case = Case(name, preset, 0, seed, a, b, truth.matches(0, 1), truth, offset)
-                    yield kind, (found := answer(case)), abs(found.offset * FPS - offset)
+                    yield judged(kind, case)
                 other = motions()[(motions().index(motion) + 1 + seed) % len(motions())]
                 a, b = (
                     simulate(m, preset=preset, videos=1, seed=int(rng.integers(2**31)))[0][0] for m in (motion, other)
                 )
                 m = Matches(np.stack([rng.integers(0, len(a), 60), rng.integers(0, len(b), 60)], 1))
-                found = refine(a, b, m, align(a, b, m, throw=False), throw=False)
-                yield "unrelated", found, np.nan
-                case = pair_case(motion, preset, 1, seed, wrong=0.7)
-                yield "70 % wrong", (found := answer(case)), abs(found.offset * FPS - case.offset)
-                case = pair_case(motion, preset, 1, seed, n=8)
-                yield "8 matches", (found := answer(case)), abs(found.offset * FPS - case.offset)
-            case = pair_case("static", preset, 1, seed)
-            yield "static", (found := answer(case)), abs(found.offset * FPS - case.offset)
+                yield "unrelated", refine(a, b, m, align(a, b, m, throw=False), throw=False), np.nan
+                yield judged("70 % wrong", pair_case(motion, preset, 1, seed, wrong=0.7))
+                yield judged("8 matches", pair_case(motion, preset, 1, seed, n=8))
+            yield judged("static", pair_case("static", preset, 1, seed))
 
 
 def flags(rows: Sequence[Row], seeds: Sequence[int]) -> Iterator[Check]:
-    """Odd cases, errors caught and needless flags (item 4)."""
+    """Odd cases, errors that are caught, and needless flags."""
     wrong, caught = 0, 0
     by_kind: dict[str, list[bool]] = {}
-    for kind, found, error in counted(odd_cases(seeds), "odd cases", "case"):
-        flagged = not found.status.ok
+    for kind, alignment, error in counted(odd_cases(seeds), "odd cases", "case"):
+        flagged = not alignment.status.ok
         by_kind.setdefault(kind, []).append(flagged)
         if not error <= WRONG:
             wrong += 1
@@ -209,7 +211,7 @@ def flags(rows: Sequence[Row], seeds: Sequence[int]) -> Iterator[Check]:
 
 
 def clocks(seeds: Sequence[int]) -> Iterator[Check]:
-    """Rates and timestamps (item 6)."""
+    """Rates and timestamps."""
     e, kept = {"fixed": [], "fit": []}, {150: [], 900: []}  # type: dict[str, list[float]], dict[int, list[bool]]
     for motion in counted(motions(), "clocks", "class"):
         for seed in seeds:
@@ -222,11 +224,11 @@ def clocks(seeds: Sequence[int]) -> Iterator[Check]:
                 m = truth.matches(0, 1)
                 start = align(a, b, m, throw=False)
                 for kind in ("fixed", "fit") if (frames, rate > 1) == (900, True) else ("fit",):
-                    found = refine(a, b, m, start, SplineRefine(rate=kind), throw=False)
+                    refined = refine(a, b, m, start, SplineRefine(rate=kind), throw=False)
                     if frames == 900 and rate > 1:
-                        e[kind].append(abs(found.offset * FPS - offset))
+                        e[kind].append(abs(refined.offset * FPS - offset))
                     elif kind == "fit":
-                        kept[frames].append(found.rate == 1.0)
+                        kept[frames].append(refined.rate == 1.0)
     yield Check("29.97 against 30 at T = 900, fixed: mean error", float(np.mean(e["fixed"])), "", True)
     yield at_most("29.97 against 30 at T = 900, fit: mean error", float(np.mean(e["fit"])), 0.1)
     yield at_least("rate left alone at T = 150", float(np.mean(kept[150])), 1.0)
@@ -252,14 +254,14 @@ def frames_of(tracks: TrackSet, keep: np.ndarray) -> TrackSet:
 
 
 def baseline(seeds: Sequence[int]) -> Iterator[Check]:
-    """The paper's DTW against the default in the widest band (item 8)."""
+    """The paper's DTW against the default in the widest band."""
     for preset in ("mid", "hard"):
         ours, paper = [], []
         for case in pair_cases((preset,), seeds):
             if case.band == len(BANDS) - 1:
                 ours.append(abs(answer(case).offset * FPS - case.offset))
-                found = align(case.a, case.b, case.matches, DTW(), throw=False)
-                paper.append(abs(found.offset * FPS - case.offset))
+                warped = align(case.a, case.b, case.matches, DTW(), throw=False)
+                paper.append(abs(warped.offset * FPS - case.offset))
         yield at_least(
             f"{preset}, 30-50: mean error of the paper's DTW over the default's",
             float(np.mean(paper) / np.mean(ours)),
@@ -270,7 +272,7 @@ def baseline(seeds: Sequence[int]) -> Iterator[Check]:
 def acceptance(seeds: Sequence[int], rows: Sequence[Row], progress: Callable[[str], None] = print) -> list[Check]:
     """All checks; ``rows`` from :func:`pair_rows`."""
     few = list(seeds)[: max(1, len(seeds) // 2)]
-    found: list[Check] = []
+    checks: list[Check] = []
     for part in (
         pairs(rows),
         views(seeds),
@@ -281,6 +283,6 @@ def acceptance(seeds: Sequence[int], rows: Sequence[Row], progress: Callable[[st
         baseline(few),
     ):
         for check in part:
-            found.append(check)
+            checks.append(check)
             progress(f"{'ok  ' if check.met else 'MISS'} {check.name}: {check.measured:.3g} ({check.bar or 'no bar'})")
-    return found
+    return checks

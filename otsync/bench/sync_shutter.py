@@ -1,4 +1,4 @@
-"""What rolling shutters cost synchronisation: with the readout declared, without, and beside global shutters."""
+"""Synchronisation with rolling shutters: with the readout declared and undeclared, beside global shutters."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from .record import Row
 from .sync_worlds import FPS, label, motions
 
 READOUT = (0.005, 0.03)
-"""Seconds; every video draws its own."""
+"""Bounds in seconds; every video draws its own."""
 
 RIG = Rig(tilt=12.0)
-"""Hand-held: what is filmed lies in the upper part of one image and in the lower of another."""
+"""Hand-held: the scene lies in the upper part of one image and in the lower part of another."""
 
 SHUTTERS = ("global", "rolling, declared", "rolling, not declared")
 
@@ -36,7 +36,7 @@ def undeclared(tracks: TrackSet) -> TrackSet:
 
 
 def worlds(motion: str, preset: str, videos: int, seed: int) -> Iterator[tuple[str, list[TrackSet], Truth]]:
-    """One world filmed three ways, offsets within 30 frames; all that is random is alike but the shutters."""
+    """One world filmed in three ways, offsets within 30 frames; everything random is alike except the shutters."""
     drawn = int(np.random.default_rng([seed, videos, zlib.crc32(label(motion).encode())]).integers(2**31))
     effects = PRESETS[preset].effects
 
@@ -53,10 +53,10 @@ def measured(tracks: Sequence[TrackSet], truth: Truth) -> Iterator[tuple[float, 
     """(frames off, trusted) of every video but the reference; two videos are a pair alone."""
     if len(tracks) == 2:
         a, b = tracks
-        found = align(a, b, truth.matches(0, 1), throw=False)
-        if np.isfinite(found.offset):
-            found = refine(a, b, truth.matches(0, 1), found, throw=False)
-        yield abs(found.offset - truth.offset(0, 1)) * FPS, found.status.ok
+        alignment = align(a, b, truth.matches(0, 1), throw=False)
+        if np.isfinite(alignment.offset):
+            alignment = refine(a, b, truth.matches(0, 1), alignment, throw=False)
+        yield abs(alignment.offset - truth.offset(0, 1)) * FPS, alignment.status.ok
         return
     many = synchronize(tracks, matches={pair: truth.matches(*pair) for pair in Graph().pairs(len(tracks), 0)})
     for v in range(1, len(tracks)):
@@ -72,7 +72,8 @@ def shutter_rows(
     """Errors in frames by number of videos, preset and shutter.
 
     Args:
-        seeds: of every class; of more than two videos the first seed alone, as in the tables of graphs: they take long.
+        seeds: for every class; with more than two videos the first one alone, as in the tables of graphs: they take
+            long.
     """
     rows: list[Row] = []
     for count, preset in itertools.product(videos, presets):
@@ -81,8 +82,8 @@ def shutter_rows(
         for motion, seed in counted(drawn, f"shutters, {preset}, {count} videos", "world"):
             for name, tracks, truth in worlds(motion, preset, count, seed):
                 answers[name] += measured(tracks, truth)
-        for name, found in answers.items():
-            e, trusted = np.array([x for x, _ in found]), np.array([ok for _, ok in found])
+        for name, pairs in answers.items():
+            e, trusted = np.array([x for x, _ in pairs]), np.array([ok for _, ok in pairs])
             rows.append(
                 {
                     "videos": count,

@@ -1,4 +1,4 @@
-"""The worlds that synchronisation is judged on: moving classes, three bands of offsets, the presets' own matches."""
+"""Worlds for benchmarks of synchronisation: moving classes, three bands of offsets, the presets' own matches."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ BANDS = ((0, 10), (10, 30), (30, 50))
 """|offset| in frames."""
 
 CALIBRATION, FRESH = 1000, 5000
-"""First seeds: thresholds were chosen on 1000-1999; figures are measured from 5000 on."""
+"""First seeds: thresholds were chosen on 1000-1999, figures are measured from 5000 on."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def label(motion: str) -> str:
 def pair_case(
     motion: str, preset: str, band: int, seed: int, *, n: int | None = None, wrong: float | None = None
 ) -> Case:
-    """A pair whose offset lies in ``band``, on either side; the draw depends on class, band and seed only."""
+    """A pair whose offset lies in ``band``, on either side; drawn from class, band and seed only."""
     rng = np.random.default_rng([seed, band, zlib.crc32(label(motion).encode())])
     offset = float(rng.uniform(*BANDS[band]) * rng.choice([-1, 1]))
     world = int(rng.integers(2**31))
@@ -66,6 +66,7 @@ def pair_case(
 
 
 def pair_cases(presets: Sequence[str], seeds: Sequence[int], classes: Sequence[str] | None = None) -> Iterator[Case]:
+    """Pairs of every preset, class, band and seed."""
     cells = list(itertools.product(presets, classes or motions(), range(len(BANDS)), seeds))
     for preset, motion, band, seed in counted(cells, "pairs", "pair"):
         yield pair_case(motion, preset, band, seed)

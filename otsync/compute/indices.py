@@ -7,7 +7,7 @@ from jaxtyping import Int
 
 
 def evenly(count: int, most: int) -> Int[np.ndarray, " n"]:
-    """Indices of at most ``most`` of ``count`` things in a row: evenly spread, ascending, the first and the last included.
+    """Indices of at most ``most`` of ``count`` things: evenly spread, ascending, with the first and the last.
 
     All of them where ``most`` are enough. Of an even spread between two whole numbers the even one is taken.
 

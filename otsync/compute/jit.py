@@ -1,4 +1,7 @@
-"""The one way a kernel is compiled. Importing this module imports numba; algorithms import their kernels when they run."""
+"""The one way in which kernels are compiled.
+
+Importing this module imports numba, so algorithms import their kernels when they run.
+"""
 
 from __future__ import annotations
 
@@ -33,8 +36,8 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
             if not _uncached_announced:
                 _uncached_announced = True
                 log.warning(
-                    "no writable folder for compiled code: it is compiled again in every process. Set NUMBA_CACHE_DIR "
-                    "to a folder of your own."
+                    "no writable folder for compiled code: every process compiles it again. Set NUMBA_CACHE_DIR to a "
+                    "folder of your own."
                 )
             return numba.njit(**settings)(function)
 
@@ -52,7 +55,7 @@ def _stamps(folder: pathlib.Path) -> tuple[tuple[str, int, int], ...]:
 def _tie_to_sources(dispatcher: Any) -> None:
     """Make the cached code of one kernel stale when any file of this folder, or of its own, changes.
 
-    Numba compares the kernel's own file only, but kernels compile in the constants and functions of the others.
+    Numba compares the kernel's own file only, but constants and functions of the others are compiled into it.
     """
     file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
     if file is not None and hasattr(file, "_source_stamp"):

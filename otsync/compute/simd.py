@@ -6,7 +6,7 @@ Numba's loops over pixels do not vectorise on their own (measured 3 to 6 times s
     drawn = (alpha >= ALPHA_MIN) & (t > ZERO)   # a mask; operands may mix vectors and float32 scalars
     simd.store(plane, i, simd.select(drawn, t - t * alpha, t))
 
-Everything maps to one LLVM vector instruction each, and LLVM to whatever the processor has. Arrays are 1-D, contiguous,
+Each maps to one vector instruction of LLVM, and LLVM maps it to what the processor has. Arrays are 1-D, contiguous,
 float32 or int32; indices are not checked.
 """
 
@@ -218,7 +218,7 @@ def to_int(typingctx, x):
     return ints(x), lambda context, builder, sig, args: builder.fptosi(args[0], ints.ir)
 
 
-#: 2^f = 1 + f (c1 + f (c2 + ...)) on [-1/2, 1/2]: minimax in the relative error, 9e-8, about one unit in the last place.
+#: 2^f = 1 + f (c1 + f (c2 + ...)) on [-1/2, 1/2]: minimax in the relative error, 9e-8: one unit in the last place.
 EXP2_COEFFICIENTS = (
     0.6931470036506653,
     0.24022242426872253,

@@ -1,4 +1,4 @@
-"""The one pool of threads: for nogil kernels over parts, in both packages.
+"""The pool of threads that runs nogil kernels over parts of their work, in both packages.
 
 Numba's own `parallel=True` is not used: its default layer aborts the process when two Python threads enter it at once.
 """
@@ -13,7 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 MapLike = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
-"""Any map-like callable: the builtin, an executor's, a cluster's."""
+"""Any callable like the builtin map: an executor's, a cluster's."""
 
 _pool: ThreadPoolExecutor | None = None
 _pool_lock = threading.Lock()
@@ -24,19 +24,19 @@ def set_threads(n: int) -> None:
     """Use `n` threads from now on, the caller's included. Results do not depend on it, to the last bit."""
     global _threads
     if n < 1:
-        raise ValueError(f"n: expected at least one thread, got {n}")
+        raise ValueError(f"n: expected at least one thread; found {n}.")
     with _pool_lock:
         _threads = n
         _forget_pool()
 
 
 def get_threads() -> int:
-    """The number of threads in use; at first the number of processors that this process may run on."""
+    """The number of threads in use; at first, that of the processors on which this process may run."""
     return _threads
 
 
 def _forget_pool() -> None:
-    # the old pool's threads end once its last job is done; jobs already handed to it are still carried out
+    # the old pool's threads end after its last job; jobs that it already has are still done
     global _pool
     if _pool is not None:
         _pool.shutdown(wait=False)
@@ -56,7 +56,8 @@ if hasattr(os, "register_at_fork"):
 def for_each(kernel: Callable[..., Any], parts: Iterable[tuple], *shared: Any) -> None:
     """Call kernel(*part, *shared) for every part, on all threads; parts are taken in order, by whoever is free.
 
-    The caller's thread works too, so a single part costs no hand-over and a busy machine no waiting for a late helper.
+    The caller's thread works too: a single part is not handed over, and on a busy machine nobody waits for a late
+    thread.
     """
     todo = deque(parts)
     helpers = min(_threads, len(todo)) - 1

@@ -35,8 +35,8 @@ from recon.scene.gaussians import Gaussians
 log = logging.getLogger("recon.backdrop")
 
 NEAR_SHARE = 0.22
-"""Near plane, as a share of the cameras' distance from the scene: what only one side saw must not stand just in front of
-another camera (with .01 m a held-out camera was blacked out: 6 dB)."""
+"""Near plane, as a share of the cameras' distance from the scene: what only one side saw must not stand just in front
+of another camera (with .01 m a held-out camera was blacked out: 6 dB)."""
 
 RATES: Mapping[str, float] = {
     "means": 0.2,
@@ -46,7 +46,7 @@ RATES: Mapping[str, float] = {
     "sh": 0.018,
     "gains": 2e-3,
 }
-"""Adam's steps at the start; of means in footprints. Slower means would stay on the seeds' surface, which is a guess."""
+"""Adam's steps at the start; of means in footprints. Slower means would stay on the seeds' surface, a guess."""
 
 DECAY = Decay(hold=0.3, last=0.03)
 """How the rates fall over the steps."""
@@ -79,7 +79,7 @@ SEARCHED = 32
 """Stills that floor and shell are searched with, at most; all of them are fitted."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class StaticFit:
     """A fitted background.
 
@@ -98,6 +98,12 @@ class StaticFit:
     psnr: Float[np.ndarray, " V"]
     floor: Floor | None = None
     stats: dict[str, float] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        known = self.psnr[np.isfinite(self.psnr)]
+        floor = "no floor" if self.floor is None else "a floor"
+        dB = float(known.mean()) if len(known) else math.nan
+        return f"StaticFit({self.gaussians}, {len(self.gains)} videos, {dB:.2f} dB, {floor})"
 
 
 def fit_backdrop(
@@ -195,7 +201,7 @@ def colour_gain(
 def backdrop_of(
     fit: StaticFit, footage: Footage, gain: Float[np.ndarray, " 3"] | None = None, frame: int = 0
 ) -> Float[np.ndarray, "h w 3"]:
-    """What the camera of ``footage`` sees of the static scene, float32 in 0..1, times ``gain``."""
+    """The static scene as the camera of ``footage`` sees it, float32 in 0..1, times ``gain``."""
     with torch.no_grad():
         w2c, K = (torch.as_tensor(a, dtype=torch.float32)[None] for a in (footage.pose(frame), footage.K))
         seen = _render(fit.gaussians, w2c, K, footage.size, fit.near)[0].numpy()

@@ -23,8 +23,8 @@ WIDTH, THICKNESS, OPACITY = 0.45, 0.2, 0.82
 """Of a seed: standard deviation along the surface, in spacings; across it, relative to that; and its opacity."""
 
 COARSE, BEHIND, BROAD = 5.0, 0.15, 0.6
-"""The layer below seeds of known depth: its spacing, in theirs; how far behind them it lies and the standard deviation of
-its discs, in its own spacings."""
+"""The layer below seeds of known depth: its spacing, in theirs; how far behind them it lies and the standard deviation
+of its discs, in its own spacings."""
 
 SOLID = 0.98
 """Opacity of that layer and of fillers: nothing lies behind them."""
@@ -33,12 +33,12 @@ FILLERS = 1500
 """Discs that would cover all directions; only those are taken where no camera looked."""
 
 BEYOND, ALONE, BLENDED = 1.05, 1.5, 8
-"""Fillers: how far out they stand, in distances of floor and shell; widths to the nearest seed from which one is needed;
-seeds whose colours it blends."""
+"""Fillers: how far out they stand, in distances of floor and shell; widths to the nearest seed from which one is
+needed; seeds whose colours it blends."""
 
 SHARPEST = 0.4
-"""Least standard deviation of a Gaussian, in pixels of the nearest camera: a held-out camera that comes closer would see
-gaps between finer ones (the smoothing filter of Mip-Splatting, Yu et al. 2024)."""
+"""Least standard deviation of a Gaussian, in pixels of the nearest camera: a held-out camera that comes closer would
+see gaps between finer ones (the smoothing filter of Mip-Splatting, Yu et al. 2024)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +76,7 @@ class Discs:
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """The surface in one picture, ray by ray: points, normals and colours [N,3], and whether their depth was given [N]."""
+    """The surface in one picture, ray by ray: points, normals and colours [N,3]; [N] whether depth was given."""
 
     at: Float[np.ndarray, "N 3"]
     normal: Float[np.ndarray, "N 3"]
@@ -198,7 +198,7 @@ def fillers(fine: Discs, around: Surroundings) -> Discs:
 
 
 def normals_of_depth(still: Still, u: np.ndarray, v: np.ndarray) -> Float[np.ndarray, "N 3"]:
-    """Surface normals, towards the camera, from the depths around pixels; where these do not tell, along the pixel's ray."""
+    """Surface normals, towards the camera, from the depths around pixels; else along the pixel's own ray."""
     assert still.depth is not None
     depth, (width, height) = still.depth, still.size
     reach = max(2, width // 80)

@@ -1,8 +1,8 @@
 """Where the background lies without depth: a floor and a shell around the scene, searched for by photo-consistency.
 
-A surface in its true place has the same colours in all cameras that see it. So the height and the tilt of the floor, and
-the centre and radius of the shell (the dome that cameras hang on, the walls of a hall, or just "far away"), are those at
-which the cameras' backgrounds agree best. Nothing assumes which axis points up.
+A surface in its true place has the same colours in all cameras that see it. So the height and the tilt of the floor,
+and the centre and radius of the shell (the dome that cameras hang on, the walls of a hall, or just "far away"), are
+those at which the cameras' backgrounds agree best. Nothing assumes which axis points up.
 """
 
 from __future__ import annotations
@@ -16,6 +16,31 @@ from scipy.ndimage import uniform_filter
 from scipy.optimize import minimize
 
 from recon.backdrop.stills import Still
+
+PARALLEL = 0.02
+"""Least curvature of the optical axes' common point, per camera: below, the axes are parallel and meet nowhere."""
+
+HEIGHTS, LEVEL, SPOTS = 41, 0.75, 48
+"""The search for a floor: heights; radius of the compared disc, in distances of the cameras; spots across it."""
+
+BELOW, ABOVE, LOWEST = 0.1, 0.05, 0.5
+"""With points of what moves: heights from this far below to this far above their lowest, in distances of the cameras; a
+percentile stands for the lowest, since some points are wrong."""
+
+TILT, TILT_COST, TILT_TRIES = 0.01, 0.02, 160
+"""Tilting the floor: a step, as a slope; what a tilt of three steps must gain in agreement; tries at most."""
+
+RADII, WIDEST, CLOSER = 20, 8.0, 9
+"""The search for a shell: radii, up to this many distances of the cameras; radii in the second, closer search."""
+
+FAR_AWAY = 2.5
+"""Radius of the shell, in distances of the cameras, where they agree on none."""
+
+SEEN_TWICE, SHARE_SEEN = 30, 0.05
+"""Points that two cameras must see for a verdict on a surface, and share of all of its points."""
+
+RAYS = 32
+"""Rays per image width along which a shell is searched."""
 
 UPRIGHT = 0.1
 """Weight of the images' vertical against the cameras' horizontals in the search for up: it decides only where they do
@@ -126,7 +151,7 @@ def common_focus(
     centers, axes = np.stack([s.center for s in stills]), np.stack([s.w2c[2, :3] for s in stills])
     focus = None
     across = np.eye(3) - axes[:, :, None] * axes[:, None]  # projections onto the planes across the axes
-    if np.linalg.svd(across.sum(0))[1][-1] > 0.02 * len(stills):
+    if np.linalg.svd(across.sum(0))[1][-1] > PARALLEL * len(stills):
         focus = np.linalg.solve(across.sum(0), np.einsum("vij,vj->i", across, centers))
         if np.median(((focus - centers) * axes).sum(1)) <= 0:
             focus = None
@@ -167,22 +192,22 @@ def find_floor(
     """
     low, high = focus @ up - distance, focus @ up
     if points is not None and len(points):
-        lowest = np.percentile(points @ up, 0.5)
-        low, high = lowest - 0.1 * distance, lowest + 0.05 * distance
+        lowest = np.percentile(points @ up, LOWEST)
+        low, high = lowest - BELOW * distance, lowest + ABOVE * distance
     # a direction of the scene, not of its axes: a turned scene gets the turned floor
     sides = np.cross(up, np.stack([v.center for v in lookups]) - focus)
     side = max(sides, key=np.linalg.norm)
     side = side / np.linalg.norm(side)
     frame = np.stack([side, np.cross(up, side)])
-    grid = np.linspace(-0.75, 0.75, 48) * distance
+    grid = np.linspace(-LEVEL, LEVEL, SPOTS) * distance
     spots = np.stack(np.meshgrid(grid, grid), -1).reshape(-1, 2)
-    spots = spots[(spots**2).sum(1) < (0.75 * distance) ** 2]
+    spots = spots[(spots**2).sum(1) < (LEVEL * distance) ** 2]
     level = focus - (focus @ up) * up + spots @ frame
 
     def at(height: float, tilt: Float[np.ndarray, " 2"]) -> Float[np.ndarray, "N 3"]:
         return level + (height + spots @ tilt)[:, None] * up
 
-    heights = np.linspace(low, high, 41)
+    heights = np.linspace(low, high, HEIGHTS)
     scores = [disagreement(lookups, at(h, np.zeros(2))) for h in heights]
     best = int(np.argmin(scores))
     step = heights[1] - heights[0]
@@ -190,12 +215,13 @@ def find_floor(
     def cost(x: np.ndarray) -> float:
         """Of a height and a tilt, which costs something: a few cameras would agree on one that suits a stain."""
         return (
-            disagreement(lookups, at(heights[best] + x[0] * step, x[1:] * 0.01)) + 0.02 * float((x[1:] ** 2).sum()) / 9
+            disagreement(lookups, at(heights[best] + x[0] * step, x[1:] * TILT))
+            + TILT_COST * float((x[1:] ** 2).sum()) / 3**2
         )
 
     start = np.vstack([np.zeros(3), np.eye(3)])
-    tilted = minimize(cost, start[0], method="Nelder-Mead", options={"maxfev": 160, "initial_simplex": start})
-    height, tilt = heights[best] + tilted.x[0] * step, tilted.x[1:] * 0.01
+    tilted = minimize(cost, start[0], method="Nelder-Mead", options={"maxfev": TILT_TRIES, "initial_simplex": start})
+    height, tilt = heights[best] + tilted.x[0] * step, tilted.x[1:] * TILT
     if not disagreement(lookups, at(height, tilt)) < AGREEMENT:
         return None
     normal = up - tilt @ frame
@@ -215,7 +241,7 @@ def find_shell(
     origin = np.concatenate([np.broadcast_to(v.center, v.rays.shape) for v in lookups])
     rays = np.concatenate([v.rays for v in lookups])
     below = np.full(len(rays), np.inf) if floor is None else floor.hit(origin, rays)
-    wide = Shell(focus, 2.5 * distance)
+    wide = Shell(focus, FAR_AWAY * distance)
     if len(lookups) < 2:
         return wide
 
@@ -227,10 +253,10 @@ def find_shell(
     tried: list[tuple[float, Shell]] = []
     for middle in (_sphere(centers, focus, distance), focus, centers.mean(0)):
         least = max(np.linalg.norm(centers - middle, axis=1).max(), 0.5 * distance)
-        radii = np.geomspace(least, 8 * distance, 20)
+        radii = np.geomspace(least, WIDEST * distance, RADII)
         costs = [cost(Shell(middle, float(r))) for r in radii]
         i = int(np.argmin(costs))
-        around = np.geomspace(radii[max(i - 1, 0)], radii[min(i + 1, len(radii) - 1)], 9)
+        around = np.geomspace(radii[max(i - 1, 0)], radii[min(i + 1, len(radii) - 1)], CLOSER)
         tried += [(c, Shell(middle, float(r))) for r, c in zip(radii, costs, strict=True)]
         tried += [(cost(shell), shell) for shell in (Shell(middle, float(r)) for r in around)]
     score, best = min(tried, key=lambda pair: pair[0])
@@ -251,7 +277,7 @@ class Lookup:
     @classmethod
     def of(cls, still: Still) -> Lookup:
         blurred = uniform_filter(still.image.astype(np.float32) / 255, (5, 5, 0))
-        u, v = still.pixels(max(1, still.size[0] // 32))
+        u, v = still.pixels(max(1, still.size[0] // RAYS))
         return cls(np.log(blurred + 0.02), still.where, still.K, still.w2c, still.center, still.rays(u, v))
 
     def look(self, points: Float[np.ndarray, "N 3"]) -> tuple[Float[np.ndarray, "N 3"], Bool[np.ndarray, " N"]]:
@@ -275,7 +301,7 @@ def disagreement(lookups: Sequence[Lookup], points: Float[np.ndarray, "N 3"]) ->
     looks = [lookup.look(points) for lookup in lookups]
     colors, ok = np.stack([c for c, _ in looks]), np.stack([k for _, k in looks])
     twice = ok.sum(0) >= 2
-    if twice.sum() < max(30, 0.05 * len(points)):
+    if twice.sum() < max(SEEN_TWICE, SHARE_SEEN * len(points)):
         return 1.0
     colors, weight = colors[:, twice], ok[:, twice, None].astype(np.float32)
     count = weight.sum(0)
@@ -291,7 +317,7 @@ def disagreement(lookups: Sequence[Lookup], points: Float[np.ndarray, "N 3"]) ->
 
 def _lifted(still: Still) -> Float[np.ndarray, "N 3"]:
     """Some points of the background at their known depth."""
-    u, v = still.pixels(max(1, still.size[0] // 32))
+    u, v = still.pixels(max(1, still.size[0] // RAYS))
     if still.depth is None:
         return np.empty((0, 3))
     known = still.depth[v, u] > 0

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from scipy.stats import binned_statistic
 
-from otsync.bench.panoptic import NEAR, precision_near
+from otsync.bench.panoptic import MATCH_RADIUS, precision_near
 from otsync.bench.record import table, write_rows
 from otsync.compute.threads import get_threads
 from otsync.io import Scene
@@ -29,7 +29,7 @@ from otsync.types import Offsets, TrackSet, Video
 from recon.bench.fits import Protocol, material_of
 from recon.features.lift import FeatureFrame, lift_features
 from recon.features.maps import DaisyMaps, LabMaps
-from recon.features.tracks import Alone, FeatureMaps, fit_alone, lifted_frames, seen_weights, tracks_of
+from recon.features.tracks import Alone, FeatureMaps, fit_alone, gaussian_tracks, lifted_frames, seen_weights
 from recon.footage.footage import Footage
 from recon.raster import render, set_threads
 from recon.scene.gaussians4d import Gaussians4D, join
@@ -112,7 +112,9 @@ def run(
         "cost": cost,
     }
     write_rows(out, "lifting", rows, about)
-    tell(f"Precision within {NEAR:g} m at the true time, by angle between the cameras:\n{table(rows)}\n{table([cost])}")
+    tell(
+        f"Precision within {MATCH_RADIUS:g} m at the true time, by angle between the cameras:\n{table(rows)}\n{table([cost])}"
+    )
     return rows
 
 
@@ -128,7 +130,7 @@ def sources_of(
 
     out = {}
     for name, maps in MAPS.items():
-        lifted = thinned(tracks_of(scene, footage, flow, maps, options=options, weights=weights))
+        lifted = thinned(gaussian_tracks(scene, footage, flow, maps, options=options, weights=weights))
         out[f"flow, {name} averaged"] = averaged(thinned(flow), footage, maps, options.every)
         out[f"Gaussians, {name} averaged"] = averaged(lifted, footage, maps, options.every)
         out[f"Gaussians, {name} lifted"] = lifted
@@ -219,7 +221,7 @@ def within_reach(a: TrackSet, b: TrackSet) -> tuple[float, int]:
     for track in a.positions():
         distance = np.linalg.norm(xb - track, axis=2)
         together = np.isfinite(distance).sum(1) >= 5
-        near += bool((np.nanmedian(distance[together], axis=1) < NEAR).any())
+        near += bool((np.nanmedian(distance[together], axis=1) < MATCH_RADIUS).any())
     return near / max(1, len(a)), len(a)
 
 

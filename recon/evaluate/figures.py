@@ -144,7 +144,7 @@ def coherence(tracks: Float[np.ndarray, "N T 3"], neighbours: int = 3, moment: i
 
 @dataclass(frozen=True)
 class Following:
-    """How far predicted points end from held-out tracks: median, 90th percentile (units of the tracks), and the count."""
+    """Distances of predicted points from held-out tracks: median, 90th percentile (units of the tracks), count."""
 
     median: float
     p90: float

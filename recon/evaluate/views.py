@@ -8,7 +8,7 @@ differs least from the filmed motion.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -48,7 +48,7 @@ COMMON = 0.5
 """Share of the shorter of clip and scene that an offset must leave in common to be tried."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class ViewScore:
     """How well a scene shows what one camera filmed.
 
@@ -69,7 +69,11 @@ class ViewScore:
     pictures: tuple[tuple[np.ndarray, np.ndarray], ...] = ()
     moving: bool = True
     held_out: bool = True
-    stats: dict[str, float] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        role = "held out" if self.held_out else "training"
+        figures = "".join(f", {name} {value:.2f}" for name, value in self.mean.items())
+        return f"ViewScore({self.name!r}, {len(self.frames)} frames, {role}{figures})"
 
 
 def view(
@@ -99,7 +103,7 @@ def view(
     return looking.scanned() if clock is None else looking
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class CameraView:
     """A camera that looks at a scene.
 
@@ -119,6 +123,9 @@ class CameraView:
     static: Tensor | None
     layered: bool = True
     optics: tuple[Effect, ...] = ()
+
+    def __repr__(self) -> str:
+        return f"CameraView({self.footage}, {self.clock})"
 
     @cached_property
     def _clip(self) -> Clip:
@@ -232,8 +239,8 @@ class CameraView:
                     tried[float(o)] = self.disagreement(o, _some(frames, SCAN_FRAMES))
         if not tried:
             raise ValueError(
-                f"video {f.name}: expected things that move at times that the scene covers; found none, so the search for "
-                "its clock has nothing to compare. Give its offset, or hold out another camera."
+                f"video {f.name}: expected things that move at times that the scene covers; found none to "
+                "find its clock by. Give its offset, or hold out another camera."
             )
         best = min(tried, key=lambda o: (tried[o], abs(o)))
         return replace(self, clock=Clock(best, self.clock.rate)).refined()

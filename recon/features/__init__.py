@@ -1,1 +1,1 @@
-"""Features on Gaussians, lifted from feature maps, and feature tracks of one video."""
+"""Features of Gaussians, lifted from feature maps, and dense feature tracks of one video."""

@@ -1,14 +1,15 @@
 """Feature lifting: one time-invariant feature per Gaussian from the feature maps of many frames and cameras.
 
-No optimisation is needed. A rendered feature is ``F(p) = sum_g w_g(p) f_g`` with compositing weights w; the f_g that the
-maps suggest are the averages over all pixels by just these weights,
+No optimisation is needed. A rendered feature is ``F(p) = sum_g w_g(p) f_g`` with compositing weights w. The f_g that
+the maps suggest are the averages over all pixels with these very weights,
 
-    f_g = sum_p w_g(p) F(p) / sum_p w_g(p),
+    f_g = sum_p w_g(p) F(p) / sum_p w_g(p).
 
-and the two sums are what the renderer's backward gives for the colours when the image's gradient is the map, and 1. So a
-frame costs one forward and one backward of the rasterizer with C + 1 channels.
+The renderer's backward pass gives the two sums as gradients of the colours, when the gradient of the image is the map,
+and 1. So a frame costs one forward and one backward pass with C + 1 channels.
 
-With positions over time they are dense 4D feature tracks, a second source for the matcher beside lifted 2-D tracks.
+Together with positions over time these are dense 4D feature tracks: a second source for the matcher, beside lifted 2D
+tracks.
 """
 
 from __future__ import annotations
@@ -34,9 +35,9 @@ class FeatureFrame:
     Args:
         t: world seconds.
         camera: at the size of the map, one pose; without distortion.
-        features: [h,w,C] of any extractor, or a function without arguments that makes them when it is their turn, so
+        features: [h,w,C] of any extractor, or a function without arguments that makes them when they are needed, so
             that only one map is in memory.
-        weight: [h,w] of pixels that count, such as the foreground mask; None: all.
+        weight: [h,w] how much each pixel counts, such as the foreground mask; None: all alike.
     """
 
     t: float
@@ -50,8 +51,8 @@ class Lifted:
     """Features of N Gaussians.
 
     Args:
-        features: [N,C] weighted means over all frames; zero where nothing was seen.
-        weight: [N] sum of compositing weights, in pixels: how much of each Gaussian was seen.
+        features: [N,C] weighted means over all frames; zero for Gaussians that were not seen.
+        weight: [N] sums of compositing weights, in pixels: how much of each Gaussian was seen.
     """
 
     features: Tensor
@@ -67,9 +68,9 @@ def lift_features(
     """Average the feature maps of all ``frames`` onto the Gaussians.
 
     Args:
-        gaussians_at: the Gaussians at a world time: ``Gaussians4D.moving``, or ``Gaussians4D.at`` when static ones may
-            stand in front. Their number and order do not change.
-        count: lift to the first ``count`` Gaussians; None: to all. The others only hide.
+        gaussians_at: the Gaussians at a world time, always as many and in the same order: ``Gaussians4D.moving``, or
+            ``Gaussians4D.at`` where static ones may stand in front.
+        count: lift to the first ``count`` Gaussians, which the others may hide; None: to all.
         options: of :func:`recon.raster.render`: near_plane, backend, ...
     """
     total: Tensor | None = None
@@ -82,12 +83,12 @@ def lift_features(
         sums = _accumulate(gaussians, frame.camera, target, options)[:n]
         if total is not None and total.shape != sums.shape:
             raise ValueError(
-                f"frames: expected {list(total.shape)} sums (Gaussians x channels + 1) of every frame, got "
-                f"{list(sums.shape)} at t = {frame.t:g}: lift maps of one extractor onto one scene"
+                f"frames: expected {list(total.shape)} sums (Gaussians x channels + 1) of every frame; found "
+                f"{list(sums.shape)} at t = {frame.t:g}. Lift maps of one extractor onto one scene."
             )
         total = sums if total is None else total + sums
     if total is None:
-        raise ValueError("frames: expected at least one frame with a feature map, got none")
+        raise ValueError("frames: expected at least one frame with a feature map; found none.")
     weight = total[:, -1]
     return Lifted(torch.where(weight[:, None] > 0, total[:, :-1] / weight[:, None].clamp_min(1e-12), 0.0), weight)
 
@@ -95,18 +96,20 @@ def lift_features(
 def _target(frame: FeatureFrame, like: Tensor, buffer: Tensor | None) -> Tensor:
     """[h,w,C+1]: the frame's features and ones, times the pixels' weights; in ``buffer`` where it fits.
 
-    Fresh memory of 15 MB (64 channels at 320 x 180) for every frame would cost a sixth of the lifting.
+    Fresh memory for every frame (15 MB for 64 channels at 320 x 180) would take a sixth of the time of lifting.
     """
     camera = frame.camera
     size = (camera.height, camera.width)
     maps = torch.as_tensor(frame.features() if callable(frame.features) else frame.features)
     if maps.ndim != 3 or tuple(maps.shape[:2]) != size:
         raise ValueError(
-            f"features: expected a map [{size[0]},{size[1]},C] like the camera at t = {frame.t:g}, got "
-            f"{list(maps.shape)}: resize the camera (K, width, height) to the map"
+            f"features: expected a map [{size[0]},{size[1]},C] like the camera at t = {frame.t:g}; found "
+            f"{list(maps.shape)}. Resize the camera (K, width, height) to the map."
         )
     if camera.w2c.ndim != 2 or (camera.distortion is not None and np.any(camera.distortion)):
-        raise ValueError("camera: expected one pose without distortion, got several or some: undistort the image first")
+        raise ValueError(
+            "camera: expected one pose without distortion; found several, or coefficients. Undistort the image first."
+        )
     shape = (*size, maps.shape[2] + 1)
     target = buffer if buffer is not None and buffer.shape == shape else like.new_empty(shape)
     target[..., :-1] = maps
@@ -139,20 +142,20 @@ def as_tracks(
     name: str = "",
     frame: str | None = None,
 ) -> TrackSet:
-    """Dense 4D feature tracks for the matcher: Gaussians that were seen, with unit features.
+    """Dense 4D feature tracks for the matcher: the Gaussians that were seen, with unit features.
 
     Args:
         positions: world units, over the T frames of the video (``Gaussians4D.tracks`` at its frames' world times).
         lifted: features of the same N Gaussians, from that video alone.
         fps, timestamps: the video's own clock, as of TrackSet.
-        visible: where a Gaussian is to count as observed; None: everywhere.
-        least_weight: pixels of a Gaussian that must have been seen over all frames; the others are left out, as are
-            those without a feature.
+        visible: where Gaussians count as observed; None: everywhere.
+        least_weight: Gaussians of which fewer pixels were seen, over all frames, are left out, as are those without a
+            feature.
         name, frame: of the video, and of the world frame.
     """
     features, weight = (t.detach().cpu().double().numpy() for t in (lifted.features, lifted.weight))
     if len(positions) != len(features):
-        raise ValueError(f"positions: expected the {len(features)} Gaussians of lifted, got {len(positions)}")
+        raise ValueError(f"positions: expected those of the {len(features)} lifted Gaussians; found {len(positions)}.")
     norm = np.linalg.norm(features, axis=1)
     keep = (weight >= least_weight) & (norm > 0) & np.isfinite(norm)
     return TrackSet(

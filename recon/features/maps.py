@@ -1,6 +1,6 @@
-"""Feature maps for lifting, from OpenCV: what goes into the slot of :func:`recon.feature_tracks.feature_tracks`.
+"""Feature maps for lifting, from OpenCV: for the slot of :func:`recon.features.tracks.feature_tracks`.
 
-Any callable of an image and its soft mask will do there, one that asks a network for instance; these need no weights.
+Any callable of an image and its soft mask fits there, such as one that runs a network; these need no weights.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from recon.footage.footage import FOREGROUND
 class LabMaps:
     """Colours of the foreground around every pixel: Gaussian-windowed histograms in CIE Lab, square-rooted.
 
-    The mean over frames and pixels of such vectors is nearly that of :class:`otsync.priors.features.LabHistogram`,
-    whose constants are used, but for the root, which is taken before the mean.
+    The mean of such vectors over frames and pixels is nearly that of :class:`otsync.priors.features.LabHistogram`, with
+    the same constants; but the root is taken before the mean.
 
     Args:
         sigma: of the window, pixels at 640 of width. bins: per axis of Lab; bins^3 channels.
@@ -38,7 +38,7 @@ class LabMaps:
         lightness = np.clip(lab[..., 0] * n / 100, 0, n - 1).astype(int)
         green, blue = (np.clip((lab[..., c] + 20) * n / 60, 0, n - 1).astype(int) for c in (1, 2))
         bin_of = np.where(mask > 255 * FOREGROUND, (lightness * n + green) * n + blue, -1)
-        # a blur at a lower resolution costs less, and a window of several pixels does not see the difference
+        # a blur at a lower resolution costs less, and over a window of several pixels it is nearly the same
         shrink = max(1, round(self.sigma * unit / 2))
         size = (max(1, round(w / shrink)), max(1, round(h / shrink)))
         out = np.zeros((h, w, n**3), np.float32)
@@ -52,8 +52,9 @@ class LabMaps:
 
 @dataclass(frozen=True)
 class DaisyMaps:
-    """DAISY (Tola et al., PAMI 2010): histograms of gradient directions on rings around every foreground pixel; of tracks
-    alone: :class:`otsync.priors.Daisy`.
+    """DAISY (Tola et al., PAMI 2010): histograms of gradient directions on rings around every foreground pixel.
+
+    For tracks instead of maps: :class:`otsync.priors.Daisy`.
 
     Args:
         radius: of the outer ring, pixels at 640 of width. rings, spokes, directions: (rings * spokes + 1) * directions
@@ -71,7 +72,7 @@ class DaisyMaps:
 
         if not hasattr(cv2, "xfeatures2d"):
             raise ValueError(
-                "DaisyMaps: needs OpenCV's contributed modules; found OpenCV without them. pip install "
+                "DaisyMaps: expected OpenCV's contributed modules; found OpenCV without them. pip install "
                 "opencv-contrib-python-headless, or use LabMaps."
             )
         radius = max(2.0, self.radius * mask.shape[1] / 640)
@@ -83,6 +84,6 @@ class DaisyMaps:
         row, column = np.nonzero(mask)
         if len(row):
             points = [cv2.KeyPoint(float(x), float(y), 1.0) for x, y in zip(column, row, strict=True)]
-            _, found = daisy.compute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), points)
-            out[row, column] = np.nan_to_num(found)
+            _, descriptors = daisy.compute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), points)
+            out[row, column] = np.nan_to_num(descriptors)
         return out

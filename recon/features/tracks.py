@@ -1,10 +1,10 @@
 """Dense 4D feature tracks of one video alone: the paper's stage 1 ("Per-Video 4D Feature Track Estimation", Sec. 3.2).
 
-Nothing is known yet of other videos, so everything lives on the video's own clock: a scaffold through its own lifted
+Nothing is known of other videos yet, so everything lives on the video's own clock: a scaffold through its own lifted
 tracks, Gaussians from its own depth, a short fit to its own images with the clock frozen. Then feature maps of any
-extractor are lifted in closed form to one time-invariant feature per Gaussian (:mod:`recon.features`), and the
+extractor are lifted in closed form to one time-invariant feature per Gaussian (:mod:`recon.features.lift`). The
 Gaussians' trajectories with these features, in the frames in which they are seen, are a track set like any other: a
-second source for the matcher, beside lifted 2-D tracks, and denser.
+second source for the matcher, beside lifted 2D tracks, and denser.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ from recon.scene.seed import Seeding, moments
 from recon.scene.seed import seed as seeded
 
 FeatureMaps = Callable[[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]], Float[np.ndarray, "h w C"]]
-"""The slot for an extractor: a working image and its soft foreground mask (0..255) to a map of the same size."""
+"""The slot of extractors: from a working image and its soft foreground mask (0..255) to a map of the same size."""
 
 
 @dataclass(frozen=True)
 class Alone:
-    """How one video is fitted, and what of it becomes tracks.
+    """How one video is fitted, and which of its Gaussians become tracks.
 
     Args:
-        steps: of the fit, of one image each. 0: Gaussians as they were seeded.
-        scaffold, seeding, losses: as of a fit of all videos. rates: without "offsets": one video has no offset.
+        steps: of the fit, with one image each. 0: Gaussians as they were seeded.
+        scaffold, seeding, losses: as for a fit of all videos. rates: without "offsets", since one video has none.
         every: seconds between frames whose features are lifted.
         least_pixels: compositing weight, in pixels, from which a Gaussian counts as seen in a frame.
         least_life: seconds that a Gaussian must be seen to become a track, or a third of the clip.
@@ -55,9 +55,12 @@ class Alone:
 
     def __post_init__(self) -> None:
         if "offsets" in self.rates:
-            raise ValueError("rates: expected no rate of offsets; found one. A video alone has nothing to be moved to.")
+            raise ValueError("rates: expected none for offsets; found one. A single video has no offset.")
         if not (self.every > 0 and self.least_pixels > 0 and self.least_life >= 0):
-            raise ValueError(f"every, least_pixels, least_life: expected positive numbers; found {self}.")
+            raise ValueError(
+                f"every, least_pixels, least_life: expected numbers > 0 (least_life: 0 or more); found {self.every}, "
+                f"{self.least_pixels}, {self.least_life}."
+            )
 
 
 def feature_tracks(
@@ -74,17 +77,17 @@ def feature_tracks(
 
     Args:
         footage: the video at working size, with masks. tracks: its lifted tracks, over the same frames.
-        depth: its depth maps, as :func:`recon.depth.working_depth` gives them.
+        depth: its depth maps, as :func:`recon.footage.depth.working_depth` gives them.
         feature_maps: the extractor. steps: of the fit, instead of those of ``options``.
 
     Returns:
-        One track per Gaussian that was seen long enough, on the video's own clock, with ``uv`` and ``camera`` at working
-        size and unit features; ``frame`` is that of ``tracks``.
+        One track per Gaussian that was seen long enough, on the video's own clock, with unit features, and ``uv`` and
+        ``camera`` at working size; ``frame`` is that of ``tracks``.
     """
     options = options or Alone()
     options = options if steps is None else replace(options, steps=steps)
     scene = fit_alone(footage, tracks, depth, options=options, seed=seed)
-    return tracks_of(scene, footage, tracks, feature_maps, options=options)
+    return gaussian_tracks(scene, footage, tracks, feature_maps, options=options)
 
 
 def fit_alone(
@@ -92,7 +95,7 @@ def fit_alone(
 ) -> Gaussians4D:
     """A 4D scene of what moves in one video, on that video's own clock; for arguments see :func:`feature_tracks`.
 
-    Where the background is not known (a moving camera), what moves is fitted before black.
+    Where the background is unknown (a moving camera), what moves is fitted in front of black.
     """
     options = options or Alone()
     _check(footage, tracks)
@@ -129,7 +132,7 @@ def fit_alone(
     ).scene
 
 
-def tracks_of(
+def gaussian_tracks(
     scene: Gaussians4D,
     footage: Footage,
     tracks: TrackSet,
@@ -142,7 +145,7 @@ def tracks_of(
 
     Args:
         tracks: of the same video; their clock, name and world frame are passed on.
-        weights: what :func:`seen_weights` gives, where it is known already: it does not depend on the features.
+        weights: those of :func:`seen_weights`, where they are known already: features do not change them.
     """
     options = options or Alone()
     _check(footage, tracks)
@@ -155,7 +158,7 @@ def tracks_of(
         [_frame(footage, k, feature_maps) for k in lifted_frames(footage, options.every)],
         near_plane=scene.moving_near,
     )
-    found = as_tracks(
+    dense = as_tracks(
         scene.tracks(footage.times),
         lifted,
         fps=tracks.fps,
@@ -165,15 +168,15 @@ def tracks_of(
         name=tracks.name,
         frame=tracks.frame,
     )
-    found = found.take(np.flatnonzero(found.seen.any(1)))
-    if len(found) == 0:
+    dense = dense.take(np.flatnonzero(dense.seen.any(1)))
+    if len(dense) == 0:
         raise ValueError(
             f"video {footage.name}: expected Gaussians that are seen for {options.least_life:g} s; found none. Check "
             "masks and depth, or lower least_life and least_pixels."
         )
-    # at the frames' own times, as by a shutter that sees all rows at once
+    # at the frames' own times, as a shutter that reads all rows at once sees them
     camera = replace(footage.camera, readout=None)
-    return replace(found, uv=camera.project(found.positions()), camera=camera)
+    return replace(dense, uv=camera.project(dense.positions()), camera=camera)
 
 
 def seen_weights(scene: Gaussians4D, footage: Footage) -> Float[np.ndarray, "N T"]:
@@ -198,7 +201,7 @@ def lifted_frames(footage: Footage, every: float) -> list[int]:
 
 
 def before_black(footage: Footage) -> Footage:
-    """The footage with its foreground alone, over a background of black."""
+    """The footage with its foreground alone, in front of black."""
     assert footage.masks is not None
     matte = footage.images * (footage.masks[..., None] / np.float32(255))
     black = np.zeros(footage.images.shape[1:], np.uint8)
@@ -211,7 +214,7 @@ def before_black(footage: Footage) -> Footage:
 
 
 def own_clock(footage: Footage) -> Offsets:
-    """One video on its own clock, of which nothing is doubted."""
+    """One video on its own clock, with nothing in doubt."""
     fps = 1 / float(np.median(np.diff(footage.times))) if len(footage) > 1 else 30.0
     return Offsets.known([footage.name], np.zeros(1), fps)
 
@@ -235,7 +238,7 @@ def _footprint(footage: Footage, tracks: TrackSet) -> float:
 
 
 def _check(footage: Footage, tracks: TrackSet) -> None:
-    """What one video must have. Tracks and footage are told apart by their clocks: both must be of the same frames."""
+    """ValueError for footage without masks, and for tracks that are not of its frames."""
     if footage.masks is None:
         raise ValueError(
             f"video {footage.name}: expected foreground masks; found none. Without them nothing tells what moves: give "

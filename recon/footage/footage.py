@@ -26,7 +26,7 @@ FOREGROUND = 0.3
 """Share of a working pixel from which it counts as foreground."""
 
 GROWTH, MARGIN = 3, 10
-"""Pixels, at 320 of width: by which masks grow before the background is taken, and between moving things and their box."""
+"""Pixels, at 320 of width: growth of masks before the background is taken; margin of boxes around what moves."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -77,8 +77,8 @@ class Footage:
         ]
         camera = "fixed" if self.w2c.ndim == 2 else "moving"
         return (
-            f"Footage({self.name!r}, {len(self)} frames of {self.size[0]} x {self.size[1]}, {first:.3f} to {last:.3f} s, "
-            f"{camera} camera{''.join(f', {name}' for name in has)})"
+            f"Footage({self.name!r}, {len(self)} frames of {self.size[0]} x {self.size[1]}, "
+            f"{first:.3f} to {last:.3f} s, {camera} camera{''.join(f', {name}' for name in has)})"
         )
 
     @property
@@ -145,8 +145,8 @@ def footage_of(
     """
     if masks is not None and len(masks) != len(video.frames):
         raise ValueError(
-            f"masks of {video.name!r}: expected {len(video.frames)}, one per frame; found {len(masks)}. Leave them out or "
-            "make one for every frame."
+            f"masks of {video.name!r}: expected {len(video.frames)}, one per frame; found {len(masks)}. Leave them "
+            "out, or make one for every frame."
         )
     lens = Lens.of(video.camera, width)
     picks = range(len(video.frames))[frames or slice(None)]

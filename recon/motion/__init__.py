@@ -1,14 +1,14 @@
-"""How things move: a scaffold of splined nodes, and its ablations, in one slot.
+"""Motion: a scaffold of splined nodes, and its ablations, in one slot.
 
-motion.py        Motion: what a fit asks of any of them
+motion.py        Motion: the slot, as a fit uses it
 paths.py         HermiteSpline, Sampled: curves in time as sums over four knots
-scaffold.py      Scaffold: nodes, and binding Gaussians to them; binding.py: who is bound to what
+scaffold.py      Scaffold: nodes, and binding Gaussians to them; binding.py: which nodes carry which Gaussian
 warp.py          carrying Gaussians with nodes: the definition in torch
 fused.py         the same, poses and motion losses in compiled kernels: *_kernels.py
 per_gaussian.py  PerGaussian, Static
 build.py         build_scaffold: from lifted tracks and offsets
-nodes.py         tracks on one grid of world time, D_track, the pick; solve.py: curves and rotations
-density.py       more nodes where they are wanted, fewer where they are not
+nodes.py         tracks on one grid of world time, D_track, picking nodes; solve.py: their curves and rotations
+density.py       more nodes where they are needed, fewer where they are not
 """
 
 from recon.motion.binding import Binding

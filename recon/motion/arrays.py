@@ -1,4 +1,4 @@
-"""Tensors from a stranger's arrays: compiled kernels follow their indices and shapes without looking, so we look here."""
+"""Tensors from a stranger's arrays, checked here: compiled kernels trust shapes and indices."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ Arrays = Mapping[str, np.ndarray]
 
 
 def numbers(arrays: Arrays, name: str, shape: tuple[int | None, ...], dtypes: tuple[type, ...] = FLOATS) -> Tensor:
-    """A copy of finite numbers of one of ``dtypes`` and of ``shape`` (None: any length).
+    """A copy of an array of finite numbers, of one of ``dtypes`` and of ``shape`` (None: any length).
 
-    KeyError where there is no such array, ValueError naming it where it is another.
+    KeyError where there is no such array; ValueError names one that does not fit.
     """
     array = np.asarray(arrays[name])
     fits = array.ndim == len(shape) and all(n is None or n == m for n, m in zip(shape, array.shape, strict=True))
@@ -32,10 +32,10 @@ def numbers(arrays: Arrays, name: str, shape: tuple[int | None, ...], dtypes: tu
 
 def indices(arrays: Arrays, name: str, shape: tuple[int | None, ...], count: int) -> Tensor:
     """A copy of int64 indices 0..count - 1 of ``shape``; errors as of :func:`numbers`."""
-    found = numbers(arrays, name, shape, (np.int64,))
-    if found.numel() and not 0 <= int(found.min()) <= int(found.max()) < count:
-        raise ValueError(f"{name}: expected indices 0 to {count - 1}; found {int(found.min())} to {int(found.max())}.")
-    return found
+    index = numbers(arrays, name, shape, (np.int64,))
+    if index.numel() and not 0 <= int(index.min()) <= int(index.max()) < count:
+        raise ValueError(f"{name}: expected indices 0 to {count - 1}; found {int(index.min())} to {int(index.max())}.")
+    return index
 
 
 def scalar(arrays: Arrays, name: str) -> float:

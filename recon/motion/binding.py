@@ -1,4 +1,4 @@
-"""Which nodes carry which Gaussian, and where those nodes stood when it was bound."""
+"""Bindings: which nodes carry which Gaussian, and where these nodes stood when it was bound."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ NODES = 8  # per Gaussian: the nearest one and its topological neighbours
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """The (rest, node) pairs that a binding uses, and the two ways through them that a warp takes.
+    """The (rest, node) pairs that a binding uses, in the orders in which a warp goes through them.
 
-    Q pairs in ascending order of the node, then the rest: `of_slot` [N,8] says which pair a Gaussian's slot is, `starts`
-    [Q+1] and `slots` [N*8] list the slots (Gaussian * 8 + k) of every pair in ascending order, `node_starts` [M+1] the
-    pairs of every node. Sums over slots and pairs run in these orders: the same to the last bit, whoever computes them.
+    Q pairs in ascending order of the node, then of the rest. `of_slot` [N,8]: the pair of each slot of a Gaussian;
+    `starts` [Q+1] and `slots` [N*8]: the slots (Gaussian * 8 + k) of every pair, ascending; `node_starts` [M+1]: the
+    pairs of every node. Sums over slots and pairs run in these orders, and so are the same to the last bit.
     """
 
     node: np.ndarray
@@ -31,14 +31,14 @@ class Layout:
     node_starts: np.ndarray
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Binding:
-    """N Gaussians bound to M nodes: constants of a fit, apart from its learnable parameters.
+    """N Gaussians bound to M nodes; constant during a fit.
 
-    rest int64 [N]: which of the R rests the Gaussian was bound at; nodes int64 [N,8] and weights [N,8] >= 0, of sum 1,
-    the nearest node first, which is the heaviest;
-    times float64 [R] world seconds of the rests; positions [R,M,3] and quats [R,M,4] (unit): the nodes' poses then,
-    frozen, so that no reference frame is evaluated anew in each step and a Gaussian's mean keeps its meaning.
+    rest int64 [N]: at which of the R rests each Gaussian was bound. nodes int64 [N,8] and weights [N,8] >= 0, of sum 1:
+    the nearest node first, which is the heaviest. times float64 [R]: world seconds of the rests. positions [R,M,3] and
+    quats [R,M,4] (unit): the nodes' poses then, frozen, so that no step evaluates them again and a Gaussian's mean
+    keeps its meaning.
     """
 
     rest: Tensor
@@ -64,9 +64,9 @@ class Binding:
 
     @classmethod
     def from_arrays(cls, arrays: Arrays, n_nodes: int, kind: tuple[type, ...]) -> Binding:
-        """From a scaffold's arrays, named ``binding_*``, in the precision `kind` of its knots.
+        """From a scaffold's arrays ``binding_*``, in the precision `kind` of its knots.
 
-        KeyError or ValueError for what is missing or unsound. Checked here alone: those made by binding are sound.
+        KeyError or ValueError for what is missing or unsound. Only arrays are checked: a binding made here is sound.
         """
         times = numbers(arrays, "binding_times", (None,), (np.float64,))
         rest = indices(arrays, "binding_rest", (None,), len(times))
@@ -83,7 +83,12 @@ class Binding:
         )
 
     def __len__(self) -> int:
+        """Number of Gaussians."""
         return len(self.rest)
+
+    def __repr__(self) -> str:
+        rests, nodes = self.positions.shape[:2]
+        return f"Binding({len(self)} Gaussians to {nodes} nodes, {rests} rests, {self.weights.device})"
 
     def take(self, index: Tensor | np.ndarray) -> Binding:
         """The Gaussians at `index` (integers, with repeats, or a mask)."""
@@ -91,8 +96,8 @@ class Binding:
         return replace(self, rest=self.rest[index], nodes=self.nodes[index], weights=self.weights[index])
 
     def append(self, nodes: Tensor, weights: Tensor, time: float, positions: Tensor, quats: Tensor) -> Binding:
-        """n more Gaussians, bound at world second `time` to nodes with poses [M,3], [M,4]: one more rest, unless an
-        earlier one is the same."""
+        """With n more Gaussians, bound at world second `time` to nodes with poses [M,3], [M,4]: one more rest, unless
+        an earlier one is the same."""
         same = [
             r
             for r in range(len(self.times))

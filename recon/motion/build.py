@@ -27,14 +27,14 @@ class ScaffoldOptions:
     """How a scaffold is built. Lengths in footprints (the world size of a working pixel), times in seconds.
 
     Args:
-        unit: spacing of the nodes; None: 7.5, less (down to 2) where that gives fewer than `fewest` nodes, more where
-            it gives more than `most`.
-        second_pick: spacing of the second pick on full curves, as a part of `unit`.
+        unit: spacing of the nodes; None: 7.5, or less (down to 2) where that gives fewer than `fewest` nodes, or more
+            where it gives more than `most`.
+        second_pick: spacing of the second pick, on full curves, as a share of `unit`.
         spacing: of the knots in time. margin: seconds of knots beyond both ends: the largest believable offset.
         per_video: one scaffold per video, each on its own clock, as in the paper; else one in world time.
-        neighbours: topological neighbours of a node. reach: D_track beyond which they are none, in units.
-        robust: distance at which a sample counts half, in footprints. shortest: seconds a track must be seen to be
-            picked, or a third of what the longest is.
+        neighbours: of a node. reach: D_track, in units, from which nodes are no neighbours.
+        robust: distance at which a sample counts half, in footprints.
+        shortest: seconds that a track must be seen to be picked, or a third of those of the longest.
         smooth: weights of the solve. blend: "linear" or "dual-quaternion".
     """
 
@@ -61,7 +61,8 @@ class ScaffoldOptions:
             raise ValueError("margin, neighbours, fewest, most: expected margin >= 0, 1 neighbour, fewest <= most.")
 
 
-UNIT, LEAST_UNIT, MOST_UNIT, GROWTH = 7.5, 2.0, 750.0, 1.25  # footprints, and the factor from one try to the next
+UNIT, LEAST_UNIT, MOST_UNIT, GROWTH = 7.5, 2.0, 750.0, 1.25  # footprints; the last: the factor between two tries
+ROUNDS = 3  # of reweighting in each of the two solves
 
 
 def build_scaffold(
@@ -76,10 +77,10 @@ def build_scaffold(
 ) -> Scaffold:
     """Nodes, curves and rotations from the lifted tracks of V videos: float32 tensors on the CPU, nothing bound yet.
 
-    tracks: one set of each video, in the order in which a fit has them: a node's clock is the number of its set, and a
-    scaffold per video expects V clocks. A video without tracks has an empty set.
-    offsets, rates [V]: world second = rate · own second + offset. footprint: world size of a working pixel at the
-    moving part. frame_step: seconds of one frame of the reference. seed: of the order of tracks seen equally long.
+    tracks: one set per video, in the order of the fit: a node's clock is the index of its set, and a scaffold per video
+    expects V clocks. The set of a video without tracks is empty.
+    offsets, rates [V]: world second = rate · own second + offset. footprint: world size of a working pixel at what
+    moves. frame_step: seconds of one frame of the reference. seed: orders tracks that are seen equally long.
     """
     options = options or ScaffoldOptions()
     if not (np.isfinite(footprint) and footprint > 0):
@@ -143,16 +144,16 @@ def _assemble(path: HermiteSpline, parts: Sequence[_Nodes], options: ScaffoldOpt
 def _nodes(grid: Grid, path: HermiteSpline, footprint: float, options: ScaffoldOptions, seed: int) -> _Nodes:
     """Pick, solve, pick again on the full curves, solve again, turn."""
     picked, unit = _first_pick(grid, footprint, options, seed)
-    fit = _Fit(grid, path, picked, unit, footprint, options)
+    nodes = _PickedTracks(grid, path, picked, unit, footprint, options)
     xyz, seen = grid.compared()
-    curves = fit.solve(*picking.neighbours(xyz[picked], seen[picked], options.neighbours), rounds=3)
-    full = fit.on_grid(curves)
+    curves = nodes.solve(*picking.neighbours(xyz[picked], seen[picked], options.neighbours), rounds=ROUNDS)
+    full = nodes.on_grid(curves)
     every = np.ones(full.shape[:2], bool)
     longest = np.argsort(-grid.seen[picked].sum(1), kind="stable")
     again = picking.pick(full, every, longest, options.second_pick * unit, len(picked))
-    fit = _Fit(grid, path, picked[again], unit, footprint, options)
-    curves = fit.solve(*picking.neighbours(full[again], every[again], options.neighbours), rounds=3)
-    full = fit.on_grid(curves)
+    nodes = _PickedTracks(grid, path, picked[again], unit, footprint, options)
+    curves = nodes.solve(*picking.neighbours(full[again], every[again], options.neighbours), rounds=ROUNDS)
+    full = nodes.on_grid(curves)
     neighbours, distances = picking.neighbours(full, every[again], options.neighbours)
     weights = picking.edge_weights(distances, unit, options.reach)
     turned = neighbourhood_rotations(curves, neighbours, weights, unit)
@@ -176,7 +177,7 @@ def _first_pick(grid: Grid, footprint: float, options: ScaffoldOptions, seed: in
 
     unit = options.unit or UNIT
     picked = at(unit)
-    # a larger spacing, rather than a part of the scene without nodes; in vain where few are ever seen together
+    # rather a larger spacing than a part of the scene without nodes; no use where few are ever seen together
     while len(picked) > options.most and unit < MOST_UNIT:
         unit *= GROWTH
         picked = at(unit)
@@ -187,15 +188,15 @@ def _first_pick(grid: Grid, footprint: float, options: ScaffoldOptions, seed: in
         unit, picked = unit / GROWTH, closer
     if len(picked) > options.most:
         logger.warning(
-            "more than %d tracks are never seen together or are further apart than %g footprints: those seen for the "
-            "longest become nodes; are the offsets right?",
+            "more than %d tracks are never seen together, or are further apart than %g footprints: those seen longest "
+            "become nodes. Are the offsets right?",
             *(options.most, unit),
         )
     return picked[: options.most], unit * footprint
 
 
-class _Fit:
-    """The picked tracks' samples, ready to be solved for."""
+class _PickedTracks:
+    """The tracks that become nodes: their samples, ready for the solve."""
 
     def __init__(
         self,

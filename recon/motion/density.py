@@ -1,6 +1,6 @@
-"""Where a scaffold needs more nodes, and where it has some for nothing.
+"""Growing nodes where a scaffold needs more, and pruning those that carry nothing.
 
-A change of the nodes says where each came from, so that an optimiser can carry its averages along.
+A change of the nodes tells where each came from, so that an optimiser can keep its averages.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from recon.rotations import continuous, unit
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """A scaffold with other nodes. source int64 [M']: the earlier node that each is, or -1 for a new one."""
+    """A scaffold with other nodes. source int64 [M']: the index that each node had before, -1 for a new one."""
 
     scaffold: Scaffold
     source: Tensor
 
 
 def node_gradients(scaffold: Scaffold, gradients: Tensor) -> Tensor:
-    """What pulls at each node [M]: the mean of its Gaussians' `gradients` [N] >= 0, by the weights of their binding."""
+    """How hard each node is pulled [M]: the mean of its Gaussians' `gradients` [N] >= 0, weighted as they are bound."""
     nodes, w = scaffold.binding.nodes.reshape(-1), scaffold.binding.weights
     pull = torch.zeros(len(scaffold), dtype=w.dtype, device=w.device)
     total = pull.index_add(0, nodes, w.reshape(-1))
@@ -45,16 +45,16 @@ def grow(
     apart: float = 0.5,
     most: int = 100,
 ) -> Change:
-    """New nodes where one node is pulled at by `factor` times as much as the median one: at most `most`.
+    """New nodes where one is pulled `factor` times as hard as the median node: at most `most`.
 
-    gradients [N]: of the loss with respect to the Gaussians' means [N,3], as norms, summed over steps. Of each such
-    node's Gaussians the one pulled at the most becomes a node, if it is further than `apart` units from its nearest. A
-    new node moves and turns as its Gaussian has been carried so far, and so did it at the rests: the others are carried
-    on nearly as before (exactly so where all move rigidly). Neighbours and bindings are found anew.
+    gradients [N]: norms of the gradients of the Gaussians' means [N,3], summed over steps. Of such a node's Gaussians
+    the one pulled hardest becomes a node, if it is further than `apart` units from its nearest node. The new node moves
+    and turns as its Gaussian has been carried so far, at the rests too: the other Gaussians are carried nearly as
+    before (exactly so where all move rigidly). Neighbours and bindings are searched for again.
     """
     if gradients.shape != means.shape[:1] or len(means) != len(scaffold.binding):
         raise ValueError(
-            f"gradients, means: expected one norm and one mean for each of the {len(scaffold.binding)} bound Gaussians; "
+            f"gradients, means: expected a norm and a mean for each of the {len(scaffold.binding)} bound Gaussians; "
             f"found shapes {tuple(gradients.shape)}, {tuple(means.shape)}."
         )
     with torch.no_grad():
@@ -67,7 +67,7 @@ def grow(
         def carried(positions: Tensor, quats: Tensor) -> tuple[Tensor, Tensor]:
             return warping.blend(bound, positions, quats, places, upright, scaffold.blend)
 
-        # a path runs through its knots, and a Gaussian's nodes share a clock: knots are poses at one time
+        # a path runs through its knots, and the nodes of a Gaussian share a clock: knots are poses at one time
         knots, turns = zip(*map(carried, scaffold.knots, unit(scaffold.knot_quats)), strict=True)
         rests = [carried(p, q) for p, q in zip(scaffold.rest_positions, scaffold.rest_quats, strict=True)]
         signed = torch.from_numpy(continuous(torch.stack(turns).cpu().numpy())).to(scaffold.knot_quats)
@@ -100,20 +100,20 @@ def _pulled(scaffold: Scaffold, means: Tensor, gradients: Tensor, factor: float,
     nearest, rest = scaffold.binding.nodes[:, 0], scaffold.binding.rest
     distance = (means - scaffold.rest_positions[rest, nearest]).norm(dim=-1)
     candidates = torch.nonzero(crowded[nearest] & (distance > apart * scaffold.unit))[:, 0]
-    # the strongest first; of each node's only the first is kept
+    # those pulled hardest first; of each node's Gaussians only the first is kept
     order = candidates[torch.argsort(gradients[candidates], descending=True, stable=True)].cpu().numpy()
     _, first = np.unique(nearest.cpu().numpy()[order], return_index=True)
     return torch.from_numpy(order[np.sort(first)][:most]).to(means.device)
 
 
 def prune(scaffold: Scaffold, *, least: float = 0.02) -> Change:
-    """Without the nodes of which no Gaussian is carried by at least `least` of its weight.
+    """Without the nodes that carry no Gaussian by at least `least` of its weight.
 
-    Where nothing is bound at all, nothing is pruned.
+    Where nothing is bound, nothing is pruned.
     """
     if not 0 <= least < 1 / NODES:
         raise ValueError(
-            f"least: expected a weight of 0 up to 1/{NODES}, which one of a Gaussian's has; found {least}."
+            f"least: expected a weight of 0 up to 1/{NODES}, which some node of a Gaussian reaches; found {least}."
         )
     bound, every = scaffold.binding, torch.arange(len(scaffold), device=scaffold.knots.device)
     largest = torch.zeros(len(scaffold), device=every.device, dtype=bound.weights.dtype)
@@ -144,7 +144,7 @@ def prune(scaffold: Scaffold, *, least: float = 0.02) -> Change:
 
 
 def retie(scaffold: Scaffold, reach: float = REACH) -> Scaffold:
-    """The same nodes with neighbours found anew from the curves as they are now."""
+    """The same nodes, with neighbours by the curves as they are now."""
     path = scaffold.path
     times = np.linspace(path.times[0], path.times[-1], WINDOW * (path.count - 1) + 1)
     with torch.no_grad():
@@ -165,8 +165,8 @@ def retie(scaffold: Scaffold, reach: float = REACH) -> Scaffold:
 
 
 def rebind(scaffold: Scaffold, means: Tensor) -> Scaffold:
-    """The same Gaussians bound anew at their rests: to the nodes and neighbours there are now, from where `means`
-    [N,3] are now."""
+    """The same Gaussians, at their rests bound again: to the present nodes and neighbours, from the present `means`
+    [N,3]."""
     bound = scaffold.binding
     nodes, weights = bound.nodes.clone(), bound.weights.clone()
     clock = torch.zeros_like(bound.rest) if scaffold.clock is None else scaffold.clock[bound.nodes[:, 0]]

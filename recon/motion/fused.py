@@ -1,4 +1,4 @@
-"""Warp, nodes' poses and motion losses as single autograd nodes over compiled kernels: float32 on the CPU."""
+"""Warp, poses of nodes and motion losses as single autograd nodes over compiled kernels: float32 on the CPU."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from recon.motion import warp_kernels as kernels
 from recon.motion.binding import NODES, Binding
 from recon.motion.paths import Path
 
-LEAST_NODES, LEAST_GAUSSIANS, LEAST_PAIRS = 64, 1024, 256  # that are worth handing to another thread
+LEAST_NODES, LEAST_GAUSSIANS, LEAST_PAIRS = 64, 1024, 256  # from which another thread is worth its start
 
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """What a scaffold is apart from its learnable tensors. clock int32 [M]: on which of V own times each node lives."""
+    """The constants of a scaffold. clock int32 [M]: which of the V own times is each node's."""
 
     path: Path
     binding: Binding
@@ -30,7 +30,7 @@ class Rig:
 
 
 def applies(*tensors: Tensor) -> bool:
-    """Whether the kernels can take these: else the definitions in torch do."""
+    """Whether the kernels take these tensors; else the definitions in torch do."""
     return all(x.dtype == torch.float32 and x.device.type == "cpu" for x in tensors)
 
 
@@ -47,7 +47,7 @@ def poses(times: Tensor, knots: Tensor, knot_quats: Tensor, path: Path, clock: n
 
 
 def penalty(knots: Tensor, knot_quats: Tensor, compute: Callable[..., float]) -> Tensor:
-    """A scalar of the knots, whose gradient `compute(knots, quats, g_knots, g_quats)` adds up while it computes it."""
+    """A scalar of the knots: `compute(knots, quats, g_knots, g_quats)` returns it and adds up its gradient."""
     return _Penalty.apply(knots, knot_quats, compute)
 
 

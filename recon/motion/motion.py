@@ -1,4 +1,4 @@
-"""What a fit asks of any motion: the slot in which a scaffold, motions per Gaussian and none at all are exchanged."""
+"""The slot of motions: a scaffold, a motion per Gaussian, or none at all."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Motion(Protocol):
     ) -> tuple[Tensor, Tensor]:
         """Means [N,3] and quats [N,4] at world second `t`; `clocks` [V] offsets, for a scaffold per video.
 
-        At T seconds: [T,N,3] and [T,N,4]; what does not change with time may lack the first axis.
+        At T seconds: [T,N,3] and [T,N,4]; one that does not change with time may lack the first axis.
         """
         ...
 
@@ -38,7 +38,7 @@ class Motion(Protocol):
         ...
 
     def shifted(self, by: float, clocks: Tensor | None = None) -> Self:
-        """The same motion, `by` seconds later in world time; `clocks` [V]: the videos' offsets after that."""
+        """The same motion, `by` seconds later in world time; `clocks` [V]: the videos' new offsets."""
         ...
 
     def to(self, device: torch.device | str) -> Self:
@@ -46,12 +46,12 @@ class Motion(Protocol):
         ...
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Everything as plain arrays; :func:`motion_from_arrays` gives it back."""
+        """Everything as plain arrays, from which :func:`motion_from_arrays` makes it again."""
         ...
 
 
 def motion_from_arrays(arrays: Mapping[str, np.ndarray]) -> Motion:
-    """The motion whose :meth:`Motion.arrays` these are. ValueError where they make none."""
+    """The motion whose :meth:`Motion.arrays` these are. ValueError where they are not those of a motion."""
     kinds: dict[str, Any] = {"scaffold": Scaffold, "per-gaussian": PerGaussian, "static": Static}
     kind = str(arrays.get("kind"))
     if kind not in kinds:

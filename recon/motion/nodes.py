@@ -1,7 +1,7 @@
-"""Nodes from lifted tracks: tracks on one grid of world time, D_track, the greedy pick, and who neighbours whom.
+"""Nodes from lifted tracks: tracks on one grid of world time, D_track, the greedy pick, and neighbours.
 
 D_track (MoSca, Lei et al. 2024) of two tracks is nearly their largest distance over the times at which both are seen:
-the k-th largest, so that k - 1 frames of a lost track do not keep two apart. Things that merely touch are far apart.
+the k-th largest, so that k - 1 frames of a lost track do not separate two. Things that merely touch are far apart.
 """
 
 from __future__ import annotations
@@ -19,11 +19,12 @@ from recon.motion.paths import MAX_KNOTS
 
 logger = logging.getLogger("recon.motion")
 
-REACH = 5.0  # units of D_track at which neighbours end
+REACH = 5.0  # units of D_track from which nodes are no neighbours
+TIE_WIDTH = 1.5  # units: sigma of the weight of a neighbour
 TOP = 3  # D_track is the third largest distance
 BRIDGE_FRAMES = 2.5  # of the video's own: a longer gap is not interpolated
 MAX_FRAMES = 4 * MAX_KNOTS  # of a grid
-COMPARED_FRAMES = 256  # at which tracks are compared at most, evenly spread
+COMPARED_FRAMES = 256  # at which tracks are compared at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,8 +72,8 @@ class Grid:
         empty = np.flatnonzero(~seen.any(0))
         if len(empty):
             logger.warning(
-                "%d of %d frames of world time show no track at all, from second %.2f on: the motion is bridged there; "
-                "are the offsets right?",
+                "%d of %d frames of world time show no track, the first at second %.2f: the motion is bridged there. "
+                "Are the offsets right?",
                 *(len(empty), len(times), times[empty[0]]),
             )
         return cls(times, xyz, seen, video, centre, samples)
@@ -81,13 +82,13 @@ class Grid:
         return len(self.video)
 
     def compared(self) -> tuple[np.ndarray, np.ndarray]:
-        """xyz and seen at no more frames than it takes to compare tracks."""
+        """xyz and seen at enough frames to compare tracks."""
         stride = -(-len(self.times) // COMPARED_FRAMES)
         return np.ascontiguousarray(self.xyz[:, ::stride]), np.ascontiguousarray(self.seen[:, ::stride])
 
 
 def world_clocks(tracks: Sequence[TrackSet], offsets: np.ndarray, rates: np.ndarray | None) -> list[np.ndarray]:
-    """World seconds of the frames of every video, after checks of everything that the caller handed in."""
+    """World seconds of the frames of every video. ValueError for tracks, offsets or rates that do not fit together."""
     offsets = np.asarray(offsets, float)
     rates = np.ones(len(tracks)) if rates is None else np.asarray(rates, float)
     if not len(tracks) or offsets.shape != (len(tracks),) or rates.shape != offsets.shape:
@@ -122,19 +123,10 @@ def _on_grid(t: np.ndarray, xyz: np.ndarray, grid: np.ndarray) -> tuple[np.ndarr
     if len(t) == 1:
         inside = np.abs(grid - t[0]) < 1e-6
     a, b = xyz[:, left], xyz[:, right]
-    # a sample whose weight is nought may be missing
+    # a sample of weight zero may be missing
     value = np.where(u[:, None] == 0, a, np.where(u[:, None] == 1, b, (1 - u[:, None]) * a + u[:, None] * b))
     seen = inside & np.isfinite(value[..., 0])
     return np.where(seen[..., None], value, 0).astype(np.float32), seen
-
-
-def held(grid: Grid) -> Float[np.ndarray, "N G 3"]:
-    """World positions of the tracks on the grid; a track stays where it was last seen, and where it will first be."""
-    frames = np.arange(len(grid.times))
-    before = np.maximum.accumulate(np.where(grid.seen, frames, -1), axis=1)
-    first = np.where(grid.seen.any(1), grid.seen.argmax(1), 0)
-    source = np.where(before < 0, first[:, None], before)
-    return np.take_along_axis(grid.xyz, source[..., None], 1).astype(float) + grid.centre
 
 
 def pick(
@@ -144,29 +136,29 @@ def pick(
     unit: float,
     most: int,
 ) -> Int[np.ndarray, " m"]:
-    """Greedily those tracks, in `order`, whose D_track to all picked before exceeds `unit`; at most `most` of them."""
+    """Tracks picked greedily in `order`: those whose D_track to all picked before exceeds `unit`; at most `most`."""
     return nodes_kernels.pick(xyz, seen, order.astype(np.int64), np.float32(unit) ** 2, TOP, most)
 
 
 def neighbours(
     xyz: Float[np.ndarray, "M G 3"], seen: Bool[np.ndarray, "M G"], k: int
 ) -> tuple[Int[np.ndarray, "M K"], Float[np.ndarray, "M K"]]:
-    """The k nearest by D_track of each curve, the nearest first, and their D_track: inf where never seen together.
+    """The k nearest curves by D_track of each, the nearest first, and their D_track: inf where never seen together.
 
-    A set of fewer than k + 1 curves is filled up with the curve itself at distance inf.
+    Where there are fewer than k others, the curve itself fills up, at distance inf.
     """
     D = nodes_kernels.track_distances(np.ascontiguousarray(xyz, np.float32), np.ascontiguousarray(seen), TOP)
     np.fill_diagonal(D, np.inf)
     m = len(D)
     index = np.tile(np.arange(m)[:, None], (1, k))
     distance = np.full((m, k), np.inf)
-    found = min(k, m - 1)
-    index[:, :found] = np.argsort(D, axis=1, kind="stable")[:, :found]
-    distance[:, :found] = np.take_along_axis(D, index[:, :found], 1)
+    others = min(k, m - 1)
+    index[:, :others] = np.argsort(D, axis=1, kind="stable")[:, :others]
+    distance[:, :others] = np.take_along_axis(D, index[:, :others], 1)
     return np.where(np.isfinite(distance), index, np.arange(m)[:, None]), distance
 
 
 def edge_weights(distances: np.ndarray, unit: float, reach: float = REACH) -> np.ndarray:
     """Weights of edges of D_track `distances`: exp(-D²/2(1.5 unit)²), 0 beyond `reach` units."""
     near = distances < reach * unit
-    return np.where(near, np.exp(-(np.where(near, distances, 0) ** 2) / (2 * (1.5 * unit) ** 2)) + 1e-6, 0.0)
+    return np.where(near, np.exp(-(np.where(near, distances, 0) ** 2) / (2 * (TIE_WIDTH * unit) ** 2)) + 1e-6, 0.0)

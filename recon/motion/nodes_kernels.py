@@ -1,4 +1,4 @@
-"""Loops over pairs of tracks."""
+"""Loops over pairs of tracks: the greedy pick, and D_track."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def track_distances(xyz, seen, top):
                     common += 1
                     x, y, z = xyz[i, t, 0] - xyz[j, t, 0], xyz[i, t, 1] - xyz[j, t, 1], xyz[i, t, 2] - xyz[j, t, 2]
                     d = x * x + y * y + z * z
-                    if d > largest[0]:  # kept ascending: the least of the largest goes first
+                    if d > largest[0]:  # ascending: the least of the largest is replaced first
                         k = 0
                         while k + 1 < top and largest[k + 1] < d:
                             largest[k] = largest[k + 1]

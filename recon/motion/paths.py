@@ -4,8 +4,8 @@ A path is a uniform grid of knots in seconds. At any time it is a sum over four 
 
     x(t) = Σ_a w_a(t) knots[first + a],   a = 0..3,
 
-whose weights are cubic polynomials in t. Everything else (nodes, Gaussians, fused kernels) asks a path for `first` and
-`w` alone, so that another kind of curve is another object in the same slot.
+whose weights are cubic polynomials in t. Everything else (nodes, Gaussians, fused kernels) uses only `first` and `w` of
+a path, so that another kind of curve is another object in the same slot.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from torch import Tensor
 from recon.motion.arrays import numbers
 
 WINDOW = 4  # knots under a path's weights at any time
-MAX_KNOTS = 4096  # of one path: a span of nine minutes at the default spacing; beyond it an offset is wrong
+MAX_KNOTS = 4096  # of one path: nine minutes at the default spacing; a longer span means a wrong offset
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Path(ABC):
     """A kind of curve on a uniform grid: `count` knots at start + i * spacing seconds (float64)."""
 
@@ -46,9 +46,13 @@ class Path(ABC):
                 "the videos, or set a wider spacing."
             )
 
+    def __repr__(self) -> str:
+        first, last = self.times[[0, -1]]
+        return f"{type(self).__name__}({self.count} knots, {first:.3f} to {last:.3f} s)"
+
     @classmethod
     def of(cls, first: float, last: float, spacing: float, margin: float = 0.0) -> Self:
-        """Knots over first..last seconds and `margin` seconds before and after: the largest believable offset."""
+        """A path over first..last seconds, and `margin` seconds before and after: the largest believable offset."""
         if not (math.isfinite(first) and math.isfinite(last) and last >= first and margin >= 0 and spacing > 0):
             raise ValueError(
                 "first, last, margin, spacing: expected finite seconds, last >= first, margin >= 0, spacing > 0; "
@@ -60,7 +64,7 @@ class Path(ABC):
                 f"last - first: expected at most {MAX_KNOTS * spacing:.0f} seconds of motion at this spacing; found "
                 f"{last - first:.6g}. Check the offsets (in seconds) of the videos, or set a wider spacing."
             )
-        # a whole number of intervals within rounding stays that number
+        # a whole number of intervals stays that number, despite rounding
         return cls(float(first - margin), float(spacing), max(WINDOW, math.ceil(span - 1e-6) + 1))
 
     @property
@@ -143,7 +147,7 @@ _ONE_HOT = np.zeros((4, 4, 4))
 _ONE_HOT[np.arange(4), np.arange(4), 0] = 1  # knot k of the window, whatever u
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class HermiteSpline(Path):
     """Cubic Hermite spline through its knots, C1, with tangents by finite differences (central; one-sided at the ends).
 
@@ -164,7 +168,7 @@ class HermiteSpline(Path):
         return seconds
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Sampled(Path):
     """The sample nearest in time, held beyond the ends: the "w/o spline" ablation, without a derivative in time."""
 
@@ -185,7 +189,7 @@ def path_arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 def path_from_arrays(arrays: Mapping[str, np.ndarray]) -> Path:
-    """What :func:`path_arrays` gave; KeyError where it is missing, ValueError where it makes no path."""
+    """The path whose :func:`path_arrays` these are; KeyError where one is missing, ValueError where they make none."""
     kinds = {kind.__name__: kind for kind in (HermiteSpline, Sampled)}
     name, (start, spacing, count) = str(arrays["path"]), numbers(arrays, "path_knots", (3,)).double().tolist()
     if name not in kinds:

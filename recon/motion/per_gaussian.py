@@ -1,27 +1,28 @@
-"""Motions without a scaffold: every Gaussian on a path of its own (the "w/o scaffold" ablation), and none at all."""
+"""Motions without a scaffold: each Gaussian on its own path (the "w/o scaffold" ablation), and none at all."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from otsync.types import TrackSet
 from recon.motion.arrays import numbers
-from recon.motion.nodes import Grid, held
 from recon.motion.paths import Path, path_arrays, path_from_arrays
 from recon.motion.scaffold import Scaffold
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class PerGaussian:
     """N Gaussians, each displaced from its mean along its own path: own_knots [P,N,3] world units. None turns."""
 
     path: Path
     own_knots: Tensor
+
+    def __repr__(self) -> str:
+        return f"PerGaussian({self.own_knots.shape[1]} Gaussians, {self.path}, {self.own_knots.device})"
 
     @classmethod
     def following(cls, scaffold: Scaffold, means: Tensor, path: Path | None = None) -> PerGaussian:
@@ -32,39 +33,6 @@ class PerGaussian:
             carried = [scaffold.warp(means, upright, float(t))[0] - means for t in path.times]
         return cls(path, torch.stack(carried))
 
-    @classmethod
-    def from_tracks(
-        cls,
-        tracks: Sequence[TrackSet],
-        offsets: np.ndarray,
-        means: Tensor,
-        times: Tensor | np.ndarray,
-        path: Path,
-        *,
-        frame_step: float,
-        rates: np.ndarray | None = None,
-    ) -> PerGaussian:
-        """Each Gaussian takes the displacement of the raw track that is nearest to its mean at its own world second.
-
-        times float64 [N] seconds at which the means [N,3] hold; only tracks seen then are asked (any, where none is),
-        and a track is held still where it was not seen. frame_step: seconds of one frame of the reference.
-        """
-        from scipy.spatial import cKDTree
-
-        grid = Grid.of(tracks, offsets, frame_step, rates)
-        curves, place = held(grid), means.detach().cpu().numpy().astype(float)
-        t = np.asarray(times, float)
-        frame = np.clip(np.rint((t - grid.times[0]) / frame_step).astype(int), 0, len(grid.times) - 1)
-        knot_frames = np.clip(np.rint((path.times - grid.times[0]) / frame_step).astype(int), 0, len(grid.times) - 1)
-        own = np.zeros((path.count, len(place), 3))
-        for f in np.unique(frame):
-            here = np.flatnonzero(frame == f)
-            seen = np.flatnonzero(grid.seen[:, f])
-            seen = seen if len(seen) else np.arange(len(curves))
-            chosen = curves[seen[cKDTree(curves[seen, f]).query(place[here])[1]]]
-            own[:, here] = (chosen[:, knot_frames] - chosen[:, f, None]).transpose(1, 0, 2)
-        return cls(path, torch.as_tensor(own).to(means))
-
     def parameters(self) -> dict[str, Tensor]:
         return {"own_knots": self.own_knots}
 
@@ -74,8 +42,8 @@ class PerGaussian:
     def warp(
         self, means: Tensor, quats: Tensor, t: Tensor | float, clocks: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Means [N,3] displaced to world second `t` ([T,N,3]: to T of them), and the quats as they are. `clocks` are
-        ignored."""
+        """Means [N,3] at world second `t` ([T,N,3] at T of them), and the quats as they are. All paths are in world
+        time: `clocks` do not matter."""
         return means + self.path.at(self.own_knots, t), quats
 
     def shifted(self, by: float, clocks: Tensor | None = None) -> PerGaussian:
@@ -94,7 +62,7 @@ class PerGaussian:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> PerGaussian:
-        """What :meth:`arrays` gave. ValueError where something is missing, unsound or does not fit."""
+        """The motion whose :meth:`arrays` these are. ValueError where one is missing, unsound or does not fit."""
         try:
             path = path_from_arrays(arrays)
             return cls(path, numbers(arrays, "own_knots", (path.count, None, 3)))
@@ -104,7 +72,7 @@ class PerGaussian:
 
 @dataclass(frozen=True)
 class Static:
-    """Nothing moves, and nothing is computed."""
+    """No motion: nothing is computed."""
 
     def parameters(self) -> dict[str, Tensor]:
         return {}

@@ -1,4 +1,4 @@
-"""Nodes' poses inside compiled loops, and gradients from poses down to knots.
+"""Poses of nodes inside compiled loops, and gradients from poses to knots.
 
 curves = (knots [P,M,3], knot_quats [P,M,4], clock int32 [M]); a moment = (first [V], weights [V,4]): of which knots a
 pose is the sum, for each of the V own times that world time may mean; see :mod:`recon.motion.paths`.
@@ -19,7 +19,7 @@ inline = kernel(fastmath={"contract", "nsz"})
 
 @inline
 def position(curves, moment, m):
-    """Of node m, float64."""
+    """Position of node m, float64."""
     knots, _, clock = curves
     first, weights = moment
     v = clock[m]

@@ -1,4 +1,4 @@
-"""Motion losses on nodes with their gradients, in one pass: what takes torch a few dozen calls on small tensors.
+"""Motion losses on nodes with their gradients, in one pass; torch would take dozens of calls on small tensors.
 
 Each adds `share` times the loss's gradient to that of the knots, and returns the loss. Lengths are in footprints, and
 norms are soft: √(x² + soft²) - soft. curves and moments as in :mod:`recon.motion.pose_kernels`.

@@ -18,10 +18,10 @@ from recon.motion.binding import NODES, Binding
 from recon.motion.paths import WINDOW, Path, path_arrays, path_from_arrays
 from recon.rotations import unit
 
-LEAST_WEIGHT = 1e-6  # before normalisation: a point far from all its nodes still follows them
+LEAST_WEIGHT = 1e-6  # before normalisation: a point far from all of its nodes still follows them
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Scaffold:
     """M nodes, each a pose that moves along a path, and the Gaussians bound to them.
 
@@ -34,7 +34,7 @@ class Scaffold:
         binding: of the Gaussians to the nodes.
         clock int64 [M] or None: the video on whose own clock each node lives (the paper's scaffold per video); None:
             all nodes live in world time.
-        offsets, rates float64 [V] or None: of those videos as at building: used where a caller gives no `clocks`.
+        offsets, rates float64 [V] or None: of those videos when it was built; used where a caller gives no `clocks`.
         blend: "linear" or "dual-quaternion".
 
     A node of video u stands, at world time t, where its curve is at its own time (t - offset_u) / rate_u.
@@ -61,17 +61,24 @@ class Scaffold:
             "edge_weights": (m, self.edges.shape[-1]),
         }
         for name, shape in expected.items():
-            found = tuple(getattr(self, name).shape)
-            if found != shape:
-                raise ValueError(f"{name}: expected shape {shape} for {m} nodes on {self.path}; found {found}.")
+            actual = tuple(getattr(self, name).shape)
+            if actual != shape:
+                raise ValueError(f"{name}: expected shape {shape} for {m} nodes on {self.path}; found {actual}.")
         if self.blend not in warping.BLENDS:
             raise ValueError(f"blend: expected one of {warping.BLENDS}; found {self.blend!r}.")
         if self.clock is not None and (self.offsets is None or self.rates is None):
-            raise ValueError("offsets, rates: expected those of the videos whose clocks the nodes live on; found none.")
+            raise ValueError("offsets, rates: expected those of the videos on whose clocks the nodes live; found none.")
 
     def __len__(self) -> int:
         """Number of nodes."""
         return self.knots.shape[1]
+
+    def __repr__(self) -> str:
+        clocks = "world time" if self.clock is None else "the videos' own times"
+        return (
+            f"Scaffold({len(self)} nodes, {len(self.binding)} Gaussians, {clocks}, {self.path}, {self.blend}, "
+            f"{self.knots.device})"
+        )
 
     @property
     def rest_positions(self) -> Tensor:
@@ -90,8 +97,7 @@ class Scaffold:
         return replace(self, knots=parameters["knots"], knot_quats=parameters["knot_quats"])
 
     def own_times(self, t: Tensor | float, clocks: Tensor | None = None) -> Tensor:
-        """World second `t`, or T of them, on the clock of every video whose nodes these are: float64 [V] or [T,V]; V is
-        1 for world time."""
+        """World second `t`, or T of them, on the videos' clocks: float64 [V] or [T,V]; V is 1 in world time."""
         t = torch.as_tensor(t, dtype=torch.float64, device=self.knots.device)
         if self.clock is None:
             return t[..., None]
@@ -106,7 +112,7 @@ class Scaffold:
         return (t[..., None] - clocks.to(torch.float64)) / self.rates
 
     def nodes(self, t: Tensor | float, clocks: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Positions [M,3] and unit quaternions [M,4] of the nodes at world second `t`, [T,M,3] and [T,M,4] at T of them;
+        """Positions [M,3] and unit quaternions [M,4] of the nodes at world second `t` ([T,M,3], [T,M,4] at T of them);
         differentiable in everything."""
         times = self.own_times(t, clocks)
         if times.ndim == 1 and fused.applies(self.knots, self.knot_quats):
@@ -127,7 +133,7 @@ class Scaffold:
         """Means [N,3] and quats [N,4] of the bound Gaussians at world second `t`, [T,N,3] and [T,N,4] at T of them; see
         :func:`recon.motion.warp.blend`.
 
-        clocks float64 [V]: offsets of the videos, for a scaffold per video; ignored by one in world time.
+        clocks float64 [V]: offsets of the videos, for a scaffold per video; one in world time does not need them.
         """
         if len(means) != len(self.binding):
             raise ValueError(f"means: expected the {len(self.binding)} Gaussians bound here; found {len(means)}.")
@@ -155,11 +161,11 @@ class Scaffold:
     def bind(
         self, points: Tensor | np.ndarray, t_rest: float, clocks: Tensor | None = None, *, video: int | None = None
     ) -> Scaffold:
-        """This scaffold with n more Gaussians, which stand at `points` [n,3] at world second `t_rest`.
+        """This scaffold with n more Gaussians, at `points` [n,3] at world second `t_rest`.
 
-        Each is carried by the node nearest to it then, and by that node's seven nearest topological neighbours, with
-        weights exp(-d²/2 unit²) of the distances then. `video`: only nodes on that video's clock, as in the paper's
-        scaffold per video, where a video's Gaussians are seeded into its own.
+        Each is carried by the node nearest to it then, and by the seven nearest neighbours of that node, with weights
+        exp(-d²/2 unit²) of the distances then. `video`: only by nodes on that video's clock, as in the paper, where
+        every video seeds its own scaffold.
         """
         with torch.no_grad():
             positions, quats = self.nodes(t_rest, clocks)
@@ -175,7 +181,7 @@ class Scaffold:
         place = positions.detach().cpu().numpy().astype(float)
         where = torch.as_tensor(points).detach().cpu().numpy().astype(float).reshape(-1, 3)
         if not np.isfinite(where).all():
-            raise ValueError("points: expected finite positions; found nan or infinity. Leave those points out.")
+            raise ValueError("points: expected finite positions; found NaN or infinity. Leave those points out.")
         among = np.arange(len(self))
         if video is not None and self.clock is not None:
             among = np.flatnonzero(self.clock.cpu().numpy() == video)
@@ -184,20 +190,20 @@ class Scaffold:
         nearest = among[cKDTree(place[among]).query(where)[1]]
         edges, ties = self.edges.cpu().numpy(), self.edge_weights.cpu().numpy()
         k = min(NODES - 1, edges.shape[1])
-        nodes = np.tile(nearest[:, None], (1, NODES))  # unused slots: the nearest node, of weight zero
+        nodes = np.tile(nearest[:, None], (1, NODES))  # unused slots: the nearest node, with weight zero
         nodes[:, 1 : 1 + k] = edges[nearest, :k]
         open_slot = np.zeros((len(nodes), NODES), bool)
         open_slot[:, 0] = True
         open_slot[:, 1 : 1 + k] = ties[nearest, :k] > 0
         distance2 = ((place[nodes] - where[:, None]) ** 2).sum(-1)
-        # measured from the nearest, as if all were that much closer: far away the exponentials would all vanish
+        # relative to the nearest: far from all nodes every exponential would vanish
         excess = distance2 - np.where(open_slot, distance2, np.inf).min(1, keepdims=True)
         weights = (np.exp(-np.maximum(excess, 0) / (2 * self.unit**2)) + LEAST_WEIGHT) * open_slot
         weights /= weights.sum(1, keepdims=True)
         return torch.as_tensor(nodes, device=self.knots.device), torch.as_tensor(weights).to(self.knots)
 
     def shifted(self, by: float, clocks: Tensor | None = None) -> Scaffold:
-        """The same motion, `by` seconds later. Nodes on videos' own clocks keep them; `clocks` are their new offsets."""
+        """The same motion, `by` seconds later; `clocks`: the videos' new offsets, for nodes on their clocks."""
         binding = replace(self.binding, times=self.binding.times + by)
         if self.clock is None:
             return replace(self, path=replace(self.path, start=self.path.start + by), binding=binding)
@@ -206,11 +212,11 @@ class Scaffold:
         return replace(self, offsets=offsets, binding=binding)
 
     def take(self, index: Tensor | np.ndarray) -> Scaffold:
-        """The same nodes with the Gaussians at `index`: for pruning and duplication."""
+        """The same nodes with the Gaussians at `index`, to prune or duplicate them."""
         return replace(self, binding=self.binding.take(index))
 
     def on(self, path: Path) -> Scaffold:
-        """The same motion on another path, sampled at its knots: on :class:`Sampled`, the "w/o spline" ablation."""
+        """The same motion on another path, sampled at its knots; on :class:`Sampled`, the "w/o spline" ablation."""
         with torch.no_grad():
             times = torch.as_tensor(path.times, device=self.knots.device)
             return replace(
@@ -222,7 +228,7 @@ class Scaffold:
         return _mapped(self, lambda x: x.to(device), binding=_mapped(self.binding, lambda x: x.to(device)))
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Everything, as plain arrays: what a checkpoint holds."""
+        """Everything as plain arrays, for a checkpoint."""
         parts = {f.name: getattr(self, f.name) for f in fields(self)}
         parts |= {f"binding_{f.name}": getattr(self.binding, f.name) for f in fields(self.binding)}
         arrays = {k: v.detach().cpu().numpy() for k, v in parts.items() if isinstance(v, Tensor)}
@@ -231,7 +237,7 @@ class Scaffold:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> Scaffold:
-        """What :meth:`arrays` gave. ValueError where something is missing, unsound or does not fit."""
+        """The scaffold whose :meth:`arrays` these are. ValueError where one is missing, unsound or does not fit."""
         try:
             path = path_from_arrays(arrays)
             knots = numbers(arrays, "knots", (path.count, None, 3))
@@ -263,6 +269,6 @@ class Scaffold:
 
 
 def _mapped(value: Any, change: Callable[[Tensor], Tensor], **others: Any) -> Any:
-    """A dataclass with `change` made to each of its tensors."""
+    """A dataclass with `change` applied to each of its tensors."""
     tensors = {f.name: getattr(value, f.name) for f in fields(value)}
     return replace(value, **{k: change(v) for k, v in tensors.items() if isinstance(v, Tensor)}, **others)

@@ -12,18 +12,20 @@ from scipy import sparse
 from recon.motion.paths import HermiteSpline
 
 FRAME = 1 / 30  # seconds: the study's frame, in which its weights are given
-TOLERANCE, ROUGH = 1e-7, 1e-4  # of the energy norm, relative to the solution's own; ROUGH between reweightings
+TOLERANCE, ROUGH = 1e-7, 1e-4  # of the energy norm, relative to that of the solution; ROUGH between reweightings
 MAX_ITERATIONS = 2000
-LEAST_INERTIA = 0.05  # squared units: a neighbourhood with less of it hardly tells how it turns
-RIDGE = 1e-9  # towards the mean of a node's samples: decides nothing but keeps blocks invertible
+LEAST_INERTIA = 0.05  # squared units: with less, a neighbourhood hardly tells how it turns
+RIDGE = 1e-9  # towards the mean of a node's samples: decides nothing, but keeps blocks invertible
+STEADY = 1e-3  # weight, in squared units, with which a rotation is drawn to the one before
 
 
 @dataclass(frozen=True)
 class Smoothness:
     """Weights of the solve, against a data term in which a sample per 1/30 s has weight 1.
 
-    velocity: of neighbours moving as parts of one body, per 1/30 s. acceleration: of second differences of the knots.
-    still: of first differences: only where nothing else speaks, a motion comes to rest within some fifteen knots.
+    velocity: of neighbours that should move as parts of one body, per 1/30 s. acceleration: of second differences of
+    the knots. still: of first differences; where nothing else decides, a motion comes to rest within some fifteen
+    knots.
     """
 
     velocity: float = 0.3
@@ -79,9 +81,9 @@ def solve_curves(
 
         Σ ρ(‖x_m(t) - sample‖) + λ_v Σ_(i,j) tie ‖ẋ_i - ẋ_j - ω × (x_i - x_j)‖² + λ_a Σ ‖Δ² knots‖² + λ_s Σ ‖Δ knots‖².
 
-    ω(t) is the edge's angular velocity as its seen neighbours turned in the round before (none in the first), so that
-    what is hidden turns with its body instead of going on straight: on two bodies whose tracks live for 24 of 36
-    frames, that follows points to 0.7 cm over ten frames, without it to 1.8.
+    ω(t) is the edge's angular velocity, from the seen neighbours' motion in the round before (0 in the first), so that
+    hidden nodes turn with their body instead of going straight on: with two bodies whose tracks live for 24 of 36
+    frames points are followed to 0.7 cm over ten frames, without ω to 1.8 cm.
     robust: the distance at which a sample counts half; rounds: of reweighting. Everything is equivariant under rigid
     motions and, with `robust` and the unit, under the scale of the world. Every node needs a sample.
     """
@@ -122,7 +124,7 @@ def angular_velocities(
     """How each node's neighbourhood turns: ω of the rigid motion nearest to the velocities of its seen nodes.
 
     Least squares over each node and its neighbours, by their ties: Σ a ‖ẋ - v - ω × x‖². Radians per unit of time of
-    `rates`, world axes; nought where too few are seen to tell.
+    `rates`, world axes; 0 where too few nodes are seen.
     """
     i, j = coupling.edges.T
     M, G = coupling.seen.shape
@@ -151,7 +153,7 @@ def _turning(
     rates: Float[np.ndarray, "M G 3"],
     design: Float[np.ndarray, "G P"],
 ) -> Float[np.ndarray, "M P 3"]:
-    """The right side that asks neighbours' velocities to differ by ω × (x_i - x_j)."""
+    """The right-hand side for velocities of neighbours that differ by ω × (x_i - x_j)."""
     omega = angular_velocities(coupling, places, rates)
     right = np.zeros((len(places), design.shape[1], 3))
     chunk = max(1, 2**20 // len(design))
@@ -178,8 +180,8 @@ def _conjugate_gradients(
 ) -> Float[np.ndarray, "M P 3"]:
     """Solve (diag(blocks) + laplacian ⊗ velocity) x = right from the guess `x`, the three coordinates side by side.
 
-    Preconditioned by each node's own block. Some forty iterations where a direct factorisation fills in: 600 nodes of
-    15 knots take .1 s instead of 1.2 s.
+    Preconditioned by each node's own block. It takes some forty iterations, where a direct factorisation would fill in:
+    600 nodes of 15 knots take .1 s instead of 1.2 s.
     """
     M, P = blocks.shape[:2]
     own = sparse.block_diag(list(blocks), format="csr")  # banded: most of a block is zero
@@ -200,7 +202,7 @@ def _conjugate_gradients(
         if (energy <= enough).all():
             break
         image = system(step)
-        length = energy / np.maximum(dot(step, image), 1e-300)  # nought over nought where a coordinate is solved
+        length = energy / np.maximum(dot(step, image), 1e-300)  # 0 / 0 where a coordinate is solved
         x = x + length * step
         residual = residual - length * image
         towards = inverse @ residual
@@ -217,14 +219,14 @@ def neighbourhood_rotations(
 ) -> Float[np.ndarray, "P M 3 3"]:
     """Rotations of M nodes at P times relative to the middle one, by Kabsch's alignment of the edges to neighbours.
 
-    Each is pulled very weakly towards the one before (outwards from the middle), which decides what the neighbours do
-    not: the turn about a line of them, everything for a node on its own.
+    Each is drawn very weakly towards the one before it (outwards from the middle). That decides what the neighbours
+    leave open: the turn about a line of them, and everything for a node on its own.
     """
     P, M = positions.shape[:2]
     edges = positions[:, neighbours] - positions[:, :, None]  # [P,M,K,3]
     middle = P // 2
     reference = weights[..., None] * edges[middle]
-    pull = 1e-3 * unit**2 * np.maximum(weights.sum(1), 1e-6)[:, None, None]
+    pull = STEADY * unit**2 * np.maximum(weights.sum(1), 1e-6)[:, None, None]
     rotations = np.tile(np.eye(3), (P, M, 1, 1))
     for order in (range(middle + 1, P), range(middle - 1, -1, -1)):
         previous = rotations[middle]

@@ -1,4 +1,4 @@
-"""Carrying Gaussians with nodes: the definition in plain torch, and the choice of the fused kernels for it.
+"""Carrying Gaussians with nodes: the definition, in plain torch.
 
 Two phases. Every (rest, node) pair in use has one relative rigid motion, from the node's pose at the rest to its pose
 at t; every Gaussian blends those of its eight nodes. There are ten times fewer pairs than blended motions.

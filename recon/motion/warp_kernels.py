@@ -41,7 +41,7 @@ F32, F64 = np.float32, np.float64
 ROW = 16
 SHIFT, QUAT = 9, 12  # where they begin in a row of linear blending
 REAL, DUAL = 0, 4  # and in one of dual quaternions
-TAIL = ROW - LANES  # where the last vector of a row begins: 0 where one vector holds it all
+TAIL = ROW - LANES  # where the last vector of a row begins; 0 where one vector holds a row
 
 _kernel = kernel(fastmath={"contract", "reassoc", "nsz"})
 
@@ -131,7 +131,7 @@ def _sum_rows(n, slots, rows, at, dual, signed, total):
     simd.store(total, n * ROW, head)
     if crossed:
         for k in range(8):
-            if signed[n, k] < 0:  # seldom: two neighbours turned apart by half a turn since the rest
+            if signed[n, k] < 0:  # rare: two neighbours have turned apart by half a turn since the rest
                 _add_twice(total, n, signed[n, k], rows, of_slot[n, k])
 
 

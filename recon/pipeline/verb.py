@@ -29,7 +29,7 @@ from recon.pipeline.intake import given_clocks, readable
 from recon.pipeline.plan import Plan
 from recon.pipeline.prepare import Prepared, prepare
 from recon.pipeline.stages import read_footage
-from recon.result.folder import FilmedBy, Result, clear_parts, metrics_of, save_run
+from recon.result.folder import FilmedBy, SavedReconstruction, clear_parts, metrics_of, save_run
 from recon.result.report import write_reconstruction_report
 
 
@@ -225,7 +225,7 @@ def true_seconds(truth: Offsets, offsets: Offsets) -> np.ndarray:
 
 
 def evaluate(
-    result: Result,
+    result: SavedReconstruction,
     scene: Scene,
     names: Sequence[str],
     offsets: Offsets | None = None,

@@ -1,4 +1,4 @@
-"""The CUDA back end: gsplat's own kernels behind :func:`recon.raster.render`. A leaf: imported only when asked for."""
+"""The CUDA back end: gsplat's kernels behind :func:`recon.raster.render`. Imported only when it is asked for."""
 
 from __future__ import annotations
 
@@ -23,14 +23,16 @@ def render(
 ) -> Rendering:
     """Render (means, quats, scales, opacities, colors), checked and finite, with `gsplat.rasterization`.
 
-    gsplat computes in float32 only; float64 tensors are converted and the result is given back as float64.
+    gsplat computes in float32 only: float64 tensors are converted, and so is the result.
     """
     try:
         import gsplat
     except ImportError as error:
-        raise ValueError("backend='gsplat' needs gsplat: pip install 'otsync[cuda]', or use backend='cpu'") from error
+        raise ValueError("backend: expected gsplat; found none. pip install 'otsync[cuda]', or use 'cpu'.") from error
     if not gaussians[0].is_cuda:
-        raise ValueError("backend='gsplat' needs CUDA tensors, got CPU tensors: move them with .cuda(), or use 'cpu'")
+        raise ValueError(
+            "backend: expected CUDA tensors for 'gsplat'; found CPU tensors. Move them with .cuda(), or use 'cpu'."
+        )
     return rasterize(gsplat.rasterization, gaussians, viewmats, Ks, size, backgrounds, options)
 
 
@@ -47,11 +49,11 @@ def rasterize(
     means, quats, scales, opacities, colors = gaussians
     dtype, n, c = means.dtype, means.shape[-2], len(viewmats)
     width, height = size
-    if n == 0:  # gsplat launches no kernel and leaves its outputs unset
+    if n == 0:  # gsplat would launch no kernel and leave its outputs unset
         return _empty(
             means, viewmats, size, 3 if options.sh_degree is not None else colors.shape[-1], backgrounds, options
         )
-    # gsplat normalises by 1/|q|; a quaternion that is no rotation must not reach it
+    # gsplat normalises by 1/|q|: a quaternion that is no rotation must not reach it
     rotates = (quats * quats).sum(-1) >= QUAT_NORM2_MIN
     quats = torch.where(rotates[..., None], quats, torch.ones_like(quats))
     opacities = torch.where(rotates, opacities, 0.0)
@@ -83,7 +85,7 @@ def rasterize(
     if options.depth is not None:
         image, depths = image[..., :-1], image[..., -1:].to(dtype)
     radii = meta["radii"].reshape(c, n, 2).to(torch.int32)
-    # means2d in gsplat's own shape: a reshaped one would be no part of the graph, and have no gradient
+    # means2d in gsplat's own shape: a reshaped one would not be in the graph and would have no gradient
     return Rendering(image.to(dtype), alphas.to(dtype), depths, meta["means2d"], radii, "gsplat")
 
 

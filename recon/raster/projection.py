@@ -1,8 +1,8 @@
 """Projection of 3-D Gaussians to splats in plain torch: the definition that the other back ends are held to.
 
 EWA splatting (Zwicker et al. 2002) as in 3DGS: the covariance is carried through the linearised pinhole projection.
-Everything runs in float64 whatever the input: the projection is a small part of the work, and a scene 10^4 units from
-the origin would lose its pixels in float32.
+Everything runs in float64 whatever the input: the projection is a small part of the work, and in float32 a scene 10^4
+units from the origin would miss its pixels.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def project(
     norm2 = (quats * quats).sum(-1)
     drawn = (depths >= torch.tensor(settings.near_plane, dtype=dtype)) & (depths <= settings.far_plane)
     drawn = drawn & (norm2 >= QUAT_NORM2_MIN)
-    # a value that is not drawn is replaced *before* it divides: where() alone would let 0 * inf into the gradient
+    # what is not drawn is replaced *before* the division: where() alone would let 0 * inf into the gradient
     z = torch.where(drawn, z, 1.0)
     unit = quats / torch.where(norm2 >= QUAT_NORM2_MIN, norm2, 1.0).sqrt()[:, None]
 

@@ -1,4 +1,4 @@
-"""The one signature of the renderer: check the arguments, choose a back end, project, rasterize."""
+"""render(): one signature for all back ends. Checks the arguments, chooses a back end, projects and rasterizes."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ def render(
     """Render N Gaussians into C cameras of one image size; conventions and names are those of gsplat's `rasterization`.
 
     means: [N,3] world units. quats: [N,4] wxyz, any length. scales: [N,3] standard deviations. opacities: [N] in 0..1.
-        Where each camera looks at another moment, means are [C,N,3] and quats [C,N,4].
+        Where every camera looks at its own moment, means are [C,N,3] and quats [C,N,4].
     colors: [N,D] or per camera [C,N,D], D channels of any kind; with `sh_degree` spherical-harmonics coefficients
         [N,K,3] or [C,N,K,3], K >= (sh_degree + 1)^2, and D = 3.
     viewmats: [C,4,4] world-to-camera, OpenCV axes (x right, y down, z forward). Ks: [C,3,3] pixels, not differentiable.
-    backgrounds: [C,D], seen through what the Gaussians leave; black when None.
-    backend: "torch" (any float type; the oracle), "cpu" (numba; computes in float32), "gsplat" (CUDA), or "auto": gsplat
-        for CUDA tensors, else cpu when numba is installed, else torch.
+    backgrounds: [C,D], seen where the Gaussians let light through; None: black.
+    backend: "torch" (any float type; the oracle), "cpu" (numba; computes in float32), "gsplat" (CUDA), or "auto":
+        gsplat for CUDA tensors, else cpu where numba is installed, else torch.
     settings: fields of :class:`Settings`: near_plane, far_plane, radius_clip, eps2d, rasterize_mode, sh_degree, depth.
 
     Differentiable in means, quats, scales, opacities, colors, viewmats and backgrounds. A Gaussian with a NaN or an
@@ -78,7 +78,7 @@ def render(
     image, depths, alphas = engine.rasterize(splats, features, width, height, options.depth)
     inputs = (means, quats, scales, opacities, colors, viewmats)
     if torch.is_grad_enabled() and not image.requires_grad and any(t.requires_grad for t in inputs):
-        # nothing is in view: gradients are zeros, not absent
+        # nothing is in view: gradients are zeros, not None
         image = image + 0 * sum(t.nan_to_num().sum() for t in inputs)
     if backgrounds is not None:
         image = image + (1 - alphas) * backgrounds[:, None, None, :]
@@ -86,13 +86,13 @@ def render(
 
 
 def warmup() -> None:
-    """Compile the CPU back end now, or load its compiled code; without numba there is nothing to do."""
+    """Compile the CPU back end now, or load its compiled code. Does nothing without numba."""
     if _has_numba():
         _engine("cpu").warmup()
 
 
 def set_threads(n: int) -> None:
-    """Let the CPU back end use `n` threads, the caller's included; results do not depend on it, to the last bit."""
+    """Let the CPU back end use `n` threads, the caller's included. Results are the same to the last bit."""
     from otsync.compute import threads
 
     threads.set_threads(n)
@@ -109,14 +109,18 @@ def _engine(name: str) -> ModuleType:
 
 
 def _choose(backend: str, means: Tensor) -> str:
-    """The back end that will run, announced once when it was chosen here."""
+    """The back end to run; announced once where the choice was made here."""
     if backend not in ("auto", "torch", "cpu", "gsplat"):
-        raise ValueError(f"backend: expected 'auto', 'torch', 'cpu' or 'gsplat', got {backend!r}")
+        raise ValueError(f"backend: expected 'auto', 'torch', 'cpu' or 'gsplat'; found {backend!r}.")
     if backend != "auto":
         if backend == "cpu" and not _has_numba():
-            raise ValueError("backend='cpu' needs numba: pip install numba, or use backend='torch' (15-40x slower)")
+            raise ValueError(
+                "backend: expected numba for 'cpu'; found none. pip install numba, or use 'torch' (15-40x slower)."
+            )
         if backend in ("cpu", "torch") and means.device.type != "cpu":
-            raise ValueError(f"backend={backend!r} works on CPU tensors, got {means.device}: move them with .cpu()")
+            raise ValueError(
+                f"backend: expected CPU tensors for {backend!r}; found {means.device}. Move them with .cpu()."
+            )
         return backend
     if means.device.type != "cpu":
         name, reason = "gsplat", "the tensors are on a GPU"
@@ -137,8 +141,8 @@ def _has_numba() -> bool:
 def _drop_nonfinite(gaussians: tuple[Tensor, ...], sh_degree: int | None) -> tuple[Tensor, ...]:
     """Replace Gaussians that hold a NaN or an infinity by ones that are not drawn; the rest pass untouched.
 
-    The sum over a tensor is finite when all its entries are (save for sums beyond the largest float, which only cost
-    the slower exact test), and takes a small fraction of the time of a rendering.
+    A finite sum means that all entries are finite, and takes a small fraction of the time of a rendering. (A sum may
+    exceed the largest float; that only costs the slower exact test.)
     """
     with torch.no_grad():
         if _finite_sums(*gaussians):
@@ -158,10 +162,10 @@ def _drop_nonfinite(gaussians: tuple[Tensor, ...], sh_degree: int | None) -> tup
 
 def _finite_sums(*tensors: Tensor) -> bool:
     if tensors[0].device.type != "cpu":
-        # one question for all: a GPU's answers are waited for
+        # one transfer for all: each answer of a GPU is waited for
         return bool(torch.stack([t.sum().isfinite() for t in tensors]).all())
     with np.errstate(all="ignore"):
-        # torch would wake its own pool, which then competes with ours
+        # torch would wake its own threads, which compete with ours
         return all(np.isfinite(t.detach().numpy().sum()) for t in tensors)
 
 
@@ -182,32 +186,34 @@ def _check_shapes(
     for name, tensor in {"means": means, "viewmats": viewmats}.items():
         if not isinstance(tensor, Tensor):
             raise ValueError(
-                f"{name}: expected a torch tensor, got {type(tensor).__name__}: convert with torch.as_tensor"
+                f"{name}: expected a torch tensor; found {type(tensor).__name__}. Convert it with torch.as_tensor."
             )
     if means.dtype not in (torch.float16, torch.float32, torch.float64):
-        raise ValueError(f"means: expected float16, float32 or float64, got {means.dtype}: convert with .float()")
+        raise ValueError(
+            f"means: expected float16, float32 or float64; found {means.dtype}. Convert them with .float()."
+        )
     c, moving = len(viewmats), means.ndim == 3
     n = means.shape[-2] if means.ndim > 1 else 0
 
     def expect(name: str, tensor: Tensor, *shapes: tuple[int | str, ...]) -> None:
         if not isinstance(tensor, Tensor):
             raise ValueError(
-                f"{name}: expected a torch tensor, got {type(tensor).__name__}: convert with torch.as_tensor"
+                f"{name}: expected a torch tensor; found {type(tensor).__name__}. Convert it with torch.as_tensor."
             )
         for shape in shapes:
             if tensor.ndim == len(shape) and all(
-                isinstance(want, str) or want == got for want, got in zip(shape, tensor.shape, strict=True)
+                isinstance(want, str) or want == actual for want, actual in zip(shape, tensor.shape, strict=True)
             ):
                 break
         else:
             wanted = " or ".join("[" + ",".join(map(str, s)) + "]" for s in shapes)
             raise ValueError(
-                f"{name}: expected {wanted} (N = {n} from means, C = {c} from viewmats), got {list(tensor.shape)}"
+                f"{name}: expected {wanted} (N = {n} from means, C = {c} from viewmats); found {list(tensor.shape)}."
             )
         if tensor.dtype != means.dtype or not tensor.is_floating_point() or tensor.device != means.device:
             raise ValueError(
-                f"{name}: expected {means.dtype} on {means.device} like means (a float type), "
-                f"got {tensor.dtype} on {tensor.device}: convert with .to(means)"
+                f"{name}: expected {means.dtype} on {means.device} like means (a float type); "
+                f"found {tensor.dtype} on {tensor.device}. Convert it with .to(means)."
             )
 
     expect("means", means, ("N", 3), (c, "N", 3))
@@ -221,19 +227,19 @@ def _check_shapes(
         expect("colors", colors, (n, "D"), (c, n, "D"))
         if d == 0:
             raise ValueError(
-                "colors: expected at least one channel, got none: pass ones [N,1] to render the alpha only"
+                "colors: expected at least one channel; found none. Pass ones [N,1] to render the alpha only."
             )
     else:
         expect("colors", colors, (n, "K", 3), (c, n, "K", 3))
         if colors.shape[-2] < (options.sh_degree + 1) ** 2:
             raise ValueError(
-                f"colors: sh_degree {options.sh_degree} needs {(options.sh_degree + 1) ** 2} coefficients, "
-                f"got {colors.shape[-2]}"
+                f"colors: expected {(options.sh_degree + 1) ** 2} coefficients for sh_degree {options.sh_degree}; "
+                f"found {colors.shape[-2]}."
             )
     if not (isinstance(width, int) and isinstance(height, int)) or width < 1 or height < 1:
-        raise ValueError(f"width, height: expected whole numbers of at least one pixel, got {width} x {height}")
+        raise ValueError(f"width, height: expected whole numbers of at least one pixel; found {width} x {height}.")
     if c < 1:
-        raise ValueError("viewmats: expected at least one camera, got none")
+        raise ValueError("viewmats: expected at least one camera; found none.")
     cameras = {"viewmats": viewmats, "Ks": Ks}
     if backgrounds is not None:
         expect("backgrounds", backgrounds, (c, d))
@@ -241,11 +247,11 @@ def _check_shapes(
     if not _finite_sums(*cameras.values()):
         name = next(name for name, tensor in cameras.items() if not _finite_sums(tensor))
         raise ValueError(
-            f"{name}: expected finite entries, got NaN or infinity: a camera or colour of the caller has diverged"
+            f"{name}: expected finite entries; found NaN or infinity. A camera or a background has diverged."
         )
     if not ((Ks[:, 0, 0] > 0) & (Ks[:, 1, 1] > 0)).all():
         raise ValueError(
-            "Ks: expected positive focal lengths, got zero or negative ones: flip the image, not the camera"
+            "Ks: expected positive focal lengths; found zero or negative ones. Flip the image, not the camera."
         )
     if (Ks[:, 0, 1] != 0).any():
-        raise ValueError("Ks: expected no skew (K[0,1] = 0), got some: it is not modelled; rectify the images")
+        raise ValueError("Ks: expected no skew (K[0,1] = 0), which is not modelled; found some. Rectify the images.")

@@ -1,4 +1,4 @@
-"""What a rendering is asked for and what it gives back: thresholds, Settings, Splats, Rendering."""
+"""Values that the back ends share: thresholds, Settings, Splats, Rendering."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ QUAT_NORM2_MIN = 1e-24  # a quaternion with a squared norm below this is no rota
 
 @dataclass(frozen=True)
 class Settings:
-    """How to project and what to return; the names and defaults are gsplat's.
+    """How to project and what to return, with gsplat's names and defaults.
 
     near_plane, far_plane: a Gaussian is kept when near <= z <= far (z of its mean, camera frame, world units).
     radius_clip: Gaussians whose two pixel radii are both at most this are dropped.
     eps2d: variance in square pixels added to both axes of every projected Gaussian.
     rasterize_mode: "classic", or "antialiased": the opacity is multiplied by sqrt(det(cov) / det(cov + eps2d I)),
         so that eps2d widens a splat without brightening it (Mip-Splatting, Yu et al. 2024).
-    sh_degree: None when `colors` are colours; else `colors` are spherical-harmonics coefficients, used up to this degree.
+    sh_degree: None where `colors` are colours; else they are spherical-harmonics coefficients, used up to this degree.
     depth: "expected" (sum of weight * z over the alpha), "accumulated" (sum of weight * z), or None: not computed.
     """
 
@@ -37,17 +37,17 @@ class Settings:
 
     def __post_init__(self) -> None:
         if self.rasterize_mode not in ("classic", "antialiased"):
-            raise ValueError(f"rasterize_mode: expected 'classic' or 'antialiased', got {self.rasterize_mode!r}")
+            raise ValueError(f"rasterize_mode: expected 'classic' or 'antialiased'; found {self.rasterize_mode!r}.")
         if self.depth not in ("expected", "accumulated", None):
-            raise ValueError(f"depth: expected 'expected', 'accumulated' or None, got {self.depth!r}")
+            raise ValueError(f"depth: expected 'expected', 'accumulated' or None; found {self.depth!r}.")
         if not 0 <= self.near_plane < self.far_plane:
             raise ValueError(
-                f"near_plane, far_plane: expected 0 <= near < far, got {self.near_plane}, {self.far_plane}"
+                f"near_plane, far_plane: expected 0 <= near < far; found {self.near_plane}, {self.far_plane}."
             )
         if not 0 <= self.eps2d < float("inf"):
-            raise ValueError(f"eps2d: expected a variance >= 0 in square pixels, got {self.eps2d}")
+            raise ValueError(f"eps2d: expected a variance >= 0 in square pixels; found {self.eps2d}.")
         if self.sh_degree is not None and self.sh_degree not in range(5):
-            raise ValueError(f"sh_degree: expected 0 to 4 or None (plain colours), got {self.sh_degree}")
+            raise ValueError(f"sh_degree: expected 0 to 4 or None (plain colours); found {self.sh_degree}.")
 
     @property
     def antialiased(self) -> bool:
@@ -56,7 +56,7 @@ class Settings:
 
 
 class Splats(NamedTuple):
-    """Projected Gaussians: what the projection node hands to the rasterization node. C cameras, N Gaussians.
+    """Projected Gaussians, which the projection node hands to the rasterization node. C cameras, N Gaussians.
 
     The 2x2 pixel covariance S = [[A, B], [B, C]] travels in the *centred-row form* (its LDL factors): on the pixel row
     dy below the mean, the splat is a 1-D Gaussian centred at dx = slope * dy,
@@ -72,7 +72,7 @@ class Splats(NamedTuple):
     depths: Tensor  # [C,N] z in the camera frame
     opacities: Tensor  # [C,N] compensated when antialiased
     radii: Tensor  # [C,N,2] int32 pixels; 0 where the Gaussian is not drawn
-    residuals: Tensor  # [C,N,3] what rounding took from means2d (x, y) and from the slope; no gradient
+    residuals: Tensor  # [C,N,3] rounding errors of means2d (x, y) and of the slope; no gradient
 
     # Without the residuals a needle a hundredth of a pixel wide would be 10^-3 wrong: its position on a row is
     # mean_x + slope * dy, and float32 knows that to 10^-6 pixels only.
@@ -80,13 +80,13 @@ class Splats(NamedTuple):
 
 @dataclass(frozen=True)
 class Rendering:
-    """Images of C cameras, and what densification asks for.
+    """Images of C cameras, with the means and radii that densification asks for.
 
     `means2d` takes part in the graph: call `rendering.means2d.retain_grad()` before `backward()`, or pass it to
     `torch.autograd.grad`, to read the gradient of the loss with respect to the 2-D means (per pixel); `radii > 0` are
-    the Gaussians that were drawn. It is the very tensor that was rasterized: a view of it would be beside the graph and
-    have no gradient. So it keeps gsplat's own shape, which is [C,1,N,2] where means are [C,N,3], one set per camera;
-    bring gradients to one shape with `grad.reshape(rendering.radii.shape)`, which is [C,N,2] everywhere.
+    the Gaussians that were drawn. It is the very tensor that was rasterized: a view of it would not be in the graph and
+    would have no gradient. So it keeps gsplat's own shape, which is [C,1,N,2] where means are [C,N,3], one set per
+    camera; bring gradients to one shape with `grad.reshape(rendering.radii.shape)`, which is [C,N,2] everywhere.
     """
 
     colors: Tensor  # [C,H,W,D]

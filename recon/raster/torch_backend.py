@@ -1,8 +1,8 @@
 """Rasterization in plain torch, batches of tiles at a time: the oracle in float64, the fallback without numba.
 
-Every tile composites its depth-sorted splats at once as a [splats, pixels] block. Tiles are taken in order of the length
-of their lists, so that a batch wastes little padding; blocks are recomputed in the backward pass when keeping them all
-would take too much memory.
+Every tile composites its depth-sorted splats at once as a [splats, pixels] block. Tiles are taken in order of the
+length of their lists, so that a batch wastes little on padding; blocks are recomputed in the backward pass where
+keeping them all would take too much memory.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""The folder that a reconstruction is kept in, and what is shown of it: images, video, exports, the report page."""
+"""The folder of a reconstruction, and ways to show it: images, video, exports, the report page."""

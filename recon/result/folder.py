@@ -1,9 +1,9 @@
-"""The folder that a reconstruction is kept in, and reading it back.
+"""The folder of a reconstruction: writing it, and reading it back.
 
 scene.npz      the 4D scene          offsets.json   the refined clocks
 run.json       cameras, clocks and colour gains of every video, options, wall times, notes
 metrics.json   figures of the views  report.html    all of it to look at
-fit.npz        where the fit stood   stages/        what led there, from which a killed run continues
+fit.npz        the fit's last state  stages/        earlier results, from which a killed run continues
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from recon.scene.gaussians4d import Gaussians4D
 FORMAT, VERSION = "otsync.reconstruction", 1
 MAX_VIDEOS = 10_000
 MAX_SIDE, MAX_PIXELS = 16_384, 2**26
-"""Of one image: what a foreign run.json, or a wish for a width, may ask memory for."""
+"""Of one image: a foreign run.json or a requested width may take no more memory."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class FilmedBy:
-    """One video's camera as the reconstruction knows it.
+    """The camera of one video, placed in a reconstruction.
 
     Args:
         camera: at working size, without distortion. gain: factors of R, G, B from the scene's colours to its images.
-        clock: its place in world time. times: (T,) seconds of its frames on its own clock.
+        clock: where it stands in world time. times: (T,) seconds of its frames on its own clock.
     """
 
     name: str
@@ -46,21 +46,29 @@ class FilmedBy:
     times: np.ndarray
     held_out: bool = False
 
+    def __repr__(self) -> str:
+        role = "held out" if self.held_out else "fitted"
+        return f"FilmedBy({self.name!r}, {len(self.times)} frames, {self.clock}, {role})"
+
     @classmethod
     def of(cls, footage: Footage, clock: Clock, gain: np.ndarray, held_out: bool = False) -> FilmedBy:
         return cls(footage.name, footage.camera, clock, gain, footage.times, held_out)
 
     def pose(self, t: float) -> np.ndarray:
-        """w2c (4,4) at world second ``t``: of the nearest frame where the camera moves."""
+        """w2c (4,4) at world second ``t``: of a moving camera that of the nearest frame."""
         if self.camera.w2c.ndim == 2:
             return self.camera.w2c
         world = self.clock.world(self.times)
         return self.camera.w2c[int(np.argmin(np.abs(world - t)))]
 
 
-@dataclass(frozen=True, eq=False)
-class Result:
-    """What :func:`load_result` reads: all that rendering, evaluation and export need."""
+@dataclass(frozen=True, eq=False, repr=False)
+class SavedReconstruction:
+    """A reconstruction as :func:`load_result` reads it: all that rendering, evaluation and export need.
+
+    Args:
+        options: those of the fit, as run.json has them. frame: name of the world frame.
+    """
 
     scene: Gaussians4D
     offsets: Offsets
@@ -70,11 +78,15 @@ class Result:
 
     @property
     def layered(self) -> bool:
-        """Whether the fit drew what moves over what is static; see :class:`recon.held_out.View`."""
+        """Whether the fit drew what moves over what is static; see :class:`recon.evaluate.views.CameraView`."""
         return bool(self.options.get("layered", True))
 
+    def __repr__(self) -> str:
+        held = sum(v.held_out for v in self.videos)
+        return f"SavedReconstruction({len(self.videos)} videos, {held} held out, {self.scene})"
+
     def video(self, name: str) -> FilmedBy:
-        """The named video. ValueError lists what there is."""
+        """The video of this name. ValueError lists those that there are."""
         for one in self.videos:
             if one.name == name:
                 return one
@@ -119,7 +131,7 @@ def save_run(
 
 
 def metrics_of(views: Sequence[ViewScore], stats: Mapping[str, float], lpips_reason: str = "") -> dict[str, Any]:
-    """The content of ``metrics.json``: nothing in it depends on wall time, so that equal fits give equal files."""
+    """The content of ``metrics.json``. It does not depend on wall time: equal fits give equal files."""
 
     def plain(figures: Mapping[str, float]) -> dict[str, float | None]:
         return {k: float(v) if math.isfinite(v) else None for k, v in figures.items()}
@@ -149,7 +161,7 @@ def metrics_of(views: Sequence[ViewScore], stats: Mapping[str, float], lpips_rea
     return document
 
 
-def load_result(folder: str | os.PathLike[str]) -> Result:
+def load_result(folder: str | os.PathLike[str]) -> SavedReconstruction:
     """Read a result folder. ValueError and FileNotFoundError name the file that is missing or unsound."""
     folder = Path(folder)
     if not (folder / "run.json").is_file():
@@ -171,12 +183,12 @@ def load_result(folder: str | os.PathLike[str]) -> Result:
             f"{folder / 'run.json'}: not a sound reconstruction; {type(error).__name__}: {error}. Run the fit again."
         ) from None
     scene, offsets = Gaussians4D.load(folder / "scene.npz"), Offsets.load(folder / "offsets.json")
-    return Result(scene, offsets, videos, options, frame)
+    return SavedReconstruction(scene, offsets, videos, options, frame)
 
 
-def _options(found: dict[str, Any]) -> dict[str, Any]:
-    """What the fit was told, as far as evaluation needs it. ValueError for no width, range of frames or exposure."""
-    options = dict(found)
+def _options(given: dict[str, Any]) -> dict[str, Any]:
+    """The options of the fit. ValueError where those that evaluation needs (width, frames, exposure) are unsound."""
+    options = dict(given)
     if type(options["width"]) is not int or not 1 <= options["width"] <= MAX_SIDE:
         raise ValueError(f"options.width: expected 1 to {MAX_SIDE} pixels; found {options['width']!r}")
     frames = options.get("frames")
@@ -194,7 +206,7 @@ def _options(found: dict[str, Any]) -> dict[str, Any]:
 
 
 def check_size(width: int, height: int) -> None:
-    """ValueError for images that nobody renders and no memory holds."""
+    """ValueError for images without pixels, or too large for memory."""
     if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE and width * height <= MAX_PIXELS):
         raise ValueError(
             f"width, height: expected 1 to {MAX_SIDE} pixels each and {MAX_PIXELS} in all; found {width} x {height}."
@@ -202,11 +214,11 @@ def check_size(width: int, height: int) -> None:
 
 
 def clear_parts(*folders: Path) -> None:
-    """Remove the unfinished files that killed writers left in ``folders`` (see :func:`otsync.files.atomic_write`).
+    """Remove unfinished files that killed writers left in ``folders`` (see :func:`otsync.files.arrays.atomic_write`).
 
-    Those of processes that still live stay: another run may be writing there.
+    Those of living processes stay: another run may be writing there.
     """
-    if os.name != "posix":  # elsewhere a process cannot be asked for without harming it
+    if os.name != "posix":  # elsewhere asking for a process would end it
         return
     for part in (p for folder in folders for p in folder.glob(".*.part")):
         pid = part.name.removesuffix(".part").rpartition(".")[2].partition("-")[0]
@@ -243,7 +255,7 @@ def _filmed_by(row: dict[str, Any]) -> FilmedBy:
         )
     gain = np.array(row["gain"], float)
     if gain.shape != (3,) or not np.isfinite(gain).all():
-        raise ValueError(f"gain: expected three numbers; found {row['gain']!r}")
+        raise ValueError(f"gain: expected three finite numbers; found {row['gain']!r}")
     times = np.array(row["times"], float)
     if times.ndim != 1 or not len(times) or (camera.w2c.ndim == 3 and len(times) != len(camera.w2c)):
         raise ValueError(f"times: expected one second per frame; found shape {times.shape}")

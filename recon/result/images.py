@@ -11,18 +11,23 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from otsync.types import Camera
-from recon.result.folder import MAX_SIDE, Result, check_size
+from recon.result.folder import MAX_SIDE, SavedReconstruction, check_size
 from recon.result.orbit import orbit
 
 
 def rendered(
-    result: Result, times: Sequence[float], camera: str | None = None, *, turns: float = 1.0, width: int | None = None
+    result: SavedReconstruction,
+    times: Sequence[float],
+    camera: str | None = None,
+    *,
+    turns: float = 1.0,
+    width: int | None = None,
 ) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
     """One image per world second of ``times``.
 
     Args:
-        camera: name of a video: from its place and with its colours; None: from a path around what moves.
-        turns: of the path. width: pixels; None: the working size of the fit.
+        camera: name of a video, to render from its place and with its colours; None: from a path around what moves.
+        turns: of the path. width: in pixels; None: the working size of the fit.
     """
     if camera is not None:
         video = result.video(camera)
@@ -39,8 +44,8 @@ def rendered(
         yield (image.numpy() * gain * 255).clip(0, 255).round().astype(np.uint8)
 
 
-def seen_by(result: Result, camera: Camera, t: float) -> Tensor:
-    """[h,w,3] of a static camera at world second ``t``: what moves over what is static, or both in one, as fitted."""
+def seen_by(result: SavedReconstruction, camera: Camera, t: float) -> Tensor:
+    """The image [h,w,3] of a static camera at world second ``t``, layered as in the fit."""
     scene = result.scene
     with torch.no_grad():
         if scene.static is None or not result.layered:
@@ -51,7 +56,7 @@ def seen_by(result: Result, camera: Camera, t: float) -> Tensor:
 
 
 def at_width(camera: Camera, width: int | None) -> Camera:
-    """The same view with images of another width; its height follows."""
+    """The same camera with images of another width, and a height to match."""
     if width is None or width == camera.width:
         return camera
     if not 1 <= width <= MAX_SIDE:
@@ -63,7 +68,7 @@ def at_width(camera: Camera, width: int | None) -> Camera:
 
 
 def stretched(span: tuple[float, float], frames: int) -> list[float]:
-    """``frames`` world seconds from the first to the last of the span."""
+    """``frames`` world seconds, evenly from the first to the last of the span."""
     if frames < 1:
         raise ValueError(f"frames: expected at least 1; found {frames}.")
     return np.linspace(*span, frames).tolist()

@@ -12,7 +12,7 @@ from recon.backdrop.surroundings import up_axis
 from recon.rotations import look_at
 
 SURROUNDED = np.radians(120)
-"""Cameras stand all around where the largest gap between them is smaller; else the path swings between the outermost."""
+"""With a larger gap the cameras do not stand all around, and the path swings between the outermost of them."""
 
 SWING = 0.9
 """Share of the filmed arc that a swing uses: beyond the outermost cameras nothing has been seen of the scene."""

@@ -1,4 +1,4 @@
-"""The page of a reconstruction: what came out, how the fit got there, and pictures beside what was filmed.
+"""The report of a reconstruction: results, convergence of the fit, and rendered pictures beside filmed ones.
 
 One self-contained HTML file without a script, in the style of the synchronisation report.
 """
@@ -20,17 +20,17 @@ from recon.evaluate.views import ViewScore
 from recon.fit.verb import History, Reconstruction
 
 SHOWN_VIEWS = 2
-"""Cameras whose pictures are shown; all stand in the table."""
+"""Cameras with pictures; the table has all."""
 
 PICTURE = 240
-"""Width of a picture, pixels: nine of them are about 60 kB."""
+"""Width of a picture in pixels: nine of them are about 60 kB."""
 
 HOW = {"given": "as given", "found": "found on the frozen scene", "fitted": "fitted with the scene"}
 
 
 def write_reconstruction_report(
     path: str | os.PathLike[str],
-    found: Reconstruction,
+    reconstruction: Reconstruction,
     coarse: Offsets,
     videos: Sequence[str],
     views: Sequence[ViewScore],
@@ -43,37 +43,38 @@ def write_reconstruction_report(
     """Write the page, atomically.
 
     Args:
-        coarse: the offsets that the fit began with; same videos as ``found.offsets``.
+        coarse: the offsets that the fit began with, of the same videos as ``reconstruction.offsets``.
         videos: names of those that took part in the fit, in its order.
-        views: held-out cameras, and training ones to compare with.
-        seconds: wall time of every stage. notes: what was lacking or assumed, in words.
+        views: of held-out cameras, and of training ones to compare with.
+        seconds: wall time of every stage. notes: in words, what was missing or assumed.
         truth: (V,) true offsets in seconds relative to the reference, where they are known.
+        lpips_reason: why there is no LPIPS; "" where there is.
     """
     parts = [
         "<h1>Reconstruction</h1>",
-        f"<p>{_verdict(found, views)}</p>",
+        f"<p>{_verdict(reconstruction, views)}</p>",
         "".join(f"<p class=no>{escape(note)}</p>" for note in notes),
         "<h2>Offsets</h2>",
-        _offset_rows(found, coarse, truth),
-        "<p class=s>In frames of the reference. Before: what the fit began with. Moved: after the common shift of all "
-        "videos, which images cannot tell, is taken out. t<sub>world</sub> = rate · t<sub>video</sub> + offset.</p>",
-        f"<h2>Convergence</h2><p class=s>{_pace(found)}</p>",
-        convergence(found, coarse, videos, truth),
+        _offset_rows(reconstruction, coarse, truth),
+        "<p class=s>In frames of the reference. Before: what the fit began with. Moved: without the common shift "
+        "of all videos, which images cannot tell. t<sub>world</sub> = rate · t<sub>video</sub> + offset.</p>",
+        f"<h2>Convergence</h2><p class=s>{_pace(reconstruction)}</p>",
+        convergence(reconstruction, coarse, videos, truth),
         "<h2>Views</h2>",
         _view_rows(views, lpips_reason),
         views_over_time(views) if any(len(v.frames) > 1 for v in views) else "",
         *_pictures(views),
         "<h2>Numbers</h2>",
-        _numbers(found, seconds or {}),
+        _numbers(reconstruction, seconds or {}),
     ]
     write_page(path, "Reconstruction", parts)
 
 
-def _verdict(found: Reconstruction, views: Sequence[ViewScore]) -> str:
+def _verdict(reconstruction: Reconstruction, views: Sequence[ViewScore]) -> str:
     held = [v for v in views if v.held_out]
-    text = f"<b>{len(found.offsets)} videos, {len(found.scene)} moving Gaussians"
-    if found.scene.static is not None:
-        text += f", {len(found.scene.static)} static"
+    text = f"<b>{len(reconstruction.offsets)} videos, {len(reconstruction.scene)} moving Gaussians"
+    if reconstruction.scene.static is not None:
+        text += f", {len(reconstruction.scene.static)} static"
     text += ".</b> "
     if held:
         mean = {
@@ -84,12 +85,12 @@ def _verdict(found: Reconstruction, views: Sequence[ViewScore]) -> str:
         text += f"Held-out cameras: {number(mean.get('psnr', np.nan), 2)} dB"
         text += f", {number(mean['mask_psnr'], 2)} dB where things move." if "mask_psnr" in mean else "."
     else:
-        text += "No camera was held out: the figures below are of cameras that the fit has seen."
+        text += "No camera was held out: the figures below are of cameras that took part in the fit."
     return text
 
 
-def _offset_rows(found: Reconstruction, coarse: Offsets, truth: np.ndarray | None) -> str:
-    offsets = found.offsets
+def _offset_rows(reconstruction: Reconstruction, coarse: Offsets, truth: np.ndarray | None) -> str:
+    offsets = reconstruction.offsets
     head = "<th>video<th>before<th>after<th>± sigma<th>moved" + ("<th>true<th>error" if truth is not None else "")
     rows = []
     for v, name in enumerate(offsets.names):
@@ -104,9 +105,11 @@ def _offset_rows(found: Reconstruction, coarse: Offsets, truth: np.ndarray | Non
     return f"<div class=scroll><table><tr>{head}<th class=t>status before the fit{''.join(rows)}</table></div>"
 
 
-def convergence(found: Reconstruction, coarse: Offsets, videos: Sequence[str], truth: np.ndarray | None = None) -> str:
+def convergence(
+    reconstruction: Reconstruction, coarse: Offsets, videos: Sequence[str], truth: np.ndarray | None = None
+) -> str:
     """Left: every camera's offset against steps, relative to the reference. Right: PSNR of the training boxes."""
-    history, step = found.history, found.scene.frame_step
+    history, step = reconstruction.history, reconstruction.scene.frame_step
     figure, (left, right) = axes_of(7.2, 2.7, 2)
     if len(history.step):
         for name, curve, is_reference in offset_curves(history, coarse, videos, truth):
@@ -122,19 +125,19 @@ def convergence(found: Reconstruction, coarse: Offsets, videos: Sequence[str], t
     return svg(figure, "offsets and PSNR over the fit")
 
 
-def _pace(found: Reconstruction) -> str:
-    # a fit that was continued knows the time of its sessions one by one: the longest is what it took, about
-    seconds = max([found.stats.get("seconds", 0.0), *found.history.seconds.tolist()])
-    text = f"{found.stats.get('steps', 0.0):.0f} steps" + (f", {seconds:.1f} s" if seconds >= 0.1 else "")
+def _pace(reconstruction: Reconstruction) -> str:
+    # a continued fit has a time for each of its sessions: the longest is about what it took
+    seconds = max([reconstruction.stats.get("seconds", 0.0), *reconstruction.history.seconds.tolist()])
+    text = f"{reconstruction.stats.get('steps', 0.0):.0f} steps" + (f", {seconds:.1f} s" if seconds >= 0.1 else "")
     return text + ". Left: relative to the reference. Right: mean over the images since the last point."
 
 
 def offset_curves(
     history: History, coarse: Offsets, videos: Sequence[str], truth: np.ndarray | None
 ) -> list[tuple[str, np.ndarray, bool]]:
-    """(name, (R,) seconds relative to the reference, whether it is the reference) of every video that was fitted.
+    """(name, (R,) seconds relative to the reference, whether it is the reference) of every fitted video.
 
-    Against the truth where it is known, else against where the fit began.
+    Differences from the truth where it is known, else from where the fit began.
     """
     index = [coarse.names.index(name) for name in videos]
     zero = coarse.seconds if truth is None else truth
@@ -146,7 +149,7 @@ def offset_curves(
 
 def _view_rows(views: Sequence[ViewScore], lpips_reason: str) -> str:
     if not views:
-        return "<p class=s>No view was compared.</p>"
+        return "<p class=s>No view was scored.</p>"
     names = {
         "psnr": ("PSNR", 2),
         "ssim": ("SSIM", 4),
@@ -160,14 +163,15 @@ def _view_rows(views: Sequence[ViewScore], lpips_reason: str) -> str:
         gain = " ".join(f"{g:.3f}" for g in v.gain)
         role = "held out" if v.held_out else "training"
         rows.append(
-            f"<tr><td>{escape(v.name)}<td class=t>{role}{cells}<td>{len(v.frames)}<td style='white-space:nowrap'>{gain}<td class=t>{HOW[v.clock.how]}"
+            f"<tr><td>{escape(v.name)}<td class=t>{role}{cells}<td>{len(v.frames)}"
+            f"<td style='white-space:nowrap'>{gain}<td class=t>{HOW[v.clock.how]}"
         )
     head = "".join(f"<th>{title}" for title, _ in names.values())
     missing = f" LPIPS: {escape(lpips_reason)}." if lpips_reason else ""
     return (
         f"<div class=scroll><table><tr><th>camera<th class=t>role{head}<th>frames<th>gain R G B<th class=t>clock"
-        f"{''.join(rows)}</table></div><p class=s>Nothing of the cameras' own pictures is shown: static Gaussians, "
-        f"and over them what moves. The gain comes from what is static.{missing}</p>"
+        f"{''.join(rows)}</table></div><p class=s>Renderings use none of the cameras' own pictures: they are static "
+        f"Gaussians, and over them what moves. The gain is fitted to what is static.{missing}</p>"
     )
 
 
@@ -187,7 +191,7 @@ def views_over_time(views: Sequence[ViewScore]) -> str:
 
 
 def _pictures(views: Sequence[ViewScore]) -> list[str]:
-    """Rendered, filmed, and their difference four times, of the first cameras; what is missing where there are none."""
+    """Rendered, filmed, and four times their difference, of the first cameras; or what they need that is missing."""
     try:
         from PIL import Image
     except ModuleNotFoundError:  # a report without pictures is better than none
@@ -206,12 +210,12 @@ def _pictures(views: Sequence[ViewScore]) -> list[str]:
     return parts
 
 
-def _numbers(found: Reconstruction, seconds: Mapping[str, float]) -> str:
+def _numbers(reconstruction: Reconstruction, seconds: Mapping[str, float]) -> str:
     from otsync import __version__
 
     stages = "".join(f"<tr><td>{escape(k)}<td>{v:.1f} s" for k, v in seconds.items())
-    stats = "".join(f"<tr><td>{escape(k)}<td>{v:.5g}" for k, v in found.stats.items())
-    knots = found.scene.motion.parameters().get("knots")
+    stats = "".join(f"<tr><td>{escape(k)}<td>{v:.5g}" for k, v in reconstruction.stats.items())
+    knots = reconstruction.scene.motion.parameters().get("knots")
     nodes = "" if knots is None else f"<tr><td>scaffold nodes<td>{knots.shape[1]}<tr><td>knots<td>{knots.shape[0]}"
     return (
         f"<table>{stages}</table><table>{stats}{nodes}</table>"

@@ -14,7 +14,7 @@ CONTAINERS = {".mp4": "mp4", ".mov": "mov", ".mkv": "matroska"}
 
 
 def check_target(out: Path) -> None:
-    """ValueError, before any rendering, for a target that :func:`write_images` would not know how to write."""
+    """ValueError, before anything is rendered, for a target that :func:`write_images` cannot write."""
     if out.suffix and out.suffix.lower() not in CONTAINERS:
         raise ValueError(f"{out}: expected {', '.join(CONTAINERS)}, or a folder for PNG frames; found {out.suffix}.")
     if not out.suffix and out.is_file():
@@ -22,10 +22,10 @@ def check_target(out: Path) -> None:
 
 
 def write_images(images: Iterable[UInt8[np.ndarray, "h w 3"]], out: str | os.PathLike[str], fps: float = 30.0) -> int:
-    """Write RGB images of one size as they come; how many there were.
+    """Write RGB images of one size as they come, and return how many there were.
 
-    ``out`` with the suffix of a container: H.264 at ``fps``, an odd last row or column left out; otherwise a folder
-    that receives ``00000.png``, ... A video appears under its name only when it is complete.
+    ``out`` with the suffix of a container: H.264 at ``fps``, without an odd last row or column; else a folder for
+    ``00000.png``, ``00001.png``, ... A video appears under its name once it is complete.
     """
     out = Path(out)
     check_target(out)
@@ -66,7 +66,7 @@ def _video(images: Iterable[np.ndarray], out: Path, fps: float) -> int:
                 video.mux(stream.encode(frame))
                 count += 1
             if stream is None:
-                raise ValueError(f"{out}: expected at least one image to write; got none.")
+                raise ValueError(f"{out}: expected at least one image to write; found none.")
             video.mux(stream.encode())
         os.replace(part, out)
     except BaseException:

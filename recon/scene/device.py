@@ -32,7 +32,7 @@ def device_of(name: torch.device | str) -> torch.device:
         raise ValueError(f"device: expected one of {there}; found {str(name)!r}. {remedy}")
     if importlib.util.find_spec("gsplat") is None:
         raise ValueError(
-            f"device: expected gsplat, which renders on {str(name)!r}; found none installed. pip install 'otsync[cuda]', or "
+            f"device: expected gsplat, which renders on {str(name)!r}; found none. pip install 'otsync[cuda]', or "
             "use 'cpu'."
         )
     return device

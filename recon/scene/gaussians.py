@@ -47,7 +47,7 @@ class Gaussians:
     def from_colors(
         cls, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, *, sh_degree: int = 0
     ) -> Gaussians:
-        """From activated values: scales >= 0 [N,3], opacities in 0..1 [N], colours [N,3] that are alike from everywhere.
+        """From activated values: scales >= 0 [N,3], opacities in 0..1 [N], colours [N,3], alike from all sides.
 
         sh_degree: 0..4, the degree to leave room for; coefficients above the constant are 0.
 
@@ -84,7 +84,7 @@ class Gaussians:
         return int(self.sh.shape[1] ** 0.5) - 1
 
     def render(self, camera: Camera | Sequence[Camera], **options: Any) -> Rendering:
-        """What `camera` sees; options are those of :func:`recon.raster.render`.
+        """Render them as `camera` sees them; options are those of :func:`recon.raster.render`.
 
         Several cameras of one image size, and the T poses of a moving camera, become the C images of the rendering.
         A Camera is a pinhole here: one with distortion is refused (undistort its images), readout is ignored.
@@ -119,6 +119,6 @@ class Gaussians:
         for f in fields(self):
             if not getattr(self, f.name).isfinite().all():
                 raise ValueError(
-                    f"gaussians.{f.name}: expected finite values; found NaN or infinity. The fit has diverged: lower its rates."
+                    f"gaussians.{f.name}: expected finite values; found NaN or infinity. The fit has diverged."
                 )
         return self

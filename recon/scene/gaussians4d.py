@@ -33,7 +33,7 @@ UNSOUND = (
     json.JSONDecodeError,
     UnicodeDecodeError,
 )
-"""Errors beside ValueError that a stranger's header raises: JSON of other types, other lengths, too deep or too large."""
+"""Errors beside ValueError that a stranger's header raises: JSON of other types or lengths, too deep, too large."""
 
 
 NEAR_OF_MOVING = 0.01
@@ -90,7 +90,7 @@ class Gaussians4D:
 
     @property
     def moving_near(self) -> float:
-        """Near plane for what moves: unlike a backdrop it stands in front of no camera, so nearly all of it is drawn."""
+        """Near plane of what moves. Unlike a backdrop it blocks no camera's view, so nearly all of it is drawn."""
         return NEAR_OF_MOVING * self.near
 
     def moving(self, t: Tensor | float, clocks: Tensor | None = None) -> Gaussians:
@@ -104,7 +104,7 @@ class Gaussians4D:
         return moving if self.static is None else join(moving, self.static)
 
     def to(self, device: torch.device | str) -> Gaussians4D:
-        """The same scene on "cpu" or on a GPU ("cuda"), where a fit of it then runs. ValueError where there is no GPU."""
+        """The same scene on "cpu" or a GPU ("cuda"), where a fit of it then runs. ValueError where there is none."""
         device = device_of(device)
         return replace(
             self,
@@ -121,7 +121,7 @@ class Gaussians4D:
         return torch.stack(paths, 1).cpu().numpy() if paths else np.zeros((len(self), 0, 3), np.float32)
 
     def render(self, camera: Camera, t: Tensor | float, **options: Any) -> Rendering:
-        """What a static ``camera`` sees at world time ``t``; options are those of :func:`recon.raster.render`."""
+        """Render the scene at world time ``t`` for a static ``camera``; options: of :func:`recon.raster.render`."""
         if camera.w2c.ndim == 3:
             raise ValueError("camera: expected one pose; found one per frame. Take the pose of the frame you want.")
         options.setdefault("near_plane", self.near)
@@ -180,7 +180,7 @@ def scene_arrays(scene: Gaussians4D) -> dict[str, np.ndarray]:
 
 
 def scene_from_arrays(arrays: Mapping[str, np.ndarray]) -> Gaussians4D:
-    """The scene that :func:`scene_arrays` took apart. ValueError or one of :data:`UNSOUND` says what is missing or wrong."""
+    """The scene that :func:`scene_arrays` took apart. ValueError, or one of :data:`UNSOUND`, where it is unsound."""
     about = json.loads(arrays["scene"].tobytes().decode())
     if not isinstance(about, dict) or about.get("format") != FORMAT or about.get("version") != VERSION:
         raise ValueError(f"expected a 4D scene (format {FORMAT!r}, version {VERSION}); found another. Write it anew.")

@@ -1,8 +1,8 @@
 """Seeding: the first Gaussians of a scene, on the surfaces that the depth maps show, moment by moment.
 
-At the middle of the clip every surface voxel gets a Gaussian, which is bound to the scaffold. At each further moment the
-Gaussians are carried there, and new ones are added where none is near: on what earlier moments hid. Their means hold at
-that moment, so each moment is a rest of the scaffold.
+At the middle of the clip every surface voxel gets a Gaussian, which is bound to the scaffold. At each further moment
+the Gaussians are carried there, and new ones are added where none is near: on what earlier moments hid. Their means
+hold at that moment, so each moment is a rest of the scaffold.
 
 A rolling shutter is not undone here: its rows are off by up to half a readout, which the fit corrects.
 """

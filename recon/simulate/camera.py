@@ -26,7 +26,7 @@ Between the last two it has none: silhouettes mix both."""
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """What one camera filmed: uint8 images, bool masks, and exact depth [T,h,w], 0 at silhouettes."""
+    """Frames of one camera: uint8 images, bool masks, and exact depth [T,h,w], 0 at silhouettes."""
 
     images: np.ndarray
     masks: np.ndarray
@@ -86,7 +86,7 @@ class FilmingCamera:
         return see
 
     def _moving(self, t: float) -> Gaussians:
-        """What moves, in the colours that this camera sees."""
+        """The moving Gaussians in the colours that this camera sees."""
         moving = self.world.moving(t)
         for lamp in (e for e in self.effects if isinstance(e, Sheen)):
             R, shift = self.camera.w2c[:3, :3], self.camera.w2c[:3, 3]
@@ -95,7 +95,7 @@ class FilmingCamera:
         return moving
 
     def _render(self, gaussians: Gaussians, near: float) -> Instant:
-        """What the camera sees of them; depth 0 where there is nothing."""
+        """The Gaussians as the camera sees them; depth 0 where there are none."""
         colors = (sh.C0 * gaussians.sh[:, 0] + 0.5).clamp(0, 1)
         w2c = torch.as_tensor(self.camera.w2c, dtype=torch.float32)[None]
         K = torch.as_tensor(self.camera.K, dtype=torch.float32)[None]

@@ -15,7 +15,7 @@ from otsync.types import Camera
 
 @dataclass(frozen=True, eq=False)
 class Instant:
-    """What a camera sees at one instant: rgb [h,w,3] and alpha [h,w,1] of what moves.
+    """The view of one instant: rgb [h,w,3] and alpha [h,w,1] of what moves.
 
     z [h,w,1]: its depth; solid [h,w,1]: its alpha. Neither has blur, which depth estimators look through.
     """
@@ -98,7 +98,7 @@ class Sheen:
     lamp: tuple[float, float, float] = (0.3, -0.4, 0.87)
 
     def light(self, means: np.ndarray, normals: np.ndarray, eye: np.ndarray) -> Float[np.ndarray, "N 1"]:
-        """What it adds to the colours that the camera at ``eye`` sees."""
+        """Light added to the colours [N,3] that the camera at ``eye`` sees."""
         to_eye = eye - means
         half = to_eye / np.linalg.norm(to_eye, axis=1, keepdims=True) + np.asarray(self.lamp) / np.linalg.norm(
             self.lamp

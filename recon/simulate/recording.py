@@ -26,8 +26,8 @@ DEPTH_STEP = 0.0005
 def write_capture(capture: Capture, folder: str | os.PathLike[str], *, masks: bool = True, depth: bool = True) -> None:
     """Write ``scene.json``, ``truth.json``, ``start.json``, images, masks, and the training cameras' depth and tracks.
 
-    start.json holds offsets for a fit to begin with: zero for every camera. Held-out cameras film at true world time, as
-    both files say. ValueError for a folder that holds another recording.
+    start.json holds offsets for a fit to begin with: zero for every camera. Held-out cameras film at true world time,
+    as both files say. ValueError for a folder that holds another recording.
     """
     folder = Path(folder)
     if (folder / "scene.json").exists():

@@ -20,11 +20,11 @@ from recon.raster.cpu import kernels, lists
 from recon.raster.cpu import project as projection
 from recon.raster.rendering import Settings, Splats
 
-GAUSSIANS_PER_PART = 1024  # of the projection: fixed, so that sums over parts do not depend on the threads
+GAUSSIANS_PER_PART = 1024  # fixed, so that sums over parts do not depend on the threads
 logger = logging.getLogger("recon.raster")
 
 DEPTH_MODES = {None: kernels.NO_DEPTH, "accumulated": kernels.ACCUMULATED, "expected": kernels.EXPECTED}
-PARTS = 64  # of the tiles: many, because tiles differ by orders of magnitude in their work
+PARTS = 64  # of the tiles: many, because the work per tile differs by orders of magnitude
 
 
 def project(
@@ -57,9 +57,9 @@ _warming = threading.Lock()
 
 
 def warmup() -> None:
-    """Load every kernel from numba's cache, or compile it: a fraction of a second, or some seconds once per machine.
+    """Load every kernel from numba's cache (a fraction of a second), or compile it (some seconds, once per machine).
 
-    Happens by itself with the first rendering; call it to choose when. Says so when it takes long.
+    The first rendering does it; call this to do it earlier. It says so where it takes long.
     """
     global _warm
     with _warming:

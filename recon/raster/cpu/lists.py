@@ -1,6 +1,6 @@
 """Depth order and tile lists: which splats touch which tile, front to back.
 
-Splats of all cameras are sorted once by depth; from then on a splat is known by its *rank* in that order, and everything
+Splats of all cameras are sorted once by depth. From then on a splat is known by its *rank* in that order, and all that
 the compositing reads lies in rank order. Tiles are numbered over all cameras. A list is an ascending run of ranks, so
 parts of the rank range can be counted and filled by different threads: part p writes behind part p - 1 in every list.
 """
@@ -78,8 +78,8 @@ def build(splats: tuple[np.ndarray, ...], width: int, height: int) -> TileLists:
 def depth_order(depths: np.ndarray, radii: np.ndarray) -> np.ndarray:
     """Indices of the drawn splats, nearest first; equal depths keep their order.
 
-    For positive floats the bits order like the values, so a radix sort of 64-bit entries (depth bits, index) will do; it
-    is stable, and takes a fifth of the time of numpy's sort.
+    For positive floats the bits order like the values, so a radix sort of 64-bit entries (depth bits, index) will do.
+    It is stable, and takes a fifth of the time of numpy's sort.
     """
     entries = np.empty((2, len(depths)), np.uint64)
     return _radix_sort(depths.view(np.uint32), radii, entries)
@@ -108,7 +108,7 @@ def _radix_sort(depth_bits, radii, entries):
             n > 0
             and place[(depth_bits[source[0] & np.uint64(0xFFFFFFFF)] >> np.uint64(11 * digit)) & np.uint64(2047)] == n
         ):
-            continue  # all alike in these bits: the highest ones, mostly
+            continue  # all have these bits in common: mostly the highest ones
         start = 0
         for value in range(2048):
             start, place[value] = start + place[value], start

@@ -46,7 +46,7 @@ def test_mask_psnr_knows_only_the_mask():
 
 
 def scikit_ssim(x, y):
-    """The map of scikit-image's structural_similarity(gaussian_weights=True, sigma=1.5, use_sample_covariance=False)."""
+    """scikit-image: structural_similarity(gaussian_weights=True, sigma=1.5, use_sample_covariance=False)."""
 
     def mean(a):
         return np.stack([gaussian_filter(a[..., c], 1.5, truncate=3.5) for c in range(3)], -1)

@@ -16,7 +16,15 @@ from otsync.priors.features import LabHistogram
 from otsync.priors.working import WorkingFrames
 from recon.cli import main
 from recon.features.maps import DaisyMaps, LabMaps
-from recon.features.tracks import Alone, before_black, feature_tracks, fit_alone, lifted_frames, seen_weights, tracks_of
+from recon.features.tracks import (
+    Alone,
+    before_black,
+    feature_tracks,
+    fit_alone,
+    gaussian_tracks,
+    lifted_frames,
+    seen_weights,
+)
 from recon.simulate.capture import synthetic
 from recon.simulate.recording import write_capture
 
@@ -43,7 +51,7 @@ def colours(image, mask):
 
 def test_tracks_follow_the_surface_on_the_videos_own_clock(capture, scene):
     footage, flow, _ = inputs(capture)
-    tracks = tracks_of(scene, footage, flow, colours)
+    tracks = gaussian_tracks(scene, footage, flow, colours)
     tracks.check("tracks", features=True)
     assert tracks.name == flow.name and tracks.frame == flow.frame
     assert np.array_equal(tracks.times, flow.times) and len(tracks) > 200
@@ -80,7 +88,7 @@ def test_what_stands_behind_is_not_seen(capture, scene):
 
 def test_lifted_features_are_those_of_the_surface(capture, scene):
     footage, flow, _ = inputs(capture)
-    tracks = tracks_of(scene, footage, flow, colours)
+    tracks = gaussian_tracks(scene, footage, flow, colours)
     x, true = tracks.positions(), capture.world.positions(footage.times)
     middle = FRAMES // 2
     at = np.flatnonzero(tracks.seen[:, middle])
@@ -130,7 +138,7 @@ def test_the_fit_improves_the_images_and_the_clock_stays(capture):
         images.append(float(((whole - footage.images[6] / 255) ** 2)[footage.masks[6] > 128].mean()))
         assert found.span == (footage.times[0], footage.times[-1])
     assert images[1] < 0.7 * images[0]
-    with pytest.raises(ValueError, match="rates: expected no rate of offsets"):
+    with pytest.raises(ValueError, match="rates: expected none for offsets"):
         Alone(rates={"means": 0.1, "offsets": 0.02})
 
 
@@ -140,7 +148,7 @@ def test_bad_frames_show_nothing_and_unknown_backgrounds_are_black(capture, scen
     bad[3] = True
     spoiled = replace(footage, bad=bad)
     assert 3 not in lifted_frames(spoiled, 1 / 30) and len(lifted_frames(spoiled, 1 / 30)) == FRAMES - 1
-    tracks = tracks_of(scene, spoiled, flow, colours)
+    tracks = gaussian_tracks(scene, spoiled, flow, colours)
     assert not tracks.seen[:, 3].any() and tracks.seen[:, 4].any()
     black = before_black(footage)
     assert not black.background.any() and not black.images[footage.masks == 0].any()
@@ -169,7 +177,7 @@ def test_what_one_video_lacks_is_said(capture, scene):
         with pytest.raises(ValueError, match=says):
             fit_alone(*arguments, depth)
     with pytest.raises(ValueError, match="lower least_life"):
-        tracks_of(scene, footage, flow, colours, options=Alone(least_pixels=1e6))
+        gaussian_tracks(scene, footage, flow, colours, options=Alone(least_pixels=1e6))
 
 
 def test_lab_maps_are_otsyncs_histograms():
@@ -240,9 +248,9 @@ def test_the_lifting_suite_writes_its_table(tmp_path, capsys):
 
 def test_tracks_of_a_rolling_shutter_are_at_the_frames_times_and_say_so(capture, scene):
     footage, flow, _ = inputs(capture)
-    tracks = tracks_of(scene, replace(footage, readout=0.02), flow, colours)
+    tracks = gaussian_tracks(scene, replace(footage, readout=0.02), flow, colours)
     assert at_frame_times(tracks) is tracks
-    np.testing.assert_array_equal(tracks.xyz, tracks_of(scene, footage, flow, colours).xyz)
+    np.testing.assert_array_equal(tracks.xyz, gaussian_tracks(scene, footage, flow, colours).xyz)
     plain, rolled = (
         fit_alone(replace(footage, readout=r), flow, capture.depth[0].__getitem__, options=Alone(steps=2))
         for r in (None, 0.02)

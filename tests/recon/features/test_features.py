@@ -202,7 +202,7 @@ def test_bad_maps_are_refused():
         "like the camera": [replace(good, features=maps(3)[:-1])],
         "one extractor": [good, replace(good, features=maps(4))],
         "one pose": [replace(good, camera=moving)],
-        "undistort": [replace(good, camera=bent)],
+        "without distortion; found": [replace(good, camera=bent)],
     }.items():
         with pytest.raises(ValueError, match=says):
             lift(*frames)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from otsync.types import TrackSet
 from recon.motion import HermiteSpline, PerGaussian, Sampled, Static, build_scaffold, density, motion_from_arrays
 from recon.motion.solve import FRAME
 from recon.rotations import rotation_matrices, unit
@@ -39,27 +38,6 @@ def test_paths_of_their_own_start_where_the_scaffold_carries(carried):
     assert (x - scaffold.warp(means, quats, 0.5)[0]).norm(dim=1).max() < 5e-3 and torch.equal(q, quats)
     sampled = PerGaussian.following(scaffold, means, Sampled.of(0.0, 1.2, FRAME))
     assert torch.allclose(sampled.warp(means, quats, 0.5)[0], scaffold.warp(means, quats, 0.5)[0], atol=1e-4)
-
-
-def test_paths_from_the_nearest_raw_tracks():
-    """Each Gaussian takes over its own track's displacement, which is held while the track is not seen."""
-    t = np.arange(20) / 30
-    xyz = np.zeros((3, 20, 3))
-    xyz[0, :, 0], xyz[1, :, 1] = t, 1 + 2 * t
-    xyz[2] = [5.0, 5.0, 5.0]
-    visible = np.ones((3, 20), bool)
-    visible[0, 10:] = False
-    visible[2, :15] = False  # near no one when the third is bound
-    tracks = TrackSet(np.where(visible[..., None], xyz, np.nan), visible, fps=30)
-    path = HermiteSpline.of(0.0, 19 / 30, 2 * FRAME, 2 * FRAME)
-    means = torch.tensor([[0.2, 0.01, 0], [0.0, 1.4, 0.1], [5.0, 4.9, 5.0]])
-    motion = PerGaussian.from_tracks([tracks], np.zeros(1), means, [5 / 30, 5 / 30, 5 / 30], path, frame_step=FRAME)
-    x, _ = motion.warp(means, torch.zeros(3, 4), 8 / 30)
-    assert torch.allclose(x[0], means[0] + torch.tensor([3 / 30, 0, 0]), atol=1e-5)
-    assert torch.allclose(x[1], means[1] + torch.tensor([0, 6 / 30, 0]), atol=1e-5)
-    assert torch.allclose(motion.warp(means, x, 5 / 30)[0], means, atol=1e-2)
-    late, _ = motion.warp(means, torch.zeros(3, 4), 18 / 30)
-    assert torch.allclose(late[0], means[0] + torch.tensor([4 / 30, 0, 0]), atol=1e-3)
 
 
 def test_paths_of_their_own_are_learnt_and_taken():

@@ -1,4 +1,4 @@
-"""What a scaffold is built with: tracks on a grid, the pick, the solver of curves, rotations; laws and oracles."""
+"""The parts of building a scaffold: tracks on a grid, the pick, the solver of curves, rotations; laws and oracles."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 
 from otsync.types import TrackSet
 from recon.motion import HermiteSpline
-from recon.motion.nodes import TOP, Grid, held, neighbours, pick
+from recon.motion.nodes import TOP, Grid, neighbours, pick
 from recon.motion.solve import (
     FRAME,
     RIDGE,
@@ -21,7 +21,7 @@ from recon.motion.solve import (
 
 
 def test_tracks_on_the_grid():
-    """Interpolated between samples that were seen, never over a long gap; held where a curve must go on."""
+    """Interpolated between samples that were seen, never over a long gap."""
     t = np.arange(10) / 10
     xyz = np.stack([t, t**2, 0 * t], 1)[None].repeat(2, 0)
     xyz[0, 4] = np.nan
@@ -32,8 +32,6 @@ def test_tracks_on_the_grid():
     assert np.allclose(place[0, grid.seen[0], 0], (grid.times - 0.05)[grid.seen[0]], atol=1e-6)
     assert grid.seen[0].tolist() == [not 6 < k < 10 for k in range(19)]
     assert grid.seen[1].tolist() == [k >= 12 for k in range(19)]
-    still = held(grid)
-    assert np.allclose(still[1, :12], still[1, 12]) and np.allclose(still[0, 7:10], still[0, 6])
 
 
 def d_track(xyz, seen, i, j):
@@ -163,7 +161,7 @@ def test_angular_velocities_are_those_of_the_seen():
 
 
 def test_rotations_follow_a_neighbourhood_round_and_round():
-    """A rigid cloud that turns three times: the nodes' rotations are the cloud's, even where neighbours are on a line."""
+    """A rigid cloud turns three times: the nodes' rotations are the cloud's, even where neighbours are on a line."""
     from scipy.spatial.transform import Rotation
 
     rng = np.random.default_rng(1)

@@ -1,4 +1,4 @@
-"""Gradients against finite differences in float64, and torch's gradcheck; the hand-written backward against autograd."""
+"""Gradients against finite differences in float64 and torch's gradcheck; the written backward against autograd."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The cases that break rasterizers, as one table: every row on every back end, finite everywhere and equal to the oracle."""
+"""Cases that break rasterizers, as one table: every row on every back end, finite and equal to the oracle."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How the renderer behaves as a guest: imports, compiled code and its cache, announcements, threads, forks, benchmark."""
+"""The renderer as a guest: imports, compiled code and its cache, announcements, threads, forks, the benchmark."""
 
 from __future__ import annotations
 

@@ -128,4 +128,4 @@ def test_a_fit_of_no_steps_and_without_views_has_a_page_too(coarse, tmp_path):
     found = Reconstruction(reconstruction(coarse).scene, coarse, {}, empty, {"steps": 0.0})
     write_reconstruction_report(tmp_path / "r.html", found, coarse, ["a", "b", "<c>"], [])
     page = (tmp_path / "r.html").read_text()
-    assert "No camera was held out" in page and "No view was compared" in page
+    assert "No camera was held out" in page and "No view was scored" in page
