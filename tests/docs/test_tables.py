@@ -10,6 +10,7 @@ import pytest
 
 import otsync
 from otsync import Alignment, Camera, Offsets, Status, TrackSet, plugins
+from otsync.bench import suites
 from otsync.cli.commands import commands as otsync_commands
 from recon.cli.commands import commands as recon_commands
 from tests.docs.pages import PAGES, ROOT
@@ -43,6 +44,10 @@ def test_every_group_of_plugins_is_in_the_page_about_them():
 def test_every_command_is_listed():
     there = {f"otsync {name}" for name in otsync_commands()} | {f"recon {name}" for name in recon_commands()}
     assert {name for name in rows("docs/commands.md") if name.startswith(("otsync ", "recon "))} == there
+
+
+def test_every_suite_is_listed():
+    assert {*suites(), "all"} <= set(rows("docs/benchmarks.md"))
 
 
 def test_every_public_name_is_listed():
