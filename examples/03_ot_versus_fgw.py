@@ -21,12 +21,12 @@ MATCHERS = {"features only (EMD)": OptimalTransport(), "fused (FGW)": FusedGromo
 
 def main(n: int = 1000, seeds: tuple[int, ...] = (0, 1, 2), out: Path = Path("out/ablation.png")) -> None:
     rows: dict[str, list[dict[str, float]]] = {name: [] for name in MATCHERS}
-    found = {}
+    matched = {}
     for seed in seeds:
         a, b, truth = matching_world(n, seed=seed, shared_frame=True)
         for name, matcher in MATCHERS.items():
-            found[name] = match(a, b, matcher)
-            rows[name].append(match_quality(found[name], truth))
+            matched[name] = match(a, b, matcher)
+            rows[name].append(match_quality(matched[name], truth))
 
     print(f"{n} tracks a video, mean of {len(seeds)} worlds")
     print(f"{'':22}" + "".join(f"{key:>11}" for key in rows["fused (FGW)"][0]))
@@ -37,7 +37,7 @@ def main(n: int = 1000, seeds: tuple[int, ...] = (0, 1, 2), out: Path = Path("ou
     # the better half of the matches, coloured by height in the left video, so that coherent ones do not mix colours.
     rng = np.random.default_rng(0)
     figure = Figure(figsize=(9, 4), layout="constrained")
-    for ax, (name, matches) in zip(figure.subplots(1, 2), found.items(), strict=True):
+    for ax, (name, matches) in zip(figure.subplots(1, 2), matched.items(), strict=True):
         best = rng.permutation(matches.best(n // 2).pairs)[:120]
         left, right = (t.xyz[:, t.n_frames // 2][:, [0, 2]] for t in (a, b))
         right = right + np.array([1.6 * np.ptp(np.quantile(left[:, 0], (0.05, 0.95))), 0])

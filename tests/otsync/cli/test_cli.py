@@ -105,7 +105,9 @@ def test_every_optional_package_names_the_extra_that_brings_it():
     sold_as = {"cv2": "opencv-contrib-python-headless", "PIL": "pillow", "ott": "ott-jax", "jax": "ott-jax"}
     for package, extra in EXTRAS.items():
         assert any(re.match(r"[\w-]+", line)[0] == sold_as.get(package, package) for line in extras[extra]), package
-    optional = {re.match(r"[\w-]+", line)[0] for name in extras if name not in ("test", "docs") for line in extras[name]}
+    optional = {
+        re.match(r"[\w-]+", line)[0] for name in extras if name not in ("test", "docs") for line in extras[name]
+    }
     assert {sold_as.get(package, package) for package in EXTRAS} == optional - {"otsync"}
 
 
