@@ -7,11 +7,15 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from ..plugins import available
 from ..progress import tell
+
+if TYPE_CHECKING:
+    from ..recordings.stages import Stages
 
 
 @dataclass
@@ -77,6 +81,15 @@ class Check:
         return 1 if errors else 0
 
 
+def prior(option: str) -> Any:
+    """The type of a slot of priors: a name, with fields where it has some; the names there are stand in the help."""
+    from ..recordings.stages import PRIORS
+
+    _, group, own = PRIORS[option]
+    names = "|".join(available(group, own))
+    return Annotated[str | None, tyro.conf.arg(metavar=f"{names}[:FIELD=VALUE,...]")]
+
+
 @dataclass(frozen=True)
 class RecordingOptions:
     """How ``otsync sync`` treats a recording."""
@@ -89,8 +102,26 @@ class RecordingOptions:
     """Folder where stages are kept; default: stages in --out."""
     allow_outside: bool = False
     """Let the scene name files outside its folder."""
+    masks: prior("masks") = None
+    """What moves, where the scene has no masks."""
+    points: prior("points") = None
+    """The tracker of points."""
+    features: prior("features") = None
+    """What describes a track."""
     workers: int = 0
     """Threads; 0: one per core."""
+
+    def stages(self) -> Stages:
+        """The objects of every stage. ValueError names a prior that there is not."""
+        from ..recordings.stages import stages_from
+
+        return stages_from(masks=self.masks, points=self.points, features=self.features)
+
+    def threads(self) -> int:
+        """How many threads. ValueError for fewer than none."""
+        if self.workers < 0:
+            raise ValueError(f"--recording.workers: expected 0 (one per core) or more; found {self.workers}.")
+        return self.workers or os.cpu_count() or 1
 
 
 def sync_recording(
@@ -110,6 +141,7 @@ def sync_recording(
     from ..report.frames import write_recording_report
     from .tables import flagged, print_json, table, true_offsets, with_errors
 
+    stages, threads = options.stages(), options.threads()  # before the work, not after it
     scene = open_scene(path, allow_outside=options.allow_outside)
     if options.cameras:
         scene = scene.take(options.cameras)
@@ -123,10 +155,11 @@ def sync_recording(
         known = known - known[chosen]
     for note in scene.notes:
         tell(f"note: {note}")
-    with ThreadPoolExecutor(options.workers or os.cpu_count() or 1) as pool:
+    with ThreadPoolExecutor(threads) as pool:
         found = synchronize_scene(
             scene,
             route=options.route,
+            stages=stages,
             reference=chosen,
             cache=Cache(options.cache or out / "stages"),
             map=pool.map,

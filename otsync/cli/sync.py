@@ -73,6 +73,11 @@ class Sync:
         refuse_unused(self, ("recording",), "synchronising track sets")
         if len(self.tracks) < 2:
             raise ValueError(f"tracks: expected at least two .npz files; found {len(self.tracks)}.")
+        words = [str(path) for path in self.tracks if str(path).startswith(("matcher:", "aligner:", "refiner:"))]
+        if words:
+            raise ValueError(
+                f"{words[0]}: expected an algorithm that there is, after the options; otsync sync --help lists them."
+            )
         tracks = [TrackSet.load(path) for path in self.tracks]
         names = unique_names(tracks)
         reference: int | Literal["auto"] = 0

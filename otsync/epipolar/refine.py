@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from ..clocks.common import in_space, nominal_fps, on_clock
 from ..clocks.splines import TrackSplines
 from ..geometry import fundamentals, seen_pixels
-from ..refine.slot import Refiner
+from ..refine.slot import JUDGED_BY, Refiner
 from ..types import Alignment, Matches, Status, TrackSet, in_order
 from ..types.trust import Trust
 from .scan import MAD, EpipolarScan, unit_of
@@ -70,6 +70,9 @@ class EpipolarRefine(Refiner):
     trust: Trust = field(default_factory=lambda: Trust(evidence=1.0))
 
     needs_xyz = False
+
+    def __post_init__(self) -> None:
+        self.trust.check("EpipolarRefine.trust", JUDGED_BY)
 
     def __call__(self, a: TrackSet, b: TrackSet, matches: Matches, alignment: Alignment) -> Alignment:
         if not np.isfinite(alignment.offset) or len(matches) == 0:

@@ -235,4 +235,6 @@ def on_device(device: str | None, *arrays: np.ndarray) -> list[Any]:
     try:
         return [torch.as_tensor(x, device=device) for x in arrays]
     except (RuntimeError, AssertionError) as error:  # no such device, or none of it here
-        raise ValueError(f"device: expected one that torch can use; found {device!r}: {str(error).splitlines()[0]}") from None
+        raise ValueError(
+            f"device: expected one that torch can use; found {device!r}: {str(error).splitlines()[0]}"
+        ) from None

@@ -254,7 +254,7 @@ def lift_given(
         if len(best) == 0:
             raise ValueError(
                 f"video {video.name}: expected depth where things move; no track could be lifted. Check the depth "
-                "maps' scale and holes (otsync check), or use --route epipolar."
+                "maps' scale and holes (otsync check), or use --recording.route epipolar."
             )
         return best
 
