@@ -23,7 +23,7 @@ from recon.fit.verb import LOSSES, fit
 from recon.footage.depth import Depths
 from recon.footage.footage import Footage
 from recon.motion import ScaffoldOptions, build_scaffold
-from recon.observe.effects import with_declared
+from recon.observe.recorded import with_declared
 from recon.scene.gaussians4d import Gaussians4D
 from recon.scene.seed import Seeding, moments
 from recon.scene.seed import seed as seeded
