@@ -7,11 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from recon.observe import EFFECTS
+from recon.observe.recorded import all_effects
 from recon.scene import groups
 from recon.scene.groups import Group, by_name, initial_rates
 
@@ -45,9 +47,37 @@ class Decay:
         return float(self.last ** max(0.0, (progress - self.hold) / (1 - self.hold)))
 
 
+def rates_on(option: str) -> Any:
+    """Tells the shell to take rates as GROUP=RATE; groups that are not named keep their initial rates."""
+    from tyro.constructors import PrimitiveConstructorSpec
+
+    def parsed(texts: list[str]) -> dict[str, float]:
+        rates = initial_rates(every_group().values())
+        for text in texts:
+            name, _, rate = text.partition("=")
+            try:
+                rates[name] = float(rate)
+            except ValueError:
+                raise ValueError(f"{option}: expected GROUP=RATE; found {text!r}.") from None
+        return rates
+
+    return PrimitiveConstructorSpec(
+        nargs="*",
+        metavar="[GROUP=RATE ...]",
+        instance_from_str=parsed,
+        is_instance=lambda given: given is None or isinstance(given, Mapping),
+        str_from_instance=lambda rates: [f"{k}={v:g}" for k, v in (RATES if rates is None else rates).items()],
+    )
+
+
+def every_group() -> dict[str, Group]:
+    """Our own parameter groups, and those of every effect that there is."""
+    return DECLARED | by_name(group for effect in all_effects().values() for group in effect.groups)
+
+
 def check_rates(rates: Mapping[str, float], groups: Mapping[str, Tensor]) -> dict[str, float]:
     """Rates of the groups that there are. ValueError for names that no model has, and for negative rates."""
-    known = set(groups) | set(RATES)
+    known = set(groups) | set(every_group())
     unknown = [name for name in rates if name not in known]
     if unknown:
         raise ValueError(f"rates: expected groups among {', '.join(sorted(known))}; found {', '.join(unknown)}.")
@@ -70,6 +100,8 @@ class Adam:
         frame_step: float,
         declared: Mapping[str, Group] = DECLARED,
     ):
+        """declared: what tells the units of the rates, by group; one that is not declared is stepped as it is."""
+
         def unit(name: str) -> float:
             return declared[name].scale(footprint, frame_step) if name in declared else 1.0
 

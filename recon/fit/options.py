@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated, Any
 
-import tyro
-
 from otsync.plugins import named
-from otsync.types.checks import check_number, check_whole
+from otsync.types.checks import check_number, check_whole, positive
 from recon.fit.densify import Densify
-from recon.fit.optimize import DECLARED, RATES, rates_on, without
-from recon.losses import LOSSES, Acceleration, Arap, ImageLoss, Length, Loss, Mask, MotionLoss, Photometric
-from recon.losses import ScaleHinge, Velocity
+from recon.fit.optimize import DECLARED, rates_on, without
+from recon.losses import (
+    LOSSES,
+    Acceleration,
+    Arap,
+    ImageLoss,
+    Length,
+    Loss,
+    Mask,
+    MotionLoss,
+    Photometric,
+    ScaleHinge,
+    Velocity,
+)
 from recon.observe import EFFECTS, Effect
 from recon.scene.groups import Group, by_name, initial_rates
 
@@ -38,21 +48,17 @@ class FitOptions:
     losses: Annotated[tuple[Loss, ...], named("losses", LOSSES, "--losses")] = DEFAULT_LOSSES
     """What the fit minimises; what is not listed is not computed."""
     effects: Annotated[tuple[Effect, ...], named("effects", EFFECTS, "--effects")] = ()
-    """Effects of the cameras on the light, the one nearest to the scene first; what is not listed is not computed. Of a
-    recording, the shutters that its cameras declare and the gains of its static part are added by themselves."""
+    """Effects of the cameras on the light, nearest to the scene first; a recording adds declared shutters and gains."""
     rates: Annotated[Mapping[str, float] | None, rates_on("--rates")] = None
-    """Learning rate of each parameter group at the start. From Python: of all groups that are fitted. On the command
-    line: GROUP=RATE of those that differ from the default."""
+    """Learning rates at the start. Python: of all groups that are fitted. Command line: of those that shall differ."""
     freeze: tuple[str, ...] = ()
     """Parameter groups that stay as they are: offsets, gain, knots, ..."""
     steps: int | None = None
     """Length of the fit in steps: the result is then the same on any machine of a kind."""
     budget: float | None = None
-    """Length of the fit in wall seconds, instead of steps, once everything is prepared: turned into a number of steps when
-    the first ones have shown their speed (120 at the least)."""
+    """Length of the fit in wall seconds instead of steps, once everything is prepared; 120 steps at the least."""
     batch: int = 2
-    """Images a step. On a CPU each is rendered on a thread of its own; on a GPU all are one rendering, unless an effect asks
-    for other instants or the scene is drawn together with its static part."""
+    """Images a step: on a CPU each on a thread of its own, on a GPU in one rendering where effects allow it."""
     densify: Densify | None = None
     """Split the Gaussians that are pulled hardest, drop those that are faint; off unless asked for."""
     seed: int = 0
@@ -66,7 +72,7 @@ class FitOptions:
         _check_kinds("losses", self.losses, (ImageLoss, MotionLoss), "recon.losses.ImageLoss or MotionLoss")
         _check_kinds("effects", self.effects, (Effect,), "recon.observe.Effect")
         for loss in self.losses:
-            check_number(f"losses: weight of {type(loss).__name__}", loss.weight)
+            check_number(f"losses: weight of {type(loss).__name__}", loss.weight, above=-math.inf)
         if self.steps is not None and self.budget is not None:
             raise ValueError("steps, budget: expected one of them; found both.")
         if self.steps is not None:
@@ -74,7 +80,7 @@ class FitOptions:
         if self.budget is not None:
             check_number("budget", self.budget)
         check_whole("batch", self.batch, 1)
-        check_number("save_every", self.save_every, above=-1e-9)
+        positive("save_every", self.save_every, zero=True)
         if self.densify is not None and any(isinstance(x, ImageLoss) and x.reads == "tracks" for x in self.losses):
             raise ValueError(
                 "losses, densify: expected one of Track and densification; found both. Tracks are tied to Gaussians, which "

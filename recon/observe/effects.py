@@ -385,7 +385,11 @@ def _of_video(seconds: float | tuple[float, ...], video: int) -> float:
 
 
 def _of_one(seconds: float | tuple[float, ...], video: int | None) -> float | None:
-    return seconds if not isinstance(seconds, tuple) else None if video is None else seconds[video]
+    if not isinstance(seconds, tuple) or video is None:
+        return None if isinstance(seconds, tuple) else seconds
+    if video >= len(seconds):
+        raise ValueError(f"effects: expected seconds of every video; found {len(seconds)}, none for video {video}.")
+    return seconds[video]
 
 
 def _check_seconds(name: str, seconds: float | tuple[float, ...]) -> None:

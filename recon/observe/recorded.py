@@ -17,7 +17,9 @@ def all_effects() -> dict[str, type[Effect]]:
     effects = available("effects", EFFECTS)
     for name, kind in effects.items():
         if not (isinstance(kind, type) and issubclass(kind, Effect)):
-            raise ValueError(f"effects: expected classes that inherit from recon.observe.Effect; found {name}: {kind!r}.")
+            raise ValueError(
+                f"effects: expected classes that inherit from recon.observe.Effect; found {name}: {kind!r}."
+            )
     return effects
 
 
