@@ -105,7 +105,7 @@ def compared(
     """
     learned = fitted.parameters
     gains = learned["gain"].detach().cpu().numpy().astype(float)
-    gains = np.broadcast_to(gains, (len(gains), 3))
+    gains = np.broadcast_to(gains, (len(gains), 3)).copy()
     clocks = [
         Clock(float(s), float(r), "fitted") for s, r in zip(fitted.offsets.seconds, fitted.offsets.rates, strict=True)
     ]
