@@ -198,7 +198,7 @@ def test_frozen_offsets_stay(world, start, done, tmp_path):
     shutil.copytree(done[1] / "stages", tmp_path / "stages")
     outcome = reconstruct(open_scene(world), start, tmp_path, plan=quick(3, freeze=("offsets",)), held_out=("held0",))
     np.testing.assert_array_equal(outcome.fitted.offsets.seconds, np.zeros(CAMERAS))
-    with pytest.raises(ValueError, match="groups: expected some of"):
+    with pytest.raises(ValueError, match="freeze: expected some of"):
         reconstruct(open_scene(world), start, tmp_path, plan=quick(3, freeze=("clocks",)), held_out=("held0",))
 
 
