@@ -11,7 +11,7 @@ from typing import Literal
 import tyro
 
 from otsync.cli.slots import one_of
-from otsync.plugins import available
+from otsync.plugins import available, made
 from otsync.progress import counted, tell
 from recon.cli.common import opened, print_json
 from recon.cli.tables import view_table
@@ -187,7 +187,7 @@ class Export:
         from recon.result.export import export, frame_times
         from recon.result.folder import load_result
 
-        exporter = available("exporters", EXPORTERS)[self.format]
+        exporter = made(self.format, available("exporters", EXPORTERS), "--format")
         if self.at is not None and exporter.holds != "moment":
             raise ValueError(
                 f"--at: expected with a format that holds one moment; found {self.format}, which does not."
