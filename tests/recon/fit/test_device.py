@@ -257,7 +257,7 @@ def test_a_gpu_without_gsplat_says_what_to_install(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "gsplat" else find(name))
     with pytest.raises(ValueError, match=r"expected gsplat, which renders on 'cuda:1'.* pip install 'otsync\[cuda\]'"):
         device_of("cuda:1")
-    with pytest.raises(ValueError, match=r"there \(cpu, cuda:0, cuda:1\); found 'cuda:2'"):
+    with pytest.raises(ValueError, match=r"one of cpu, cuda:0, cuda:1; found 'cuda:2'"):
         device_of("cuda:2")
 
 
