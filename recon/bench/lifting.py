@@ -130,9 +130,7 @@ def run(
 
 def tables(rows: Sequence[Row], cost: Row) -> str:
     """The figures of :func:`run` as text."""
-    return (
-        f"Precision within {MATCH_RADIUS:g} m at the true time, by angle between the cameras:\n{table(rows)}\n{table([cost])}"
-    )
+    return f"Precision within {MATCH_RADIUS:g} m at the true time, by angle between the cameras:\n{table(rows)}\n{table([cost])}"
 
 
 def sources_of(
