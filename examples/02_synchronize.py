@@ -21,7 +21,7 @@ def main(
     # Everything has a default; each stage is a slot: synchronize(tracks, matcher=..., aligner=..., refiner=...)
     offsets = synchronize(tracks)
 
-    errors = offset_error(offsets.seconds, truth.offsets, fps=offsets.fps[0])
+    errors = offset_error(offsets.seconds, truth.offsets, fps=offsets.fps[0]).errors
     for v, name in enumerate(offsets.names):
         print(
             f"{name}: {offsets.frames[v]:8.3f} frames (true {truth.offsets[v] * offsets.fps[0]:8.3f}, "

@@ -10,9 +10,10 @@ import tyro
 from otsync.io import open_scene
 from otsync.progress import Progress
 from otsync.types import Offsets, TrackSet
+from recon.fit import FitOptions
 from recon.pipeline.plan import Plan
 from recon.pipeline.verb import reconstruct
-from recon.result.export import export, frame_times
+from recon.result.export import Ply, Tracks, export, frame_times
 from recon.result.folder import load_result
 from recon.result.images import rendered
 from recon.result.video import write_images
@@ -30,19 +31,18 @@ def main(out: Path = Path("out/reconstruct"), steps: int = 700, seed: int = 1) -
     scene, start, truth = open_scene(world), Offsets.load(world / "start.json"), Offsets.load(world / "truth.json")
     tracks = [TrackSet.load(path) for path in sorted((world / "tracks").glob("*.npz"))]  # or None: tracked for you
 
-    # Every choice is an object in a slot: Plan(losses=..., effects=..., scaffold=..., densify=...)
+    # Every choice is an object in a slot: Plan(scaffold=..., fit=FitOptions(losses=..., effects=..., densify=...))
     outcome = reconstruct(
         scene,
         start,
         out / "result",
-        plan=Plan(width=160, backdrop_steps=300),
+        plan=Plan(width=160, backdrop_steps=300, fit=FitOptions(steps=steps)),
         tracks=tracks,
         held_out=("held0",),
         truth=truth,
-        steps=steps,
         progress=Progress(print),
     )
-    offsets = outcome.found.offsets
+    offsets = outcome.fitted.offsets
     for name, before, after, true in zip(
         offsets.names, outcome.coarse.frames, offsets.frames, outcome.truth, strict=True
     ):
@@ -55,8 +55,8 @@ def main(out: Path = Path("out/reconstruct"), steps: int = 700, seed: int = 1) -
     times = frame_times(result.scene, fps=30)
     write_images(rendered(result, times, "held0"), out / "held0.mp4")
     write_images(rendered(result, [0.4] * 60, width=240), out / "orbit.mp4")  # a frozen moment from all sides
-    export(result.scene, "tracks", out / "tracks.npz", times)
-    export(result.scene, "ply", out / "moment.ply", [0.4])
+    export(result.scene, Tracks(), out / "tracks.npz", times)
+    export(result.scene, Ply(), out / "moment.ply", [0.4])
     print(f"wrote {out / 'orbit.mp4'}, {out / 'tracks.npz'}, {out / 'moment.ply'}, {out / 'result' / 'report.html'}")
 
 

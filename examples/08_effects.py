@@ -1,4 +1,4 @@
-"""What an effect costs when it is ignored, and what when it is modelled: a scene calls for some, and pays for those alone.
+"""The cost of an effect that is ignored, and of one that is modelled: a scene pays for those that it calls for.
 
     python examples/08_effects.py --effect rolling --seeds 201 202 203 --steps 800
 
@@ -13,11 +13,12 @@ import time
 
 import numpy as np
 
+from otsync.metrics import offset_error
 from otsync.types import Clock, Offsets
-from recon.evaluate.figures import offset_error
 from recon.evaluate.views import view
 from recon.fit.verb import fit
-from recon.observe.effects import MotionBlur, optics, with_declared
+from recon.observe.effects import MotionBlur
+from recon.observe.recorded import optics, with_declared
 from recon.scene.seed import Seeding
 from recon.simulate.capture import Capture, synthetic
 from recon.simulate.effects import Blur, Rolling, Sheen
@@ -27,7 +28,7 @@ FILMED = {"none": (), "rolling": (Rolling(0.025),), "blur": (Blur(0.025),), "she
 
 
 def modelled(effect: str, capture: Capture) -> tuple[tuple, Seeding]:
-    """What the fit is given: effects of cameras in its tuple, colours that depend on the view as room for harmonics."""
+    """The fit's model: effects of cameras in its tuple, colours that depend on the view as room for harmonics."""
     if effect == "rolling":  # the cameras declare it
         return with_declared((), [f.readout for f in capture.footage]), Seeding()
     if effect == "blur":
@@ -48,12 +49,12 @@ def main() -> None:
         for name, (effects, seeding) in {"with": modelled(args.effect, capture), "without": ((), Seeding())}.items():
             scene = initial_scene(capture, believed, seeding=seeding)
             started = time.process_time()
-            found = fit(scene, capture.footage, believed, effects=effects, steps=args.steps)
+            fitted = fit(scene, capture.footage, believed, effects=effects, steps=args.steps)
             seconds = time.process_time() - started
-            error = offset_error(found.offsets.seconds, capture.offsets, capture.frame_step)
+            error = offset_error(fitted.offsets.seconds, capture.offsets, 1 / capture.frame_step)
             held = capture.held_out[0]  # what is ignored in the fit is ignored in the view
             through = optics(effects, held.readout) if effects else ()
-            looking = view(found.scene, held, Clock(0.0), gain=np.ones(3), optics=through)
+            looking = view(fitted.scene, held, Clock(0.0), gain=np.ones(3), optics=through)
             score = looking.score(most=24, pictures=0).mean
             print(
                 f"{seed:4}  {name:8}  {error.mean:14.4f} {error.max:9.4f} {score['psnr']:22.2f} "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -54,14 +55,29 @@ def match_quality(
     }
 
 
+@dataclass(frozen=True, eq=False)
+class OffsetError:
+    """Errors of offsets in frames of the reference, once the gauge is fixed.
+
+    Args:
+        errors: (V,) signed, nan where there is no estimate; a positive one says that the video is placed too late.
+        mean, max: of their absolute values, over the videos that have an estimate; of the gauge "reference" without the
+            reference itself, whose error is zero by definition. nan when there are none.
+    """
+
+    errors: Float[np.ndarray, " V"]
+    mean: float
+    max: float
+
+
 def offset_error(
     seconds: Sequence[float] | Float[np.ndarray, " V"],
     truth: Sequence[float] | Float[np.ndarray, " V"],
     fps: float,
     gauge: Literal["reference", "median"] = "reference",
     reference: int = 0,
-) -> Float[np.ndarray, " V"]:
-    """Signed errors of estimated offsets, one a video, in frames of the reference.
+) -> OffsetError:
+    """Errors of estimated offsets, one a video, in frames of the reference.
 
     Offsets are known up to a common shift only, so the gauge is fixed first.
 
@@ -71,9 +87,6 @@ def offset_error(
         fps: of the reference.
         gauge: "reference": the ``reference`` video is right by definition (all nan when it has no estimate).
             "median": the median error of all videos is zero; for methods that let every offset move.
-
-    Returns:
-        (V,) errors, nan where there was no estimate. A positive one says that the video is placed too late.
     """
     est, true = np.asarray(seconds, float), np.asarray(truth, float)
     if est.ndim != 1 or est.shape != true.shape:
@@ -86,8 +99,14 @@ def offset_error(
     if gauge == "reference":
         if not 0 <= reference < len(error):
             raise ValueError(f"reference: expected the index of one of {len(error)} videos; found {reference}.")
-        return error - error[reference]
-    if gauge != "median":
+        error = error - error[reference]
+        counted = np.isfinite(error) & (np.arange(len(error)) != reference)
+    elif gauge == "median":
+        known = error[np.isfinite(error)]
+        error = error - (np.median(known) if len(known) else np.nan)
+        counted = np.isfinite(error)
+    else:
         raise ValueError(f"gauge: expected 'reference' or 'median'; found {gauge!r}.")
-    known = error[np.isfinite(error)]
-    return error - (np.median(known) if len(known) else np.nan)
+    size = np.abs(error[counted])
+    mean, largest = (float(size.mean()), float(size.max())) if len(size) else (float("nan"), float("nan"))
+    return OffsetError(error, mean, largest)

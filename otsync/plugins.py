@@ -18,6 +18,7 @@ import os
 import re
 import sys
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import fields, is_dataclass
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, TypeVar
@@ -115,7 +116,7 @@ def made(text: str, choices: Mapping[str, Any], what: str) -> Any:
     if name not in choices:
         raise ValueError(f"{what}: expected some of {', '.join(choices)}; found {name!r}.")
     thing, fields = choices[name], {}
-    for part in filter(None, rest.split(",")):
+    for part in filter(None, re.split(r",(?![^(\[]*[)\]])", rest)):  # commas within brackets are the value's own
         field, equals, value = part.partition("=")
         if not equals:
             raise ValueError(f"{what}: expected {name}:field=value,field=value; found {text!r}.")
@@ -134,6 +135,34 @@ def _value(text: str) -> Any:
         return ast.literal_eval(text)
     except (ValueError, SyntaxError):
         return text
+
+
+def spelled(thing: Any, choices: Mapping[str, Any]) -> str:
+    """How the shell spells an object: what :func:`made` makes it of, as far as numbers, words and tuples tell."""
+    kind = type(thing)
+    name = next((n for n, choice in choices.items() if choice is kind or choice is thing), short_name(kind))
+    own = fields(thing) if is_dataclass(thing) else ()
+    told = {f.name: getattr(thing, f.name) for f in own if f.init and getattr(thing, f.name) is not f.default}
+    values = ",".join(f"{k}={v}".replace(" ", "") for k, v in told.items())
+    return f"{name}:{values}" if values else name
+
+
+def named(group: str, own: Iterable[Any], option: str) -> Any:
+    """Tells the shell to take a tuple of things of a group by name, as :func:`made` spells them.
+
+    For a field of a dataclass: ``losses: Annotated[tuple[Loss, ...], named("losses", LOSSES, "--losses")]``. Where
+    annotations are evaluated late, plugins are among the names. ``option`` stands in errors.
+    """
+    from tyro.constructors import PrimitiveConstructorSpec
+
+    choices = available(group, own)
+    return PrimitiveConstructorSpec(
+        nargs="*",
+        metavar=f"[{{{'|'.join(choices)}}}[:FIELD=VALUE,...] ...]",
+        instance_from_str=lambda texts: tuple(made(text, choices, option) for text in texts),
+        is_instance=lambda given: isinstance(given, tuple),
+        str_from_instance=lambda things: [spelled(thing, choices) for thing in things],
+    )
 
 
 def forget(*things: Any) -> None:

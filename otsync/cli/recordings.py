@@ -133,7 +133,7 @@ def sync_recording(
     truth: Path | None = None,
     as_json: bool = False,
 ) -> int:
-    """``otsync sync SCENE``: offsets.json, run.json and report.html in ``out``. Exit code 1 when an answer is flagged."""
+    """``otsync sync SCENE``: offsets.json, sync.json and report.html in ``out``. Exit code 1 when an answer is flagged."""
     from ..files.arrays import write_json
     from ..files.cache import Cache
     from ..io import open_scene
@@ -166,11 +166,11 @@ def sync_recording(
             tell=tell,
         )
     found.offsets.save(out / "offsets.json")
-    write_json(out / "run.json", {"route": found.route, "why": list(found.why), "seconds": found.seconds})
+    write_json(out / "sync.json", {"route": found.route, "why": list(found.why), "seconds": found.seconds})
     write_recording_report(out / "report.html", scene, found, truth=None if known is None else list(known))
     if as_json:
         print_json({"route": found.route, "why": list(found.why), **with_errors(found.offsets, known)})
     else:
         print(table(found.offsets, known))
-        print(f"route {found.route}; wrote {out / 'offsets.json'}, {out / 'run.json'} and {out / 'report.html'}")
+        print(f"route {found.route}; wrote {out / 'offsets.json'}, {out / 'sync.json'} and {out / 'report.html'}")
     return flagged(found.offsets)

@@ -98,12 +98,20 @@ def parsed(prog: str, commands: Mapping[str, Load], args: list[str], description
     if chosen in commands:  # the others stay unloaded
         return tyro.cli(commands[chosen](), prog=f"{prog} {chosen}", args=args[1:])
     return tyro.extras.subcommand_cli_from_dict(
-        {name: load() for name, load in commands.items()},
+        {name: _listed(name, load) for name, load in commands.items()},
         prog=prog,
         description=description,
         args=args,
         config=(tyro.conf.AvoidSubcommands,) if not args else (),
     )
+
+
+def _listed(name: str, load: Load) -> Callable[..., Any]:
+    """A command for the list of all; one whose packages are not installed says what to install."""
+    try:
+        return load()
+    except ModuleNotFoundError as error:
+        return type(name, (), {"__doc__": f"Not installed: {missing_package(error)}"})
 
 
 def shared_options(args: list[str]) -> list[str] | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Annotated, Any, Union
+from typing import Annotated, Any, Literal, Union
 
 import tyro
 
@@ -27,6 +27,11 @@ def slot(group: str, own: Iterable[Any], *, optional: bool = False) -> Any:
                 Annotated[type(name, (), {}), tyro.conf.subcommand(name, constructor=_maker(thing), description=about)]
             )
     return Union[tuple(choices)]  # noqa: UP007  a union that is built as the program runs
+
+
+def one_of(group: str, own: Iterable[Any]) -> Any:
+    """The type of a dataclass field that takes the name of a thing of a group, ours or a plugin's."""
+    return Literal[tuple(available(group, own))]  # built as the program runs
 
 
 def _maker(thing: Any) -> Any:

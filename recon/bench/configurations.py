@@ -8,19 +8,25 @@ w/o scaffold          every Gaussian on a spline of its own
 scaffold per video    the paper's: every video's nodes on that video's clock
 Sync-NeRF style       images alone: no priors on motion, and from offsets that no geometric stage has found
 Dynamic3DGaussians    true offsets, every Gaussian free in every frame
+without LOSS          ours, without a loss of the default ones
+with LOSS             ours, with another loss that there is, a plugin's too
+with EFFECT           ours, with an effect that a plugin adds
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
-from recon.fit.optimize import RATES, without
-from recon.fit.problem import Loss
-from recon.fit.verb import LOSSES
-from recon.losses.image import Mask, Photometric, ScaleHinge
-from recon.motion import PerGaussian, Sampled, Scaffold, ScaffoldOptions
+from otsync.plugins import available
+from recon.fit.options import DEFAULT_LOSSES
+from recon.losses import LOSSES, Loss, Mask, Photometric, ScaleHinge
+from recon.motion import PerGaussian, Sampled, Scaffold
+from recon.observe import EFFECTS, Effect
+from recon.observe.recorded import all_effects
+from recon.pipeline.plan import Plan
+from recon.pipeline.readings import SUPPLIED
 from recon.scene.gaussians4d import Gaussians4D
 
 Start = Literal["given", "true"]
@@ -62,26 +68,83 @@ class Configuration:
 
     Args:
         start: offsets that everything is built from: those given, or the truth.
-        scaffold: how the motion is built. motion: what becomes of it before the fit.
-        rates, losses: of the fit.
+        change: what the row does otherwise than the plan of all rows.
+        motion: what becomes of the motion before the fit.
     """
 
     start: Start = "given"
-    scaffold: ScaffoldOptions = field(default_factory=ScaffoldOptions)
+    change: Callable[[Plan], Plan] = lambda plan: plan
     motion: Callable[[Gaussians4D], Gaussians4D] = as_built
-    rates: Mapping[str, float] = field(default_factory=lambda: RATES)
-    losses: tuple[Loss, ...] = LOSSES
 
 
-HELD = without(RATES, "offsets")
+def held(plan: Plan) -> Plan:
+    """The offsets stay as they are."""
+    return replace(plan, fit=replace(plan.fit, freeze=(*(g for g in plan.fit.freeze if g != "offsets"), "offsets")))
 
-CONFIGURATIONS: Mapping[str, Configuration] = {
+
+def per_video(plan: Plan) -> Plan:
+    """A scaffold on every video's own clock."""
+    return replace(plan, scaffold=replace(plan.scaffold, per_video=True))
+
+
+def images_alone(plan: Plan) -> Plan:
+    """No losses on the motion."""
+    return replace(plan, fit=replace(plan.fit, losses=(Photometric(), Mask(), ScaleHinge())))
+
+
+def without_loss(kind: type[Loss]) -> Callable[[Plan], Plan]:
+    """The losses of the plan but for those of a class."""
+
+    def change(plan: Plan) -> Plan:
+        rest = tuple(loss for loss in plan.fit.losses if type(loss) is not kind)
+        if len(rest) == len(plan.fit.losses):
+            raise ValueError(f"rows: expected a loss of the plan to leave out; {kind.__name__} is none of them.")
+        return replace(plan, fit=replace(plan.fit, losses=rest))
+
+    return change
+
+
+def with_loss(kind: type[Loss]) -> Callable[[Plan], Plan]:
+    """The losses of the plan, and one more at its defaults."""
+
+    def change(plan: Plan) -> Plan:
+        if any(type(loss) is kind for loss in plan.fit.losses):
+            raise ValueError(f"rows: expected a loss to add; {kind.__name__} is among those of the plan already.")
+        return replace(plan, fit=replace(plan.fit, losses=(*plan.fit.losses, kind())))
+
+    return change
+
+
+def with_effect(kind: Callable[[], Effect]) -> Callable[[Plan], Plan]:
+    """The effects of the plan, and one more at its defaults."""
+
+    def change(plan: Plan) -> Plan:
+        return replace(plan, fit=replace(plan.fit, effects=(*plan.fit.effects, kind())))
+
+    return change
+
+
+OWN: Mapping[str, Configuration] = {
     "ours": Configuration(),
-    "fixed": Configuration(rates=HELD),
-    "true time": Configuration(start="true", rates=HELD),
-    "w/o spline": Configuration(motion=sampled, rates=HELD),
+    "fixed": Configuration(change=held),
+    "true time": Configuration("true", held),
+    "w/o spline": Configuration(change=held, motion=sampled),
     "w/o scaffold": Configuration(motion=per_gaussian),
-    "scaffold per video": Configuration(scaffold=ScaffoldOptions(per_video=True)),
-    "Sync-NeRF style": Configuration(losses=(Photometric(), Mask(), ScaleHinge())),
-    "Dynamic3DGaussians": Configuration(start="true", motion=per_gaussian_sampled, rates=HELD),
+    "scaffold per video": Configuration(change=per_video),
+    "Sync-NeRF style": Configuration(change=images_alone),
+    "Dynamic3DGaussians": Configuration("true", held, per_gaussian_sampled),
 }
+
+
+def configurations() -> dict[str, Configuration]:
+    """Every row that can be measured: our own, and one for each loss and effect that there is, ours or a plugin's."""
+    rows, usual = dict(OWN), {type(loss) for loss in DEFAULT_LOSSES}
+    for name, kind in available("losses", LOSSES).items():
+        if kind in usual:
+            rows[f"without {name}"] = Configuration(change=without_loss(kind))
+        elif getattr(kind, "reads", None) in (None, *SUPPLIED):
+            rows[f"with {name}"] = Configuration(change=with_loss(kind))
+    for name, effect in all_effects().items():
+        if effect not in EFFECTS:
+            rows[f"with {name}"] = Configuration(change=with_effect(effect))
+    return rows

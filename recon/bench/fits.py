@@ -13,33 +13,36 @@ import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
+import tyro
 
 from otsync.bench.record import table, write_rows
 from otsync.files.arrays import atomic_write
 from otsync.io import Scene
+from otsync.metrics import offset_error
 from otsync.progress import Progress
 from otsync.types import Clock, Offsets, TrackSet
-from otsync.types.checks import check_number, check_whole
+from otsync.types.checks import check_whole
 from recon.backdrop.fit import StaticFit
-from recon.bench.configurations import CONFIGURATIONS, Configuration
+from recon.bench.configurations import Configuration, configurations
 from recon.bench.plot import plot
 from recon.bench.rows import KEY, find, measured_before, paper_tables
-from recon.evaluate.figures import acceleration, coherence, following_error, offset_error
+from recon.evaluate.figures import acceleration, coherence, following_error
 from recon.evaluate.lpips import Lpips
 from recon.evaluate.views import view
-from recon.fit.verb import fit
-from recon.observe.effects import Gain, with_declared
+from recon.fit.options import FitOptions
+from recon.fit.verb import Reconstruction, fit
+from recon.observe.effects import Effect
+from recon.observe.recorded import optics, with_declared
 from recon.pipeline.plan import Plan
 from recon.pipeline.prepare import Prepared, prepare
 from recon.scene.device import device_of
 from recon.scene.gaussians4d import Gaussians4D
-from recon.scene.seed import Seeding
 
 Row = dict[str, Any]
 FIGURES = 3
@@ -55,51 +58,45 @@ PUBLISHED = (
 
 @dataclass(frozen=True)
 class Protocol:
-    """What is measured.
+    """How rows are measured. ValueError for options that exclude each other, or that no row would heed."""
 
-    Args:
-        frames: first and last (exclusive) frame of the window.
-        cameras: that train; None: all that are not held out. Depth, and with it the tracks' positions, and the static
-            part always come from all of them: few cameras are few images of what moves, nothing else.
-        amplitudes: frames; errors are drawn uniformly within them, one seed after another.
-        seeds: of the draws.
-        steps: of the fit, of ``batch`` images each; several give every row several times: what accuracy costs.
-        budget: wall seconds instead.
-        width: working pixels. voxel, sh_degree: see :class:`recon.seed.Seeding`.
-        held_out_tracks: share of the tracks that no scaffold sees.
-        device: where the fits run, "cpu" or "cuda"; on a GPU rows tell the most memory that the fit held there.
-    """
-
-    frames: tuple[int, int] | None = None
-    cameras: tuple[str, ...] | None = None
+    plan: Annotated[Plan, tyro.conf.arg(name="")] = field(default_factory=lambda: Plan(views=16))
+    """How every row is reconstructed, but for what it is about. Without --steps and --budget: 2500 steps."""
     held_out: tuple[str, ...] = ()
+    """Names of videos that no fit sees: every row is compared with them."""
+    cameras: tuple[str, ...] | None = None
+    """Names of the videos that train; default: all that are not held out. Depth, and with it the tracks' positions, and the
+    static part always come from all of them: few cameras are few images of what moves, nothing else."""
     amplitudes: tuple[float, ...] = (1.0,)
+    """Frames: errors of the clocks are drawn uniformly within them."""
     seeds: tuple[int, ...] = (0,)
-    steps: tuple[int, ...] = (2500,)
-    budget: float | None = None
-    batch: int = 2
-    width: int = 320
-    voxel: float = Seeding.voxel
-    sh_degree: int = Seeding.sh_degree
+    """Of the draws of these errors: one row each."""
+    lengths: tuple[int, ...] = ()
+    """Several lengths of the fit, instead of --steps: every row is measured at each, to show what accuracy costs."""
     held_out_tracks: float = 0.1
-    backdrop_steps: int = 1500
-    device: str = "cpu"
+    """Share of the tracks that no scaffold sees: the motion is compared with them."""
 
-    def plan(self, **more: Any) -> Plan:
-        """What is done with the recording, as far as all rows agree, and what ``more`` says of one."""
-        return Plan(
-            width=self.width,
-            seeding=Seeding(voxel=self.voxel, sh_degree=self.sh_degree),
-            batch=self.batch,
-            backdrop_steps=self.backdrop_steps,
-            device=self.device,
-            **more,
-        )
+    def __post_init__(self) -> None:
+        fit = self.plan.fit
+        if self.lengths and (fit.steps is not None or fit.budget is not None):
+            raise ValueError("lengths: expected without steps and budget, which say one length; found both.")
+        for steps in self.lengths:
+            check_whole("lengths", steps, 0)
+        if fit.save_every != FitOptions.save_every:
+            raise ValueError("save_every: expected in a single fit; a benchmark keeps whole rows, not parts of a fit.")
+        if not 0 <= self.held_out_tracks < 1:
+            raise ValueError(f"held_out_tracks: expected a share in 0..1; found {self.held_out_tracks}.")
 
     @property
-    def lengths(self) -> tuple[int, ...]:
+    def steps(self) -> tuple[int, ...]:
         """Steps of the fits; 0: as many as the budget allows."""
-        return (0,) if self.budget is not None else self.steps
+        if self.plan.fit.budget is not None:
+            return (0,)
+        return self.lengths or (STEPS if self.plan.fit.steps is None else self.plan.fit.steps,)
+
+
+STEPS = 2500
+"""Steps of a fit that the protocol tells no length of."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,8 +141,8 @@ def material_of(
     from recon.pipeline.intake import only
     from recon.pipeline.stages import backdrop_of_scene, lifted_tracks, read_footage
 
-    if protocol.frames is not None:
-        scene = cut(scene, *protocol.frames)
+    if protocol.plan.frames is not None:
+        scene = cut(scene, *protocol.plan.frames)
     rig = scene.take([n for n in scene.names if n not in protocol.held_out])
     known = only(truth, rig.names)
     with progress.stage("tracks"):
@@ -153,14 +150,14 @@ def material_of(
     if any(v.depth is None for v in rig.videos):
         with progress.stage("depth"):
             every = [range(len(v.frames)) for v in rig.videos]
-            maps = depth_maps(rig, known, every, width=protocol.width, cache=cache, map=map)
+            maps = depth_maps(rig, known, every, width=protocol.plan.width, cache=cache, map=map)
             rig = replace(rig, videos=tuple(replace(v, depth=list(z)) for v, z in zip(rig.videos, maps, strict=True)))
     train, backdrop = rig, None
     if protocol.cameras is not None:
         train = rig.take(protocol.cameras)
         with progress.stage("backdrop"):
-            footage = read_footage(rig, protocol.width, cache, map, progress)
-            backdrop = backdrop_of_scene(rig, tracks, footage, protocol.plan(), cache, progress)
+            footage = read_footage(rig, protocol.plan.width, cache, map, progress)
+            backdrop = backdrop_of_scene(rig, tracks, footage, protocol.plan, cache, progress)
             if backdrop is None:
                 progress.note("the whole rig gave no static part: every row makes one from its training cameras alone")
             else:
@@ -194,11 +191,12 @@ def measure(
     map: Callable[..., Any],
     lpips: Lpips | None = None,
 ) -> Row:
-    """One row: build from the believed offsets, fit (``steps`` as of Protocol.lengths), and hold against the truth."""
+    """One row: build from the believed offsets, fit (``steps`` as of Protocol.steps), and hold against the truth."""
     believed = material.believed(amplitude, seed)
     built_from = believed if configuration.start == "given" else material.truth
-    margin = max(configuration.scaffold.margin, (amplitude + 1) / float(believed.fps[believed.reference]))
-    plan = protocol.plan(scaffold=replace(configuration.scaffold, margin=margin), losses=configuration.losses)
+    plan = replace(configuration.change(protocol.plan), frames=None)  # the material is cut already
+    margin = max(plan.scaffold.margin, (amplitude + 1) / float(believed.fps[believed.reference]))
+    plan = replace(plan, scaffold=replace(plan.scaffold, margin=margin))
     ready = prepare(
         material.scene,
         built_from,
@@ -209,27 +207,21 @@ def measure(
         cache=cache,
         map=map,
     )
-    device = device_of(protocol.device)
+    device = device_of(plan.device)
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
+    effects = with_declared(plan.effects, [f.readout for f in ready.footage], ready.gains)
+    options = replace(plan.fit, effects=effects)
+    options = options if options.budget is not None else replace(options, steps=steps)
     began = time.perf_counter(), time.process_time()
-    found = fit(
-        configuration.motion(ready.initial).to(device),
-        ready.footage,
-        ready.offsets,
-        losses=plan.losses,
-        effects=(*with_declared((), [f.readout for f in ready.footage]), Gain(start=ready.gains)),
-        rates=configuration.rates,
-        steps=None if protocol.budget is not None else steps,
-        budget=protocol.budget,
-        batch=protocol.batch,
-    )
+    fitted = fit(configuration.motion(ready.initial).to(device), ready.footage, ready.offsets, options)
     seconds, cpu = time.perf_counter() - began[0], time.process_time() - began[1]
-    step, at = found.scene.frame_step, [material.truth.names.index(n) for n in found.offsets.names]
-    true, reference = material.truth.seconds[at], found.offsets.reference
-    start = offset_error(ready.offsets.seconds, true, step, reference=reference)
-    error = offset_error(found.offsets.seconds, true, step, reference=reference)
-    free = offset_error(found.offsets.seconds, true, step, gauge="median")
+    at = [material.truth.names.index(n) for n in fitted.offsets.names]
+    true, reference = material.truth.seconds[at], fitted.offsets.reference
+    fps = float(fitted.offsets.fps[reference])
+    start = offset_error(ready.offsets.seconds, true, fps, reference=reference)
+    error = offset_error(fitted.offsets.seconds, true, fps, reference=reference)
+    free = offset_error(fitted.offsets.seconds, true, fps, gauge="median")
     row: Row = {
         "configuration": name,
         "amplitude": amplitude,
@@ -239,25 +231,29 @@ def measure(
         "mean": error.mean,
         "max": error.max,
         "gauge_free": free.mean,
-        "sigma": float(np.nanmedian(found.offsets.sigma) / step),
-        **held_out_figures(found.scene, ready, lpips),
-        **motion_figures(found.scene, ready, material.kept),
-        "images": found.stats["images"],
+        "sigma": float(np.nanmedian(fitted.offsets.sigma) * fps),
+        **held_out_figures(fitted, effects, ready, plan.views, lpips),
+        **motion_figures(fitted.scene, ready, material.kept),
+        "images": fitted.stats["images"],
         "seconds": seconds,
         "cpu_seconds": cpu,
-        "gaussians": len(found.scene),
+        "gaussians": len(fitted.scene),
     }
     if device.type == "cuda":
         row["gpu_gb"] = torch.cuda.max_memory_allocated(device) / 1e9
     return {k: _rounded(v) for k, v in row.items()}
 
 
-def held_out_figures(scene: Gaussians4D, ready: Prepared, lpips: Lpips | None = None) -> Row:
+def held_out_figures(
+    fitted: Reconstruction, effects: Sequence[Effect], ready: Prepared, views: int, lpips: Lpips | None = None
+) -> Row:
     """PSNR, SSIM, LPIPS of cameras that no fit has seen, at their true time: whole images, and where things move."""
     scores = []
     for f in ready.held_out:
-        looking = view(scene, f, ready.clocks.get(f.name, Clock(0.0)), layered=ready.layered)
-        scores.append(looking.score(most=16, pictures=0, lpips=lpips).mean)
+        through = optics(effects, f.readout, None, fitted.parameters)
+        clock = ready.clocks.get(f.name, Clock(0.0))
+        looking = view(fitted.scene, f, clock, layered=ready.layered, optics=through)
+        scores.append(looking.score(most=views, pictures=0, lpips=lpips).mean)
     keys = ("psnr", "ssim", "lpips", "mask_psnr", "mask_ssim")
     return {k: float(np.mean([s.get(k, math.nan) for s in scores])) if scores else math.nan for k in keys}
 
@@ -328,40 +324,38 @@ def run(
     """
     from otsync.files.cache import Cache
 
-    unknown = [r for r in rows if r not in CONFIGURATIONS]
+    choices = configurations()
+    unknown = [r for r in rows if r not in choices]
     if unknown:
-        raise ValueError(f"rows: expected some of {', '.join(CONFIGURATIONS)}; found {', '.join(unknown)}.")
-    protocol.plan()  # says what is wrong before the work, not after it
-    for steps in protocol.steps:
-        check_whole("steps", steps, 0)
-    if protocol.budget is not None:
-        check_number("budget", protocol.budget)
+        raise ValueError(f"rows: expected some of {', '.join(choices)}; found {', '.join(unknown)}.")
+    for name_of_row in rows:
+        choices[name_of_row].change(protocol.plan)  # says what is wrong before the work, not after it
     kept, progress, lpips = Cache(cache or out / "stages"), Progress(tell), lpips or Lpips()
     description = about(protocol, scene, truth)
-    found = measured_before(out, description)
+    known = measured_before(out, description)
     wanted = [
         (row, amplitude, seed, steps)
         for amplitude in protocol.amplitudes
         for seed in protocol.seeds
         for row in rows
-        for steps in protocol.lengths
-        if find(found, (row, amplitude, seed, steps), lpips.network is not None) is None
+        for steps in protocol.steps
+        if find(known, (row, amplitude, seed, steps), lpips.network is not None) is None
     ]
-    if found:
-        tell(f"{len(found)} rows are kept from an earlier run; {len(wanted)} are to be measured")
+    if known:
+        tell(f"{len(known)} rows are kept from an earlier run; {len(wanted)} are to be measured")
     if wanted:
         with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
             material = material_of(scene, truth, protocol, kept, pool.map, progress)
             for which in wanted:
-                row = measure(which[0], CONFIGURATIONS[which[0]], material, protocol, *which[1:], kept, pool.map, lpips)
-                found = [r for r in found if tuple(r[k] for k in KEY) != which] + [row]
+                row = measure(which[0], choices[which[0]], material, protocol, *which[1:], kept, pool.map, lpips)
+                known = [r for r in known if tuple(r[k] for k in KEY) != which] + [row]
                 tell(table([row]))
-                write_rows(out, "recon", found, description)
+                write_rows(out, "recon", known, description)
     with atomic_write(out / "recon.md", "w") as stream:
-        stream.write(paper_tables(found, name, lpips.reason, "markdown") + "\n")
-    plot(found, out / "recon.svg")
-    tell(f"{table(found)}\n{PUBLISHED}")
-    return found
+        stream.write(paper_tables(known, name, lpips.reason, "markdown") + "\n")
+    plot(known, out / "recon.svg")
+    tell(f"{table(known)}\n{PUBLISHED}")
+    return known
 
 
 def about(protocol: Protocol, scene: Scene, truth: Offsets) -> Mapping[str, Any]:
@@ -369,12 +363,28 @@ def about(protocol: Protocol, scene: Scene, truth: Offsets) -> Mapping[str, Any]
     clips = [[v.name, len(v.frames), v.camera.width, v.camera.height] for v in scene.videos]
     true = {n: round(float(s), 6) for n, s in zip(truth.names, truth.seconds, strict=True)}
     return {
-        "protocol": dict(vars(protocol)),
+        "protocol": described(protocol),
         "figures": FIGURES,
         "recording": {"videos": clips, "truth": true},
         "published": PUBLISHED,
         "unit": "frames, dB, footprints",
     }
+
+
+def described(options: Any) -> dict[str, Any]:
+    """Options as JSON takes them, those of parts beside those of the whole; objects as they would be written in Python."""
+    out: dict[str, Any] = {}
+    for name, value in vars(options).items():
+        if isinstance(value, Plan | FitOptions):
+            out |= described(value)
+        else:
+            plain = isinstance(value, int | float | str | None) or _plain(value)
+            out[name] = value if plain else repr(value)
+    return out
+
+
+def _plain(value: Any) -> bool:
+    return isinstance(value, tuple) and all(isinstance(x, int | float | str) for x in value)
 
 
 def _rounded(value: Any) -> Any:

@@ -1,7 +1,7 @@
-"""``recon bench SCENE --suite lifting``: what lifted features are worth to the matcher, and what lifting costs.
+"""``recon lifting``: the worth of lifted features to the matcher, and the cost of lifting.
 
 On a truly synchronised recording in metres. Two sources of tracks: optical flow, lifted by depth, as otsync uses it; and
-the Gaussians of a fit of every video alone (:mod:`recon.feature_tracks`). Two ways to their features from the same
+the Gaussians of a fit of every video alone (:mod:`recon.features.tracks`). Two ways to their features from the same
 maps: the mean over the pixels where a track is seen, and lifting by compositing weights. Each is thinned alike, matched
 alike, and scored by the share of matches that are within 15 cm at the true time.
 """
@@ -26,11 +26,13 @@ from otsync.compute.threads import get_threads
 from otsync.io import Scene
 from otsync.progress import counted
 from otsync.types import Offsets, TrackSet, Video
+from otsync.types.checks import check_whole
 from recon.bench.fits import Protocol, material_of
 from recon.features.lift import FeatureFrame, lift_features
 from recon.features.maps import DaisyMaps, LabMaps
 from recon.features.tracks import Alone, FeatureMaps, fit_alone, gaussian_tracks, lifted_frames, seen_weights
 from recon.footage.footage import Footage
+from recon.pipeline.plan import Plan
 from recon.raster import render, set_threads
 from recon.scene.gaussians4d import Gaussians4D, join
 
@@ -47,18 +49,33 @@ STUDY_MS = (20.0, 16.0)
 
 @dataclass(frozen=True)
 class Lifting:
-    """What the lifting suite measures.
-
-    Args:
-        cameras: drawn at random; every pair of them is matched. steps: of the fit of each video alone. seed: of the draw.
-        channels, repeats: of the timing.
-    """
+    """How lifting is measured."""
 
     cameras: int = 5
+    """Videos, drawn at random; every pair of them is matched."""
     steps: int = 300
+    """Steps of the fit of each video alone."""
     seed: int = 0
+    """Of the draw of the videos."""
+    width: int = 320
+    """Working pixels of an image's width."""
+    frames: tuple[int, int] | None = None
+    """First and last (exclusive) frame of every video to use; default: all."""
+    held_out: tuple[str, ...] = ()
+    """Names of videos that take no part."""
     channels: int = 64
+    """Feature channels of the map whose lifting is timed."""
     repeats: int = 15
+    """How often it is timed; the median counts."""
+
+    def __post_init__(self) -> None:
+        for name, least in (("cameras", 2), ("steps", 0), ("seed", 0), ("width", 1), ("channels", 1), ("repeats", 1)):
+            check_whole(name, getattr(self, name), least)
+
+    @property
+    def protocol(self) -> Protocol:
+        """How tracks and depth are made: as for fits, of all tracks."""
+        return Protocol(Plan(width=self.width, frames=self.frames), self.held_out)
 
 
 def run(
@@ -66,12 +83,11 @@ def run(
     truth: Offsets,
     out: Path,
     *,
-    protocol: Protocol,
     lifting: Lifting,
     cache: Path | None = None,
     tell: Callable[[str], None] = print,
-) -> list[Row]:
-    """Measure; print, and write ``lifting.csv`` and ``lifting.json`` to ``out``."""
+) -> tuple[list[Row], Row]:
+    """Measure, and write ``lifting.csv`` and ``lifting.json`` to ``out``: precision by matching, and the cost of lifting."""
     from otsync.files.cache import Cache
     from otsync.progress import Progress
     from recon.pipeline.stages import read_footage
@@ -83,49 +99,48 @@ def run(
         )
     kept, progress = Cache(cache or out / "stages"), Progress(tell)
     with ThreadPoolExecutor(1) as pool:
-        material = material_of(scene, truth, protocol, kept, pool.map, progress)
+        material = material_of(scene, truth, lifting.protocol, kept, pool.map, progress)
         by_name = {t.name: t for t in material.tracks}
         names = [n for n in material.train if n in by_name]
-        if len(names) < 2 or lifting.cameras < 2:
-            raise ValueError(
-                f"cameras: expected two or more with lifted tracks; found {min(len(names), lifting.cameras)}."
-            )
+        if len(names) < 2:
+            raise ValueError(f"scene: expected two or more videos with lifted tracks; found {len(names)}.")
         drawn = np.random.default_rng(lifting.seed).permutation(len(names))[: lifting.cameras]
         chosen = [names[v] for v in sorted(drawn)]
         videos = material.scene.take(chosen)
-        footage = read_footage(videos, protocol.width, kept, pool.map, progress)
+        footage = read_footage(videos, lifting.width, kept, pool.map, progress)
     sources, scenes, seconds = [], [], []
     for video, one in zip(videos.videos, footage, strict=True):
         began = time.process_time()
-        found, alone = sources_of(video, one, by_name[video.name], protocol.width, lifting)
+        sets, alone = sources_of(video, one, by_name[video.name], lifting)
         seconds.append(time.process_time() - began)
-        sources.append(found)
+        sources.append(sets)
         scenes.append(alone)
         tell(f"video {video.name}: {len(alone)} Gaussians, {seconds[-1]:.1f} CPU seconds")
     rows = matched(sources, [v.camera for v in videos.videos])
     cost = lift_cost(scenes, footage[0], lifting)
     about = {
-        "protocol": vars(protocol),
         "lifting": vars(lifting),
         "cameras": chosen,
         "cpu_seconds": seconds,
         "cost": cost,
     }
     write_rows(out, "lifting", rows, about)
-    tell(
-        f"Precision within {MATCH_RADIUS:g} m at the true time, by angle between the cameras:\n{table(rows)}\n{table([cost])}"
-    )
-    return rows
+    return rows, cost
+
+
+def tables(rows: Sequence[Row], cost: Row) -> str:
+    """The figures of :func:`run` as text."""
+    return f"Precision within {MATCH_RADIUS:g} m at the true time, by angle between the cameras:\n{table(rows)}\n{table([cost])}"
 
 
 def sources_of(
-    video: Video, footage: Footage, flow: TrackSet, width: int, lifting: Lifting
+    video: Video, footage: Footage, flow: TrackSet, lifting: Lifting
 ) -> tuple[dict[str, TrackSet], Gaussians4D]:
     """Track sets of one video by name of source, thinned alike; and the scene that the Gaussians are from."""
     from recon.footage.depth import working_depth
 
     options = Alone(steps=lifting.steps)
-    scene = fit_alone(footage, flow, working_depth(video, width=width), options=options)
+    scene = fit_alone(footage, flow, working_depth(video, width=lifting.width), options=options)
     weights = seen_weights(scene, footage)
 
     out = {}
@@ -147,10 +162,10 @@ def thinned(tracks: TrackSet) -> TrackSet:
     mixed = tracks.take(np.random.default_rng(0).permutation(len(tracks)))
     for apart in APART:
         select = Selection(apart=apart, count=COUNT)
-        found = mixed.take(select(seen_pixels(mixed), tracks.camera.width, tracks.fps or 30.0))
-        if len(found) >= COUNT:
+        chosen = mixed.take(select(seen_pixels(mixed), tracks.camera.width, tracks.fps or 30.0))
+        if len(chosen) >= COUNT:
             break
-    return found
+    return chosen
 
 
 def averaged(tracks: TrackSet, footage: Footage, maps: FeatureMaps, every: float) -> TrackSet:
@@ -159,10 +174,10 @@ def averaged(tracks: TrackSet, footage: Footage, maps: FeatureMaps, every: float
     scale = footage.size[0] / tracks.camera.width
     total: Any = 0.0
     for k in lifted_frames(footage, every):
-        found = maps(footage.images[k], footage.masks[k])
+        here = maps(footage.images[k], footage.masks[k])
         pixel = np.where(tracks.seen[:, k, None], tracks.uv[:, k] * scale, 0).astype(int)
         column, row = np.clip(pixel, 0, np.array(footage.size) - 1).T
-        total = total + np.where(tracks.seen[:, k, None], found[row, column], 0)
+        total = total + np.where(tracks.seen[:, k, None], here[row, column], 0)
     norm = np.linalg.norm(total, axis=1)
     keep = np.flatnonzero(norm > 0)
     return replace(tracks.take(keep), features=total[keep] / norm[keep, None])

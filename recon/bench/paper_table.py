@@ -146,7 +146,7 @@ def ablation_table(rows: Sequence[Row], style: Style = "text") -> str:
 def layout(header: Sequence[str], lines: Sequence[Sequence[str]], style: Style = "text", below: str = "") -> str:
     """Cells as aligned text or as a markdown table; the first column to the left, the others to the right."""
     if style not in ("text", "markdown"):
-        raise ValueError(f"style: expected 'text' or 'markdown', got {style!r}")
+        raise ValueError(f"style: expected 'text' or 'markdown'; found {style!r}.")
     widths = [max(len(line[i]) for line in (header, *lines)) for i in range(len(header))]
 
     def line(cells: Sequence[str]) -> str:

@@ -50,7 +50,7 @@ def measured_before(out: Path, about: Mapping[str, Any]) -> list[Row]:
 def _fixed(key: str, value: Any) -> Any:
     """What must agree: of a protocol all but the errors put in and the lengths, since every row names its own."""
     if key == "protocol" and isinstance(value, dict):
-        return {k: v for k, v in value.items() if k not in ("amplitudes", "seeds", "steps")}
+        return {k: v for k, v in value.items() if k not in ("amplitudes", "seeds", "steps", "lengths")}
     return value
 
 

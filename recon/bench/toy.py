@@ -1,4 +1,4 @@
-"""A toy photometric synchronisation: what a differentiable renderer is for, small enough to run in seconds.
+"""A toy photometric synchronisation through the renderer, small enough to run in seconds.
 
 Gaussians move on cubic splines in world time; static cameras film them, each with a clock of its own. Frame k of camera
 v shows the world at time k + offset_v (in frames). The fit starts from wrong offsets and a perturbed motion and renders
@@ -34,8 +34,8 @@ class World:
 
 
 @dataclass(frozen=True)
-class Fit:
-    """What a fit recovered: offsets relative to camera 0, and how far they are off, both in frames."""
+class Recovered:
+    """Offsets that a fit recovered, relative to camera 0, and how far they are off, both in frames."""
 
     offsets: Tensor  # [V]
     errors: Tensor  # [V]
@@ -102,7 +102,7 @@ def _film(w: World, control: Tensor, v: int, time: Tensor, size: tuple[int, int]
     return render(*gaussians, w.viewmats[v : v + 1], w.K[None], *size, depth=None).colors[0]
 
 
-def fit(w: World, steps: int = 1500, perturbation: float = 0.05, seed: int = 1) -> Fit:
+def fit(w: World, steps: int = 1500, perturbation: float = 0.05, seed: int = 1) -> Recovered:
     """Recover offsets and motion from the videos, from offsets of zero and a motion off by `perturbation` units.
 
     Only differences of offsets are seen: a common shift of all cameras moves into the motion and is taken out.
@@ -124,5 +124,5 @@ def fit(w: World, steps: int = 1500, perturbation: float = 0.05, seed: int = 1) 
         optimizer.step()
         schedule.step()
         losses.append(loss.detach())
-    found = (offsets - offsets[0]).detach()
-    return Fit(found, found - (w.offsets - w.offsets[0]), torch.stack(losses), steps)
+    recovered = (offsets - offsets[0]).detach()
+    return Recovered(recovered, recovered - (w.offsets - w.offsets[0]), torch.stack(losses), steps)

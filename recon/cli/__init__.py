@@ -1,4 +1,5 @@
-"""Reconstruct a moving scene from synchronised videos: ``recon fit | render | eval | export | simulate | bench``.
+"""Reconstruct a moving scene from synchronised videos: ``recon fit | render | eval | export | simulate | bench |
+lifting``.
 
 Exit codes: 0 done; 1 an answer is not to be trusted (it is written all the same); 2 bad arguments or files; 130
 interrupted: the same command continues where it stopped.

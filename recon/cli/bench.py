@@ -1,17 +1,28 @@
-"""``recon bench``: configurations of the field, and ablations, on one recording whose clocks are known."""
+"""``recon bench`` and ``recon lifting``: on one recording whose clocks are known."""
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import tyro
 
+from otsync.progress import tell
+from recon.bench.configurations import configurations
 from recon.bench.fits import Protocol
 from recon.bench.lifting import Lifting
+from recon.cli.common import opened, print_json
+
+if TYPE_CHECKING:
+    from otsync.io import Scene
+    from otsync.types import Offsets
+
+
+def row_names() -> Any:
+    """Tells the help which configurations there are, plugins' among them."""
+    return tyro.conf.arg(metavar=f"[{{{'|'.join(configurations())}}} ...]")
 
 
 @dataclass
@@ -25,54 +36,38 @@ class Bench:
     On a GPU, with the time and the most memory that it took: recon bench recording/ --held-out 0 --frames 0 150
     --width 640 --rows ours --steps 10000 --batch 8 --device cuda --out bench
 
-    Lifted features against averaged ones, for the matcher: recon bench recording/ --suite lifting --frames 50 98
+    Every option of a fit holds for all rows, but for what a row is about.
     """
 
     scene: tyro.conf.Positional[Path]
     """A scene.json, or a folder that holds one, or a folder in Panoptic layout."""
-    suite: Literal["fit", "lifting"] = "fit"
-    """fit: offsets and views by configuration. lifting: precision of matching with lifted features, and their cost."""
     truth: Path | None = None
     """True offsets; default: all zero, a recording that is truly synchronised."""
-    rows: tuple[str, ...] = ("ours", "fixed", "true time")
-    """Configurations: see recon/configurations.py."""
+    rows: Annotated[tuple[str, ...], row_names()] = ("ours", "fixed", "true time")
+    """Configurations: see recon/bench/configurations.py."""
     out: Path = Path("bench/out")
-    """Folder for recon.csv, .json and .md (lifting.csv and .json), and the stages; rows that it holds already are kept."""
+    """Folder for recon.csv, .json and .md, and the stages; rows that it holds already are kept."""
     cache: Path | None = None
     """Folder where stages are kept; default: stages in --out."""
     name: str | None = None
     """Of the recording in the tables; one of the paper's scenes stands beside its figures; default: its folder's."""
     lpips_weights: Path | None = None
     """torchvision's weights of AlexNet; without them the LPIPS column says so."""
-    protocol: tyro.conf.OmitArgPrefixes[Protocol] = field(default_factory=Protocol)
-    lifting: Lifting = field(default_factory=Lifting)
+    protocol: Annotated[Protocol, tyro.conf.arg(name="")] = field(default_factory=Protocol)
+    json: bool = False
+    """Print the rows as one JSON document instead of tables."""
     allow_outside: bool = False
     """Let the scene name files outside its folder."""
 
     def run(self) -> int:
-        from otsync.io import open_scene
-        from otsync.types import Offsets
-        from recon.bench import lifting as bench_lifting
         from recon.bench.fits import run
         from recon.bench.rows import paper_tables
         from recon.evaluate.lpips import Lpips
 
-        scene = open_scene(self.scene, allow_outside=self.allow_outside)
-        if self.truth is None:  # the first is the reference, which must not be held out
-            held = self.protocol.held_out
-            scene = scene.take([n for n in scene.names if n not in held] + [n for n in scene.names if n in held])
-            truth = Offsets.known(scene.names, np.zeros(len(scene.names)), scene.videos[0].fps or 30.0)
-        else:
-            truth = Offsets.load(self.truth)
-        if self.suite == "lifting":
-            bench_lifting.run(
-                scene, truth, self.out, protocol=self.protocol, lifting=self.lifting, cache=self.cache, tell=tell
-            )
-            print(f"wrote {self.out / 'lifting.csv'} and {self.out / 'lifting.json'}")
-            return 0
+        scene, truth = known_scene(self.scene, self.truth, self.protocol.held_out, self.allow_outside)
         path, lpips = self.scene.resolve(), Lpips.load(self.lpips_weights)
         name = self.name or (path if path.is_dir() else path.parent).name
-        found = run(
+        rows = run(
             scene,
             truth,
             self.out,
@@ -83,11 +78,59 @@ class Bench:
             name=name,
             lpips=lpips,
         )
-        print(paper_tables(found, name, lpips.reason))
-        print(f"wrote {self.out / 'recon.csv'}, {self.out / 'recon.json'} and {self.out / 'recon.md'}")
+        wrote = f"wrote {self.out / 'recon.csv'}, {self.out / 'recon.json'} and {self.out / 'recon.md'}"
+        if self.json:
+            print_json({"recording": name, "rows": rows})
+            tell(wrote)
+        else:
+            print(paper_tables(rows, name, lpips.reason))
+            print(wrote)
         return 0
 
 
-def tell(text: str) -> None:
-    """A line of progress."""
-    print(text, file=sys.stderr, flush=True)
+@dataclass
+class LiftingBench:
+    """Measure the precision of matching with lifted features against averaged ones, and the cost of lifting.
+
+    Example: recon lifting recording/ --frames 50 98 --held-out 0
+    """
+
+    scene: tyro.conf.Positional[Path]
+    """A truly synchronised recording in metres: a scene.json, its folder, or a folder in Panoptic layout."""
+    out: Path = Path("bench/out")
+    """Folder for lifting.csv and lifting.json, and the stages."""
+    cache: Path | None = None
+    """Folder where stages are kept; default: stages in --out."""
+    lifting: Annotated[Lifting, tyro.conf.arg(name="")] = field(default_factory=Lifting)
+    json: bool = False
+    """Print the figures as one JSON document instead of tables."""
+    allow_outside: bool = False
+    """Let the scene name files outside its folder."""
+
+    def run(self) -> int:
+        from recon.bench.lifting import run, tables
+
+        scene, truth = known_scene(self.scene, None, self.lifting.held_out, self.allow_outside)
+        rows, cost = run(scene, truth, self.out, lifting=self.lifting, cache=self.cache, tell=tell)
+        wrote = f"wrote {self.out / 'lifting.csv'} and {self.out / 'lifting.json'}"
+        if self.json:
+            print_json({"rows": rows, "cost": cost})
+            tell(wrote)
+        else:
+            print(tables(rows, cost))
+            print(wrote)
+        return 0
+
+
+def known_scene(
+    path: Path, truth: Path | None, held_out: tuple[str, ...], allow_outside: bool
+) -> tuple[Scene, Offsets]:
+    """A recording and its true offsets: those of a file, or all zero."""
+    from otsync.types import Offsets
+
+    scene = opened(path, allow_outside)
+    if truth is not None:
+        return scene, Offsets.load(truth)
+    # the first is the reference, which must not be held out
+    scene = scene.take([n for n in scene.names if n not in held_out] + [n for n in scene.names if n in held_out])
+    return scene, Offsets.known(scene.names, np.zeros(len(scene.names)), scene.videos[0].fps or 30.0)

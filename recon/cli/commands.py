@@ -11,6 +11,7 @@ OWN = {
     "export": "recon.cli.show:Export",
     "simulate": "recon.cli.simulate:Simulate",
     "bench": "recon.cli.bench:Bench",
+    "lifting": "recon.cli.bench:LiftingBench",
 }
 
 

@@ -1,25 +1,32 @@
-"""What the commands of reconstruction share: opening a scene, running the pipeline, and its outcome in words."""
+"""Shared by the commands of reconstruction: opening a scene, running the pipeline, and printing its outcome."""
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from recon.cli.options import FitOptions
-from recon.cli.tables import offset_table, view_table
+from otsync.progress import Progress, tell
+from recon.cli.tables import offset_rows, offset_table, view_table
 
 if TYPE_CHECKING:
     from otsync.io import Scene
-    from otsync.progress import Progress
     from otsync.types import Offsets
+    from recon.pipeline.plan import Plan
+
+BUDGET = 300.0
+"""Seconds of a fit that the shell is told no length of."""
 
 
-def tell(text: str) -> None:
-    """A line of progress."""
-    print(text, file=sys.stderr, flush=True)
+def with_length(plan: Plan) -> Plan:
+    """The plan with the shell's budget, where it has neither steps nor a budget."""
+    if plan.fit.steps is not None or plan.fit.budget is not None:
+        return plan
+    return replace(plan, fit=replace(plan.fit, budget=BUDGET))
 
 
 def opened(path: Path, allow_outside: bool) -> Scene:
@@ -32,41 +39,64 @@ def opened(path: Path, allow_outside: bool) -> Scene:
     return scene
 
 
+def print_json(document: Any) -> None:
+    """One document on standard output; numbers that are none become null."""
+    print(json.dumps(_plain(document), allow_nan=False))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    return None if isinstance(value, float) and value - value != 0 else value
+
+
 def reconstructed(
     scene: Scene,
     offsets: Offsets,
     out: Path,
-    options: FitOptions,
+    plan: Plan,
     *,
+    held_out: tuple[str, ...] = (),
     tracks: Any = None,
     truth: Path | None = None,
+    cache: Path | None = None,
+    workers: int = 0,
+    as_json: bool = False,
     progress: Progress | None = None,
 ) -> int:
-    """Prepare, fit, evaluate, write, and print what came out; the exit code."""
+    """Prepare, fit, evaluate, write, and print the outcome; the exit code."""
     from otsync.files.cache import Cache
-    from otsync.progress import Progress
     from otsync.types import Offsets
     from recon.pipeline.verb import reconstruct
+    from recon.result.folder import metrics_of
 
     known = None if truth is None else Offsets.load(truth)
-    with ThreadPoolExecutor(options.workers or os.cpu_count() or 1) as pool:
+    with ThreadPoolExecutor(workers or os.cpu_count() or 1) as pool:
         outcome = reconstruct(
             scene,
             offsets,
             out,
-            plan=options.plan(),
+            plan=plan,
             tracks=tracks,
-            held_out=options.held_out,
+            held_out=held_out,
             truth=known,
-            cache=Cache(options.cache or out / "stages"),
+            cache=Cache(cache or out / "stages"),
             map=pool.map,
             progress=progress or Progress(tell),
-            **options.length(),
         )
-    print(offset_table(outcome))
-    print(view_table(outcome.views, outcome.lpips_reason))
-    print(f"wrote {out / 'scene.npz'}, {out / 'offsets.json'}, {out / 'metrics.json'} and {out / 'report.html'}")
+    wrote = f"wrote {out / 'scene.npz'}, {out / 'offsets.json'}, {out / 'metrics.json'} and {out / 'report.html'}"
     doubtful = [n for n, s in zip(outcome.coarse.names, outcome.coarse.status, strict=True) if not s.ok]
+    if as_json:
+        figures = metrics_of(outcome.views, outcome.fitted.stats, outcome.lpips_reason)
+        told = {"out": str(out), "offsets": offset_rows(outcome), "doubtful": doubtful, "metrics": figures}
+        print_json(told | {"left_out": list(outcome.left_out)})
+        tell(wrote)
+    else:
+        print(offset_table(outcome))
+        print(view_table(outcome.views, outcome.lpips_reason))
+        print(wrote)
     if doubtful:
         print(f"begun from offsets that are not to be trusted: {', '.join(doubtful)}", file=sys.stderr)
     return 1 if doubtful or outcome.left_out else 0

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import tyro
 
-from recon.cli.common import opened, reconstructed
-from recon.cli.options import FitOptions
-
-if TYPE_CHECKING:
-    pass
+from recon.cli.common import opened, reconstructed, with_length
+from recon.pipeline.plan import Plan
 
 
 @dataclass
@@ -24,6 +21,8 @@ class Fit:
     A quick look: recon fit recording/ --offsets offsets.json --out look --width 160 --frames 0 30 --steps 300
 
     The offsets as they are: recon fit recording/ --offsets offsets.json --out fixed --freeze offsets
+
+    Other losses: recon fit recording/ --offsets offsets.json --out deep --losses photometric mask depth:weight=0.05
     """
 
     scene: tyro.conf.Positional[Path]
@@ -32,17 +31,38 @@ class Fit:
     """offsets.json as otsync sync writes it."""
     out: Path = Path("recon")
     """Folder for scene.npz, offsets.json, metrics.json and report.html; a run that was stopped continues in it."""
+    held_out: tuple[str, ...] = ()
+    """Names of videos that the fit does not see: the finished scene is compared with them."""
     tracks: tuple[Path, ...] = ()
     """Track sets in space (.npz), one a video, that the motion begins with; default: tracked and lifted here."""
     truth: Path | None = None
     """truth.json of a simulated world: adds errors to table and report."""
-    fit: Annotated[FitOptions, tyro.conf.arg(name="")] = field(default_factory=FitOptions)
+    plan: Annotated[Plan, tyro.conf.arg(name="")] = field(default_factory=Plan)
+    """How it is reconstructed: without --steps and --budget the fit takes 300 seconds."""
+    cache: Path | None = None
+    """Folder where stages are kept; default: stages in --out."""
+    workers: int = 0
+    """Threads of the stages before the fit; 0: one per core."""
+    json: bool = False
+    """Print one JSON document instead of tables."""
+    allow_outside: bool = False
+    """Let the scene name files outside its folder."""
 
     def run(self) -> int:
         from otsync.types import Offsets, TrackSet
 
-        self.fit.length(), self.fit.plan()  # before the work, not after it
-        scene = opened(self.scene, self.fit.allow_outside)
+        scene = opened(self.scene, self.allow_outside)
         offsets = Offsets.load(self.offsets)
         tracks = tuple(TrackSet.load(path) for path in self.tracks) or None
-        return reconstructed(scene, offsets, self.out, self.fit, tracks=tracks, truth=self.truth)
+        return reconstructed(
+            scene,
+            offsets,
+            self.out,
+            with_length(self.plan),
+            held_out=self.held_out,
+            tracks=tracks,
+            truth=self.truth,
+            cache=self.cache,
+            workers=self.workers,
+            as_json=self.json,
+        )

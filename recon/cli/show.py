@@ -6,17 +6,16 @@ import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import tyro
 
-from otsync.progress import counted
-from recon.cli.common import opened, tell
+from otsync.cli.slots import one_of
+from otsync.plugins import available, made
+from otsync.progress import counted, tell
+from recon.cli.common import opened, print_json
 from recon.cli.tables import view_table
-from recon.result.export import Format
-
-if TYPE_CHECKING:
-    pass
+from recon.result import EXPORTERS
 
 
 @dataclass
@@ -42,10 +41,10 @@ class Render:
     """World seconds; default: the whole span at --fps."""
     frames: int | None = None
     """Frames of a path: time runs through the span, or stands still at the one moment of --times."""
-    turns: float = 1.0
-    """How often the path goes around."""
+    turns: float | None = None
+    """How often the path goes around; default: once."""
     fps: float | None = None
-    """Frames per second; default: the reference's."""
+    """Frames per second of the world's clock, and of a video; default: the reference's."""
     width: int | None = None
     """Pixels; default: the working size of the fit."""
     out: Path = Path("render.mp4")
@@ -63,6 +62,13 @@ class Render:
             raise ValueError("--frames: expected with --path, and with at most one moment in --times.")
         if self.frames is not None and not 1 <= self.frames <= MAX_FRAMES:
             raise ValueError(f"--frames: expected 1 to {MAX_FRAMES}; found {self.frames}.")
+        if self.turns is not None and self.path is None:
+            raise ValueError("--turns: expected with --path; found --camera.")
+        if self.fps is not None and not self.out.suffix and (self.times or self.frames is not None):
+            raise ValueError(
+                "--fps: expected with a video in --out, or to choose the times of images; found a folder of images whose "
+                f"times {'--times' if self.times else '--frames'} chooses."
+            )
         if self.fps is not None and not 0 < self.fps <= 1000:
             raise ValueError(f"--fps: expected frames per second above 0, at most 1000; found {self.fps:g}.")
         check_target(self.out)
@@ -72,7 +78,8 @@ class Render:
         if self.frames is not None:
             times = times * self.frames if len(self.times) == 1 else stretched(result.scene.span, self.frames)
         check_times(result.scene, times)
-        images = rendered(result, times, self.camera, turns=self.turns, width=self.width)
+        turns = 1.0 if self.turns is None else self.turns
+        images = rendered(result, times, self.camera, turns=turns, width=self.width)
         count = write_images(counted(images, "rendering", "image", len(times)), self.out, fps)
         print(f"wrote {count} images to {self.out}")
         return 0
@@ -80,7 +87,7 @@ class Render:
 
 @dataclass
 class Eval:
-    """Hold a finished reconstruction against cameras that it has not seen.
+    """Compare a finished reconstruction with cameras that it has not seen.
 
     Example: recon eval result recording/ --held-out 0
 
@@ -103,6 +110,8 @@ class Eval:
     """torchvision's weights of AlexNet; without them LPIPS is left out."""
     out: Path | None = None
     """Where to write the figures; default: eval.json in the result."""
+    json: bool = False
+    """Print the figures as one JSON document instead of a table."""
     allow_outside: bool = False
     """Let the scene name files outside its folder."""
 
@@ -134,18 +143,21 @@ class Eval:
                 map=pool.map,
                 progress=Progress(tell),
             )
-        print(view_table(views, reason))
-        document = metrics_of(views, {}, reason)
+        document, lines = metrics_of(views, {}, reason), [view_table(views, reason)]
         if self.truth is not None:
             error = offset_figures(result.offsets, true_seconds(Offsets.load(self.truth), result.offsets))
             if error["mean_frames"] is None:
-                print("offset error: none, for there is one video only")
+                lines.append("offset error: none, for there is one video only")
             else:
-                print(f"offset error: mean {error['mean_frames']:.3f}, max {error['max_frames']:.3f} frames")
+                lines.append(f"offset error: mean {error['mean_frames']:.3f}, max {error['max_frames']:.3f} frames")
             document["offset_error"] = error
         out = self.out or self.result / "eval.json"
         write_json(out, document)
-        print(f"wrote {out}")
+        if self.json:
+            print_json(document)
+            tell(f"wrote {out}")
+        else:
+            print("\n".join([*lines, f"wrote {out}"]))
         return 0
 
 
@@ -162,7 +174,7 @@ class Export:
 
     result: tyro.conf.Positional[Path]
     """Folder that recon fit or otsync run wrote."""
-    format: Format = "ply"
+    format: one_of("exporters", EXPORTERS) = "ply"
     """ply and splat hold a moment, ply-sequence every frame; checkpoint is the whole scene, tracks an otsync track set."""
     at: float | None = None
     """World second of the moment; default: the middle."""
@@ -175,21 +187,21 @@ class Export:
         from recon.result.export import export, frame_times
         from recon.result.folder import load_result
 
+        exporter = made(self.format, available("exporters", EXPORTERS), "--format")
+        if self.at is not None and exporter.holds != "moment":
+            raise ValueError(
+                f"--at: expected with a format that holds one moment; found {self.format}, which does not."
+            )
+        if self.fps is not None and exporter.holds != "frames":
+            raise ValueError(f"--fps: expected with a format that holds frames; found {self.format}, which does not.")
         result = load_result(self.result)
-        single = self.format in ("ply", "splat")
-        if self.at is not None and not single:
-            raise ValueError(f"--at: expected with ply or splat; found {self.format}, which holds all times.")
         low, high = result.scene.span
-        middle = 0.5 * (low + high) if self.at is None else self.at
-        times = [middle] if single else frame_times(result.scene, self.fps).tolist()
-        names = {
-            "ply": "scene.ply",
-            "splat": "scene.splat",
-            "ply-sequence": "sequence",
-            "checkpoint": "scene4d.npz",
-            "tracks": "tracks.npz",
-        }
-        out = self.out or self.result / names[self.format]
-        export(result.scene, self.format, out, times, result.frame)
+        times: list[float] = []
+        if exporter.holds == "moment":
+            times = [0.5 * (low + high) if self.at is None else self.at]
+        elif exporter.holds == "frames":
+            times = frame_times(result.scene, self.fps).tolist()
+        out = self.out or self.result / exporter.file
+        export(result.scene, exporter, out, times, result.frame)
         print(f"wrote {out}")
         return 0

@@ -1,30 +1,42 @@
-"""Tables that commands print."""
+"""Tables that commands print, and their rows as JSON."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from recon.evaluate.views import ViewScore
     from recon.pipeline.verb import Outcome
 
 
+def offset_rows(outcome: Outcome) -> list[dict[str, Any]]:
+    """Offsets before and after, their sigma, and truth and error where it is known: in frames of the reference."""
+    offsets, true = outcome.fitted.offsets, outcome.truth
+    fps = float(offsets.fps[offsets.reference])
+    rows = []
+    for v, name in enumerate(offsets.names):
+        row: dict[str, Any] = {"video": name, "reference": v == offsets.reference}
+        row |= {"before": float(outcome.coarse.frames[v]), "after": float(offsets.frames[v])}
+        row["sigma"] = float(offsets.sigma[v]) * fps
+        if true is not None:
+            row |= {"true": float(true[v]) * fps, "error": float(offsets.frames[v]) - float(true[v]) * fps}
+        rows.append(row)
+    return rows
+
+
 def offset_table(outcome: Outcome) -> str:
     """Offsets before and after, in frames of the reference."""
     import numpy as np
 
-    offsets, coarse, true = outcome.found.offsets, outcome.coarse, outcome.truth
-    fps, width = offsets.fps[offsets.reference], max(5, *map(len, offsets.names))
-    head = f"{'video':{width}}  {'before':>9} {'after':>9} {'sigma':>8}"
-    head += f" {'true':>9} {'error':>8}" if true is not None else ""
-    lines = [head + "   (frames of the reference)"]
-    for v, name in enumerate(offsets.names):
-        values = [coarse.frames[v], offsets.frames[v], offsets.sigma[v] * fps]
-        values += [true[v] * fps, offsets.frames[v] - true[v] * fps] if true is not None else []
-        cells = [
-            f"{x:{w}.3f}" if np.isfinite(x) else "–".rjust(w) for x, w in zip(values, (9, 9, 8, 9, 8), strict=False)
-        ]
-        lines.append(f"{name:{width}}  {' '.join(cells)}" + ("  reference" if v == offsets.reference else ""))
+    rows = offset_rows(outcome)
+    columns = [
+        (k, w) for k, w in (("before", 9), ("after", 9), ("sigma", 8), ("true", 9), ("error", 8)) if k in rows[0]
+    ]
+    width = max(5, *(len(row["video"]) for row in rows))
+    lines = [f"{'video':{width}} " + "".join(f" {k:>{w}}" for k, w in columns) + "   (frames of the reference)"]
+    for row in rows:
+        cells = [f"{row[k]:{w}.3f}" if np.isfinite(row[k]) else "–".rjust(w) for k, w in columns]
+        lines.append(f"{row['video']:{width}}  {' '.join(cells)}" + ("  reference" if row["reference"] else ""))
     return "\n".join(lines)
 
 

@@ -1,4 +1,4 @@
-"""Figures of a reconstruction: images against held-out ones, offsets against the truth, tracks against tracks.
+"""Figures of a reconstruction: images against held-out ones, tracks against tracks.
 
 Figures of images are those of the literature's tables: PSNR for colours in 0..1 clipped as in a file, SSIM with the
 11 x 11 Gaussian window (sigma 1.5) over the pixels whose window lies inside the image, as scikit-image and torchmetrics
@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -73,56 +73,6 @@ def mean_scores(frames: Sequence[Mapping[str, float]]) -> dict[str, float]:
         known = [frame[name] for frame in frames if not math.isnan(frame.get(name, math.nan))]
         out[name] = math.fsum(known) / len(known) if known else math.nan
     return out
-
-
-@dataclass(frozen=True, eq=False)
-class OffsetError:
-    """Absolute errors of offsets in frames of the reference, once the gauge is fixed.
-
-    Args:
-        mean, max: over the videos that have an estimate; of the gauge "reference" without the reference itself, whose
-            error is zero by definition. nan when there are none.
-        errors: (V,) signed, nan where there is no estimate; positive: the video is placed too late.
-    """
-
-    mean: float
-    max: float
-    errors: Float[np.ndarray, " V"]
-
-
-def offset_error(
-    estimated: Any,
-    true: Any,
-    frame_step: float,
-    gauge: Literal["reference", "median"] = "reference",
-    reference: int = 0,
-) -> OffsetError:
-    """Errors of offsets (seconds, one a video) in frames of ``frame_step`` seconds.
-
-    Offsets are known up to a common shift only. gauge: "reference": the ``reference`` video is right by definition;
-    "median": the median error is zero, for comparing methods that hold different videos.
-    """
-    est, truth = np.asarray(estimated, float), np.asarray(true, float)
-    if est.ndim != 1 or est.shape != truth.shape:
-        raise ValueError(
-            f"estimated, true: expected one number per video in both; found shapes {est.shape} and {truth.shape}."
-        )
-    if not (math.isfinite(frame_step) and frame_step > 0):
-        raise ValueError(f"frame_step: expected seconds > 0; found {frame_step}.")
-    errors = (est - truth) / frame_step
-    counted = np.isfinite(errors)
-    if gauge == "reference":
-        if not 0 <= reference < len(errors):
-            raise ValueError(f"reference: expected the index of one of {len(errors)} videos; found {reference}.")
-        errors = errors - errors[reference]
-        counted[reference] = False
-        counted &= np.isfinite(errors)
-    elif gauge == "median":
-        errors = errors - (np.median(errors[counted]) if counted.any() else np.nan)
-    else:
-        raise ValueError(f"gauge: expected 'reference' or 'median'; found {gauge!r}.")
-    size = np.abs(errors[counted])
-    return OffsetError(*((float(size.mean()), float(size.max())) if len(size) else (math.nan, math.nan)), errors)
 
 
 def coherence(tracks: Float[np.ndarray, "N T 3"], neighbours: int = 3, moment: int | None = None) -> float:

@@ -24,7 +24,7 @@ from recon.evaluate.lpips import Lpips
 from recon.footage.footage import Footage
 from recon.observe.cameras import Box, Clip, draw
 from recon.observe.effects import Effect, Rendered, Shot, compose
-from recon.observe.effects import optics as optics_of
+from recon.observe.recorded import optics as optics_of
 from recon.raster import Rendering
 from recon.scene.gaussians import Gaussians
 from recon.scene.gaussians4d import Gaussians4D
@@ -91,7 +91,7 @@ def view(
         clock: of the camera; None: unknown, so the scene's whole span is searched.
         gain: of the camera; None: fitted to what is static.
         layered: see :class:`CameraView`.
-        optics: see :func:`recon.observe.effects.optics`; None: the rolling shutter that the camera declares.
+        optics: see :func:`recon.observe.recorded.optics`; None: the rolling shutter that the camera declares.
 
     Raises ValueError where the clock is unknown and nothing that moves can be compared.
     """

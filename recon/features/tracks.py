@@ -18,12 +18,13 @@ from jaxtyping import Float, UInt8
 from otsync.types import Camera, Offsets, TrackSet
 from recon.features.lift import FeatureFrame, as_tracks, lift_features
 from recon.fit.optimize import RATES, without
-from recon.fit.problem import Loss
-from recon.fit.verb import LOSSES, fit
+from recon.fit.options import DEFAULT_LOSSES
+from recon.fit.verb import fit
 from recon.footage.depth import Depths
 from recon.footage.footage import Footage
+from recon.losses import Loss
 from recon.motion import ScaffoldOptions, build_scaffold
-from recon.observe.effects import with_declared
+from recon.observe.recorded import with_declared
 from recon.scene.gaussians4d import Gaussians4D
 from recon.scene.seed import Seeding, moments
 from recon.scene.seed import seed as seeded
@@ -47,7 +48,7 @@ class Alone:
     steps: int = 300
     scaffold: ScaffoldOptions = field(default_factory=ScaffoldOptions)
     seeding: Seeding = field(default_factory=Seeding)
-    losses: tuple[Loss, ...] = LOSSES
+    losses: tuple[Loss, ...] = DEFAULT_LOSSES
     rates: Mapping[str, float] = field(default_factory=lambda: without(RATES, "offsets"))
     every: float = 4 / 30
     least_pixels: float = 1.0

@@ -34,10 +34,10 @@ class Densify:
 
     def __post_init__(self) -> None:
         if not all(0 < a < 1 for a in self.at):
-            raise ValueError(f"Densify.at: expected shares of the fit strictly between 0 and 1, got {self.at}")
+            raise ValueError(f"Densify.at: expected shares of the fit strictly between 0 and 1; found {self.at}.")
         if not 0 <= self.share <= 1 or not 0 <= self.min_opacity < 1:
             raise ValueError(
-                f"Densify: expected share in 0..1 and min_opacity in 0..1, got {self.share}, {self.min_opacity}"
+                f"Densify: expected share in 0..1 and min_opacity in 0..1; found {self.share}, {self.min_opacity}."
             )
 
     def steps(self, steps: int) -> frozenset[int]:

@@ -1,42 +1,35 @@
 """Learning rates per parameter group, their decay, and the optimiser that a fit steps.
 
-A group without a rate is frozen: there is no other switch.
+A group without a rate is frozen.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
-IN_FOOTPRINTS = ("means", "knots", "own_knots", "static.means")
-IN_FRAMES = ("offsets",)
+from recon.observe import EFFECTS
+from recon.observe.recorded import all_effects
+from recon.scene import groups
+from recon.scene.groups import Group, by_name, initial_rates
 
-RATES: Mapping[str, float] = {
-    "means": 0.03,
-    "quats": 2e-3,
-    "log_scales": 6e-3,
-    "opacity_logits": 0.03,
-    "sh": 0.02,
-    "sh_rest": 1e-3,
-    "knots": 0.075,
-    "own_knots": 0.075,
-    "knot_quats": 2e-3,
-    "gain": 1e-3,
-    "offsets": 0.02,
-}
-"""Adam's steps at the start. means and knots in footprints, offsets in frames of the reference, the rest as they are
-(the study's metres and colours, expressed so). Leave a group out to freeze it: ``without(RATES, "offsets")``."""
+DECLARED = by_name((*groups.SCENE, *(g for e in EFFECTS for g in e.groups), *groups.CLOCKS))
+"""Our own parameter groups by name: a scene's, the effects', the clocks'."""
+
+RATES: Mapping[str, float] = initial_rates(DECLARED.values())
+"""Adam's steps at the start of our own groups, in the groups' units: see :mod:`recon.scene.groups`."""
 
 
-def without(rates: Mapping[str, float], *groups: str) -> dict[str, float]:
+def without(rates: Mapping[str, float], *frozen: str) -> dict[str, float]:
     """``rates`` with some groups frozen. ValueError for a name that has no rate anyway."""
-    unknown = [g for g in groups if g not in rates]
+    unknown = [g for g in frozen if g not in rates]
     if unknown:
-        raise ValueError(f"groups: expected some of {', '.join(rates)}; found {', '.join(unknown)}.")
-    return {name: rate for name, rate in rates.items() if name not in groups}
+        raise ValueError(f"freeze: expected some of {', '.join(rates)}; found {', '.join(unknown)}.")
+    return {name: rate for name, rate in rates.items() if name not in frozen}
 
 
 @dataclass(frozen=True)
@@ -54,9 +47,37 @@ class Decay:
         return float(self.last ** max(0.0, (progress - self.hold) / (1 - self.hold)))
 
 
+def rates_on(option: str) -> Any:
+    """Tells the shell to take rates as GROUP=RATE; groups that are not named keep their initial rates."""
+    from tyro.constructors import PrimitiveConstructorSpec
+
+    def parsed(texts: list[str]) -> dict[str, float]:
+        rates = initial_rates(every_group().values())
+        for text in texts:
+            name, _, rate = text.partition("=")
+            try:
+                rates[name] = float(rate)
+            except ValueError:
+                raise ValueError(f"{option}: expected GROUP=RATE; found {text!r}.") from None
+        return rates
+
+    return PrimitiveConstructorSpec(
+        nargs="*",
+        metavar="[GROUP=RATE ...]",
+        instance_from_str=parsed,
+        is_instance=lambda given: given is None or isinstance(given, Mapping),
+        str_from_instance=lambda rates: [f"{k}={v:g}" for k, v in (RATES if rates is None else rates).items()],
+    )
+
+
+def every_group() -> dict[str, Group]:
+    """Our own parameter groups, and those of every effect that there is."""
+    return DECLARED | by_name(group for effect in all_effects().values() for group in effect.groups)
+
+
 def check_rates(rates: Mapping[str, float], groups: Mapping[str, Tensor]) -> dict[str, float]:
     """Rates of the groups that there are. ValueError for names that no model has, and for negative rates."""
-    known = set(groups) | set(RATES)
+    known = set(groups) | set(every_group())
     unknown = [name for name in rates if name not in known]
     if unknown:
         raise ValueError(f"rates: expected groups among {', '.join(sorted(known))}; found {', '.join(unknown)}.")
@@ -71,11 +92,20 @@ class Adam:
 
     BETAS = (0.9, 0.99)
 
-    def __init__(self, groups: Mapping[str, Tensor], rates: Mapping[str, float], footprint: float, frame_step: float):
-        self.rates = {
-            name: rate * (footprint if name in IN_FOOTPRINTS else frame_step if name in IN_FRAMES else 1.0)
-            for name, rate in rates.items()
-        }
+    def __init__(
+        self,
+        groups: Mapping[str, Tensor],
+        rates: Mapping[str, float],
+        footprint: float,
+        frame_step: float,
+        declared: Mapping[str, Group] = DECLARED,
+    ):
+        """declared: what tells the units of the rates, by group; one that is not declared is stepped as it is."""
+
+        def unit(name: str) -> float:
+            return declared[name].scale(footprint, frame_step) if name in declared else 1.0
+
+        self.rates = {name: rate * unit(name) for name, rate in rates.items()}
         # torch's fused CPU kernel walks parameters and gradients as flat memory: strides of their own would scramble them
         self.groups = {
             name: groups[name].detach().clone(memory_format=torch.contiguous_format).requires_grad_()

@@ -1,10 +1,10 @@
-"""What a fit is about: a scene, videos with their clocks, losses and effects, checked against each other."""
+"""The problem of a fit: a scene, videos with their clocks, losses and effects, checked against each other."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,19 +12,24 @@ from torch import Tensor
 
 from otsync.files.digest import content_key
 from otsync.types import Offsets
+from recon.fit.options import FitOptions
 from recon.footage.footage import Footage
-from recon.losses.image import ImageLoss
-from recon.losses.motion import MotionLoss
+from recon.losses import ImageLoss, MotionLoss
 from recon.observe.cameras import Clip
-from recon.observe.effects import Effect, Gain, initial_parameters
+from recon.observe.effects import Effect, initial_parameters
 from recon.scene.gaussians4d import Gaussians4D, scene_arrays
-
-Loss = ImageLoss | MotionLoss
+from recon.scene.groups import Group
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """What a fit is about, and does not change while it runs."""
+    """All that a fit is given and does not change while it runs.
+
+    Args:
+        times: [V] of (F,) seconds of every video's frames. index: [V] place of every video in ``offsets``.
+        losses, motion_losses, effects, batch, seed: of the options.
+        keys: [K,2] (video, frame) of the images that take part. declared: what is declared of every parameter group.
+    """
 
     scene: Gaussians4D
     clips: tuple[Clip, ...]
@@ -37,23 +42,16 @@ class Problem:
     keys: np.ndarray
     batch: int
     seed: int
+    declared: Mapping[str, Group]
 
     @classmethod
     def of(
-        cls,
-        scene: Gaussians4D,
-        footage: Sequence[Footage],
-        offsets: Offsets,
-        losses: tuple[Loss, ...],
-        effects: tuple[Effect, ...],
-        batch: int,
-        seed: int,
+        cls, scene: Gaussians4D, footage: Sequence[Footage], offsets: Offsets, options: FitOptions | None = None
     ) -> Problem:
         """Check that everything fits together; ValueError names what does not."""
+        options = options or FitOptions()
         if not footage:
-            raise ValueError("footage: expected at least one video, got none")
-        if batch < 1:
-            raise ValueError(f"batch: expected at least 1 image a step, got {batch}")
+            raise ValueError("footage: expected at least one video; found none.")
         names = [f.name for f in footage]
         missing = [n for n in names if n not in offsets.names]
         if missing or len(set(names)) < len(names):
@@ -72,19 +70,18 @@ class Problem:
                 f"offsets: expected every video on one clock; {', '.join(apart)} have no offset on it. Leave them out."
             )
         if len(scene) == 0:
-            raise ValueError("scene: expected moving Gaussians, got none: nothing was seeded where things move")
-        unknown = [type(x).__name__ for x in losses if not hasattr(x, "needs") and not hasattr(x, "every")]
-        if unknown:
-            raise ValueError(f"losses: expected ImageLoss or MotionLoss objects, got {', '.join(unknown)}")
-        for loss in losses:
-            reads = getattr(loss, "reads", None)
-            if reads is not None and not any(getattr(f, reads) for f in footage):
+            raise ValueError("scene: expected moving Gaussians; found none: nothing was seeded where things move.")
+        on_images = tuple(loss for loss in options.losses if isinstance(loss, ImageLoss))
+        for loss in on_images:
+            if loss.reads is not None and not any(getattr(f, loss.reads) for f in footage):
                 raise ValueError(
-                    f"losses: {type(loss).__name__} compares with the {reads} of footage; found none in any video. Give "
-                    f"Footage.{reads}, or leave the loss out."
+                    f"losses: {type(loss).__name__} compares with the {loss.reads} of footage; found none in any video. "
+                    f"Give Footage.{loss.reads}, or leave the loss out."
                 )
-            if reads == "features" and scene.features is None:
-                raise ValueError("losses: Feature compares the scene's features; found none. Lift them first.")
+            if "features" in loss.needs and scene.features is None:
+                raise ValueError(
+                    f"losses: {type(loss).__name__} compares the scene's features; found none. Lift them first."
+                )
         keys = [
             (v, k)
             for v, f in enumerate(footage)
@@ -100,12 +97,13 @@ class Problem:
             tuple(torch.as_tensor(f.times, dtype=torch.float64, device=device) for f in footage),
             offsets,
             index,
-            tuple(cast(ImageLoss, x) for x in losses if hasattr(x, "needs")),
-            tuple(cast(MotionLoss, x) for x in losses if hasattr(x, "every")),
-            effects,
+            on_images,
+            tuple(loss for loss in options.losses if isinstance(loss, MotionLoss)),
+            options.effects,
             np.array(keys),
-            batch,
-            seed,
+            options.batch,
+            options.seed,
+            options.groups,
         )
 
     @property
@@ -129,7 +127,7 @@ class Problem:
         """Whether the images of a step are one rendering: on a GPU, where no effect asks for other moments than the
         frames' own and what is static is not drawn."""
         layered = self.scene.static is None or all(clip.background is not None for clip in self.clips)
-        return self.device.type != "cpu" and layered and all(isinstance(e, Gain) for e in self.effects)
+        return self.device.type != "cpu" and layered and all(effect.instant for effect in self.effects)
 
     def needs(self, what: str) -> bool:
         """Whether a loss asks for "depth" or "features" to be rendered."""

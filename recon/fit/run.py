@@ -1,4 +1,4 @@
-"""A fit under way: its parameters, and what happens in a step."""
+"""A fit under way: its parameters, and its steps."""
 
 from __future__ import annotations
 
@@ -24,8 +24,6 @@ from recon.observe.effects import Rendered, Shot, compose, prior
 from recon.scene.gaussians4d import Gaussians4D, scene_arrays, scene_from_arrays
 
 RECORDS = 200  # rows of history in a fit
-PER_NODE = ("knots", "knot_quats")
-PER_GAUSSIAN = ("means", "quats", "log_scales", "opacity_logits", "sh", "sh_rest", "features", "own_knots")
 
 
 class Diverged(RuntimeError):
@@ -33,9 +31,13 @@ class Diverged(RuntimeError):
 
 
 @dataclass(frozen=True)
-class Result:
-    """What one job of a step gives back: loss and PSNR by image, gradients in the order of the groups, None where there
-    is none."""
+class JobDone:
+    """One job of a step, done.
+
+    Args:
+        losses, psnrs: by image. gradients: in the order of the groups, None where there is none.
+        pull: [2,N] what densification is decided by; None where it was not asked for.
+    """
 
     losses: list[float]
     psnrs: list[float]
@@ -44,7 +46,7 @@ class Result:
 
 
 class Run:
-    """A fit under way: its parameters, and what happens in a step."""
+    """A fit under way: its parameters, and its steps."""
 
     def __init__(self, problem: Problem, rates: dict[str, float], snapshot: Snapshot | None, total: int | None):
         self.problem, self.rates = problem, rates
@@ -67,7 +69,7 @@ class Run:
 
     def _adam(self, moments: Mapping[str, Tensor]) -> Adam:
         active = check_rates(self.rates, self.groups)
-        adam = Adam(self.groups, active, self.scene.footprint, self.scene.frame_step)
+        adam = Adam(self.groups, active, self.scene.footprint, self.scene.frame_step, self.problem.declared)
         adam.restore(moments)
         return adam
 
@@ -136,7 +138,7 @@ class Run:
             return compose_over(compose(observe, p.effects, values)(shot), clip.behind(box))
 
     def sigma(self, values: dict[str, Tensor]) -> np.ndarray:
-        """See :func:`recon.uncertainty.newton_sigma`."""
+        """See :func:`recon.fit.uncertainty.newton_sigma`."""
         p = self.problem
         return newton_sigma(
             lambda v, k, later: self.look(values, v, k, later),
@@ -149,7 +151,7 @@ class Run:
 
     def image_gradient(
         self, values: dict[str, Tensor], names: list[str], keys: list[tuple[int, int]], probe: bool
-    ) -> Result:
+    ) -> JobDone:
         """Losses of some frames, and the gradients of their sum; several are rendered at once."""
         p = self.problem
         probes: list[tuple[Tensor, Tensor]] = []
@@ -178,7 +180,7 @@ class Run:
                 length = g.reshape(radii.shape)[:, : len(scene)].norm(dim=-1)
                 pull += torch.stack([(length * seen_here).sum(0), seen_here.float().sum(0)])
         psnrs = [-10 * math.log10(float(e) + 1e-12) for e in errors]
-        return Result([float(x.detach()) for x in losses], psnrs, list(gradients[: len(names)]), pull)
+        return JobDone([float(x.detach()) for x in losses], psnrs, list(gradients[: len(names)]), pull)
 
     def seen(
         self, scene: Gaussians4D, values: Mapping[str, Tensor], rendered: Rendered, clip: Clip, shot: Shot
@@ -213,7 +215,7 @@ class Run:
             means=None if tracks is None else scene.moving(shot.t, clocks).means,
         )
 
-    def motion_gradient(self, values: dict[str, Tensor], names: list[str]) -> Result:
+    def motion_gradient(self, values: dict[str, Tensor], names: list[str]) -> JobDone:
         """Losses of the motion itself, at a time of its own."""
         p = self.problem
         scene = assemble(self.scene, values)
@@ -230,9 +232,9 @@ class Run:
         gradients = (
             torch.autograd.grad(total, wanted, allow_unused=True) if total.requires_grad else [None] * len(names)
         )
-        return Result([float(total.detach())], [], list(gradients), None)
+        return JobDone([float(total.detach())], [], list(gradients), None)
 
-    def _guard(self, total: Mapping[str, Tensor], done: Sequence[Result], keys: list[tuple[int, int]]) -> None:
+    def _guard(self, total: Mapping[str, Tensor], done: Sequence[JobDone], keys: list[tuple[int, int]]) -> None:
         """Diverged, with step, group and frames, before a NaN reaches the parameters."""
         sums = [g.sum().isfinite() for g in total.values()]
         sound = not sums or bool(torch.stack(sums).all())  # one question: a GPU's answers are waited for
@@ -255,10 +257,11 @@ class Run:
         carried = {}
         for name, moment in moments.items():
             group, _, kind = name.rpartition(".")
-            if kind != "step" and group in PER_GAUSSIAN:
-                moment = _carried(moment, 1 if group == "own_knots" else 0, torch.where(fresh, -1, old))
-            elif kind != "step" and group in PER_NODE and source is not None:
-                moment = _carried(moment, 1, source)
+            told = self.problem.declared.get(group)
+            if told is not None and kind != "step" and told.rows == "gaussians":
+                moment = _carried(moment, told.axis, torch.where(fresh, -1, old))
+            elif told is not None and kind != "step" and told.rows == "nodes" and source is not None:
+                moment = _carried(moment, told.axis, source)
             carried[name] = moment
         self.adam = self._adam(carried)
         self._pull = self._no_pull()

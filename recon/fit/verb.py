@@ -11,34 +11,30 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from os import PathLike
+from typing import Any
 
 import numpy as np
 from torch import Tensor
 from tqdm import tqdm
 
 from otsync.compute.threads import MapLike
+from otsync.progress import is_quiet
 from otsync.types import Offsets
 from recon.fit.checkpoint import Checkpoint
-from recon.fit.densify import Densify
-from recon.fit.optimize import RATES
-from recon.fit.problem import Loss, Problem, assemble
+from recon.fit.options import FitOptions
+from recon.fit.problem import Problem, assemble
 from recon.fit.run import Diverged, Run
 from recon.fit.undisturbed import one_thread_each, uninterrupted
 from recon.footage.footage import Footage
-from recon.losses.image import Mask, Photometric, ScaleHinge
-from recon.losses.motion import Acceleration, Arap, Length, Velocity
-from recon.observe.effects import Effect, initial_parameters
+from recon.observe.effects import initial_parameters
 from recon.scene.gaussians4d import Gaussians4D
 
-__all__ = ["LOSSES", "RATES", "Diverged", "History", "Reconstruction", "fit"]
-
-LOSSES: tuple[Loss, ...] = (Photometric(), Mask(), ScaleHinge(), Arap(), Length(), Velocity(), Acceleration())
-"""What the study of the paper's scene used; depth, tracks and features enter only at initialisation unless added."""
+__all__ = ["Diverged", "History", "Reconstruction", "fit"]
 
 CALIBRATION = (20, 60)  # steps of a session between which the speed is taken when a budget in seconds is given
 
@@ -66,12 +62,12 @@ class History:
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
-    """What a fit came to.
+    """A fitted scene and its clocks.
 
     Args:
         scene: asked for any world time by ``scene.at(t)``.
         offsets: the videos' clocks, refined where "offsets" had a rate; sigma from the frames' own votes.
-        parameters: what the effects learned, by group.
+        parameters: of the effects, by group.
         history: convergence. stats: steps, seconds, images, loss, psnr, gaussians.
     """
 
@@ -86,54 +82,54 @@ def fit(
     scene: Gaussians4D,
     footage: Sequence[Footage],
     offsets: Offsets,
+    options: FitOptions | None = None,
     *,
-    losses: Sequence[Loss] = LOSSES,
-    effects: Sequence[Effect] = (),
-    rates: Mapping[str, float] = RATES,
-    steps: int | None = None,
-    budget: float | None = None,
-    batch: int = 2,
-    densify: Densify | None = None,
-    seed: int = 0,
     checkpoint: str | PathLike[str] | None = None,
-    save_every: float = 60.0,
+    **changes: Any,
 ) -> Reconstruction:
     """Refine a 4D scene, and the clocks of the videos, from their images.
 
-    The fit runs where the scene is: ``fit(scene.to("cuda"), ...)`` runs on a GPU, through gsplat. What it gives back is
-    on the CPU either way.
+    The fit runs where the scene is: ``fit(scene.to("cuda"), ...)`` runs on a GPU, through gsplat. The result is on the
+    CPU either way, and does not depend on the number of threads.
 
     Args:
         footage: the videos; each is found by name in ``offsets``, whose reference keeps its place.
-        losses, effects: what is in the tuple is computed, nothing else; not even a rolling shutter that a camera declares,
-            which :func:`recon.effects.with_declared` adds.
-        rates: learning rate of each parameter group at the start; a group without one is frozen, "offsets" too.
-        steps, budget: how long: a number of steps, or wall seconds, which are turned into a number of steps once the
-            first ones have shown their speed (120 at the least). Default: 2000 steps.
-        batch: images per step, on a CPU each on its own thread. The result does not depend on the number of threads.
+        options: how the scene is fitted; ``changes`` are fields of it: ``fit(scene, footage, offsets, steps=200)``. What
+            is not among its losses and effects is not computed; not even a rolling shutter that a camera declares, which
+            :func:`recon.observe.recorded.with_declared` adds.
         checkpoint: file that the fit is kept in, every ``save_every`` seconds and on Ctrl-C; a fit that was killed
             continues from it and ends with the same numbers (on a GPU, whose sums run in any order, nearly so).
 
     Raises:
         ValueError: for footage, offsets or rates that do not fit together.
+        TypeError: for a change that is no field of :class:`FitOptions`.
         Diverged: when a loss or a gradient is no number; the last checkpoint is kept.
+
+    Example:
+        >>> fit(scene, footage, offsets, steps=200, freeze=("offsets",))  # doctest: +SKIP
     """
-    problem = Problem.of(scene, footage, offsets, tuple(losses), tuple(effects), batch, seed)
-    options = (losses, effects, sorted(rates.items()), steps, budget, batch, densify, seed)
-    keep = Checkpoint(checkpoint, problem.key(*options) if checkpoint is not None else "", save_every)
-    run = Run(problem, dict(rates), keep.load(problem.groups()), _steps(steps, budget))
+    unknown = changes.keys() - (known := {f.name: None for f in fields(FitOptions)}).keys()
+    if unknown:
+        raise TypeError(f"fit: expected fields of FitOptions ({', '.join(known)}); found {', '.join(sorted(unknown))}.")
+    options = replace(options or FitOptions(), **changes)
+    problem, rates = Problem.of(scene, footage, offsets, options), options.active_rates()
+    o = options
+    told = (o.losses, o.effects, sorted(rates.items()), o.steps, o.budget, o.batch, o.densify, o.seed)
+    keep = Checkpoint(checkpoint, problem.key(*told) if checkpoint is not None else "", options.save_every)
+    run = Run(problem, rates, keep.load(problem.groups()), options.total)
     started = time.perf_counter()
     with ExitStack() as stack:
         each: MapLike = map
         if problem.device.type == "cpu":  # a GPU is fed by one thread: more would only wait for each other
-            each = stack.enter_context(ThreadPoolExecutor(batch + 1, thread_name_prefix="recon.fit")).map
-        stack.enter_context(one_thread_each(batch))
-        bar = stack.enter_context(tqdm(total=run.total, initial=run.step, desc="fit", unit="step", disable=None))
-        calibrate = Calibration(budget)
+            each = stack.enter_context(ThreadPoolExecutor(options.batch + 1, thread_name_prefix="recon.fit")).map
+        stack.enter_context(one_thread_each(options.batch))
+        hidden = True if is_quiet() else None  # None: hidden where there is no terminal
+        bar = stack.enter_context(tqdm(total=run.total, initial=run.step, desc="fit", unit="step", disable=hidden))
+        calibrate = Calibration(options.budget)
         try:
             while run.total is None or run.step < run.total:
                 with uninterrupted():
-                    run.advance(each, densify)
+                    run.advance(each, options.densify)
                     row = run.record(time.perf_counter() - started) if run.record_due() else None
                 bar.update()
                 if run.total is None:
@@ -147,20 +143,6 @@ def fit(
             raise
         keep.save(run.snapshot())
         return _finish(run, time.perf_counter() - started)
-
-
-def _steps(steps: int | None, budget: float | None) -> int | None:
-    """How many steps; None when the speed must be known first."""
-    if steps is not None and budget is not None:
-        raise ValueError("steps, budget: expected one of them, got both")
-    if budget is not None:
-        if not 0 < budget < math.inf:
-            raise ValueError(f"budget: expected seconds above 0, got {budget}")
-        return None
-    steps = 2000 if steps is None else steps
-    if steps < 0:
-        raise ValueError(f"steps: expected 0 or more, got {steps}")
-    return steps
 
 
 class Calibration:
@@ -192,13 +174,13 @@ def _finish(run: Run, seconds: float) -> Reconstruction:
     p = run.problem
     values = {n: v.detach() for n, v in run.values().items()}
     scene = assemble(run.scene, values)
-    found = values["offsets"].cpu().numpy()
+    refined = values["offsets"].cpu().numpy()
     sigma = run.sigma(values) if "offsets" in run.adam.groups else p.offsets.sigma[p.index]
-    drift = float(found[p.reference] - p.start[p.reference])
+    drift = float(refined[p.reference] - p.start[p.reference])
     scene = replace(scene, motion=scene.motion.shifted(-drift, values["offsets"] - drift)).to("cpu")
     offsets = replace(
         p.offsets,
-        seconds=_put(p.offsets.seconds, p.index, found - drift),
+        seconds=_put(p.offsets.seconds, p.index, refined - drift),
         sigma=_put(p.offsets.sigma, p.index, sigma),
         rates=_put(p.offsets.rates, p.index, values["clock_rates"].cpu().numpy()),
     )

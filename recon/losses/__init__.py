@@ -1,1 +1,52 @@
-"""What a rendering and a motion are held against: a tuple of objects with weights."""
+"""Losses of a fit: a tuple of objects with weights, on images (:mod:`.image`) and on the motion (:mod:`.motion`).
+
+To add a loss: one class in one file, and its name in :data:`LOSSES`; or ``@register("losses")`` in a file of your own.
+"""
+
+from recon.losses.image import Depth, Feature, ImageLoss, Mask, Photometric, ScaleHinge, Track
+from recon.losses.motion import (
+    Acceleration,
+    Arap,
+    Length,
+    MotionLoss,
+    RotationAcceleration,
+    RotationVelocity,
+    Velocity,
+)
+
+Loss = ImageLoss | MotionLoss
+
+LOSSES: tuple[type[Loss], ...] = (
+    Photometric,
+    Mask,
+    Depth,
+    Track,
+    Feature,
+    ScaleHinge,
+    Arap,
+    Length,
+    Velocity,
+    Acceleration,
+    RotationVelocity,
+    RotationAcceleration,
+)
+"""Our own losses."""
+
+__all__ = [
+    "LOSSES",
+    "Acceleration",
+    "Arap",
+    "Depth",
+    "Feature",
+    "ImageLoss",
+    "Length",
+    "Loss",
+    "Mask",
+    "MotionLoss",
+    "Photometric",
+    "RotationAcceleration",
+    "RotationVelocity",
+    "ScaleHinge",
+    "Track",
+    "Velocity",
+]

@@ -1,14 +1,15 @@
-"""What a rendering of one frame is held against: a tuple of objects with weights.
+"""Losses of one rendered frame against the filmed one.
 
 Every loss is a frozen dataclass ``(seen) -> scalar | None``, unweighted; None says that the frame lacks what the loss
-compares with. What is not in the tuple is not computed, and ``needs`` tells the renderer which extra channels it must
-render. Colours are in 0..1; lengths enter in footprints, pixels or ratios, so a scene's unit does not matter.
+compares with. What is not in a fit's tuple of losses is not computed, and ``needs`` tells the renderer which extra
+channels it must render. Colours are in 0..1; lengths enter in footprints, pixels or ratios, so a scene's unit does not matter.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import ClassVar, Literal, Protocol
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar, Literal
 
 import numpy as np
 import torch
@@ -72,26 +73,26 @@ class Seen:
     tracks: Sightings | None = None
 
 
-class ImageLoss(Protocol):
-    """A comparison of one rendered frame with the filmed one."""
+class ImageLoss(ABC):
+    """A comparison of one rendered frame with the filmed one: a frozen dataclass with a ``weight`` that inherits from this."""
 
-    @property
-    def weight(self) -> float:
-        """Its share in the sum of losses."""
-        ...
+    weight: float
+    """Its share in the sum of losses."""
 
-    @property
-    def needs(self) -> frozenset[str]:
-        """What must be rendered besides colour and alpha: "depth", "features"."""
-        ...
+    needs: ClassVar[frozenset[str]] = frozenset()
+    """What must be rendered besides colour and alpha: "depth", "features"."""
 
+    reads: ClassVar[str | None] = None
+    """The field of :class:`recon.footage.Footage` that it compares with, beyond images and masks: "depth", "tracks",
+    "features". A fit refuses the loss where no video has it."""
+
+    @abstractmethod
     def __call__(self, seen: Seen) -> Tensor | None:
         """The loss, unweighted: a scalar; None when the frame lacks what it compares with."""
-        ...
 
 
 @dataclass(frozen=True)
-class Photometric:
+class Photometric(ImageLoss):
     """Mean absolute colour difference + ``ssim`` * (1 - mean SSIM), over the usable pixels.
 
     Where ``usable`` is below 1, the rendered colour is mixed with the filmed one before the comparison, so that an
@@ -101,18 +102,16 @@ class Photometric:
     weight: float = 1.0
     ssim: float = 0.2
     window: Window = SMALL
-    needs: frozenset[str] = field(default=frozenset(), init=False)
 
     def __call__(self, seen: Seen) -> Tensor | None:
         return photometric(seen.rendered, seen.image, seen.usable, self.ssim, self.window)
 
 
 @dataclass(frozen=True)
-class Mask:
+class Mask(ImageLoss):
     """Mean absolute difference of alpha and the soft foreground mask."""
 
     weight: float = 0.1
-    needs: frozenset[str] = field(default=frozenset(), init=False)
 
     def __call__(self, seen: Seen) -> Tensor | None:
         if seen.mask is None:
@@ -121,7 +120,7 @@ class Mask:
 
 
 @dataclass(frozen=True)
-class Depth:
+class Depth(ImageLoss):
     """Relative difference of the expected depth from the given one, robust, over the pixels where both are known.
 
     A pixel counts when a depth is given, the foreground mask (if any) is above 1/2, and so is alpha. The error is
@@ -137,8 +136,8 @@ class Depth:
     weight: float = 0.01
     tolerance: float = 0.05
     scale: Literal["given", "median"] = "given"
-    needs: frozenset[str] = field(default=frozenset({"depth"}), init=False)
-    reads: ClassVar[str] = "depth"
+    needs: ClassVar[frozenset[str]] = frozenset({"depth"})
+    reads: ClassVar[str | None] = "depth"
 
     def __call__(self, seen: Seen) -> Tensor | None:
         if seen.depth is None or seen.given_depth is None:
@@ -155,7 +154,7 @@ class Depth:
 
 
 @dataclass(frozen=True)
-class Track:
+class Track(ImageLoss):
     """Distance in pixels between where tracked points project and where the tracker saw them, robust.
 
     Args:
@@ -164,8 +163,7 @@ class Track:
 
     weight: float = 0.01
     tolerance: float = 2.0
-    needs: frozenset[str] = field(default=frozenset(), init=False)
-    reads: ClassVar[str] = "tracks"
+    reads: ClassVar[str | None] = "tracks"
 
     def __call__(self, seen: Seen) -> Tensor | None:
         if seen.tracks is None or seen.means is None or seen.view is None or not len(seen.tracks.uv):
@@ -183,12 +181,12 @@ class Track:
 
 
 @dataclass(frozen=True)
-class Feature:
+class Feature(ImageLoss):
     """Mean absolute difference of rendered features from extracted ones, over the foreground."""
 
     weight: float = 0.1
-    needs: frozenset[str] = field(default=frozenset({"features"}), init=False)
-    reads: ClassVar[str] = "features"
+    needs: ClassVar[frozenset[str]] = frozenset({"features"})
+    reads: ClassVar[str | None] = "features"
 
     def __call__(self, seen: Seen) -> Tensor | None:
         if seen.features is None or seen.given_features is None:
@@ -200,7 +198,7 @@ class Feature:
 
 
 @dataclass(frozen=True)
-class ScaleHinge:
+class ScaleHinge(ImageLoss):
     """Mean of what the Gaussians' scales exceed ``limit`` by, in footprints: keeps blobs from swallowing the scene.
 
     The weight is the study's .05 per metre, whose footprint was 1.33 cm.
@@ -208,7 +206,6 @@ class ScaleHinge:
 
     weight: float = 7e-4
     limit: float = 3.8
-    needs: frozenset[str] = field(default=frozenset(), init=False)
 
     def __call__(self, seen: Seen) -> Tensor | None:
         if seen.scales is None or not len(seen.scales):
@@ -247,7 +244,7 @@ def tie_tracks(
         Sightings per frame; None where no tied track was seen.
     """
     if tracks.xyz is None or tracks.uv is None:
-        raise ValueError("tracks: expected positions (xyz) and pixels (uv), found only one of them: lift them first")
+        raise ValueError("tracks: expected positions (xyz) and pixels (uv), found only one of them. Lift them first.")
     if gaussians.shape[1:] != (tracks.n_frames, 3) or len(gaussians) < neighbours:
         raise ValueError(
             f"gaussians: expected at least {neighbours} of them over the tracks' {tracks.n_frames} frames, (N,T,3); "
@@ -267,6 +264,6 @@ def tie_tracks(
     for frame in range(tracks.n_frames):
         rows = np.flatnonzero(tied & tracks.seen[:, frame])
         uv = (tracks.uv[rows, frame] * scale).astype(np.float32)
-        found = (torch.from_numpy(a) for a in (nearest[rows], shift[rows], uv))
-        out.append(Sightings(*found) if len(rows) else None)
+        parts = (torch.from_numpy(a) for a in (nearest[rows], shift[rows], uv))
+        out.append(Sightings(*parts) if len(rows) else None)
     return out

@@ -1,4 +1,4 @@
-"""What is asked of a motion apart from the images: losses on nodes (ARAP, lengths) and on how they move.
+"""Losses of a motion itself, apart from the images: on the shape that nodes keep, and on how they move.
 
 All are means of unsquared norms, smooth at zero and exactly zero there. Lengths are in footprints (the world size of a
 working pixel), steps of time are those of the study's frame, 1/30 s, whatever the videos' own: a weight means the same
@@ -8,10 +8,11 @@ Offsets get no gradient from here: a motion is as stiff as it is, whenever it wa
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -29,7 +30,7 @@ SHIFTS = (FRAME, 3 * FRAME, 8 * FRAME)  # seconds over which shapes are compared
 
 @dataclass(frozen=True, eq=False)
 class Draw:
-    """What motion losses draw from. span: first and last world second of the footage; footprint: world units;
+    """Where motion losses draw their moments. span: first and last world second of the footage; footprint: world units;
     frame_step: seconds of a frame of the reference; clocks float64 [V]: offsets, for a scaffold per video."""
 
     rng: np.random.Generator
@@ -44,18 +45,18 @@ class Draw:
         return float(self.rng.uniform(first, last)) if last > first else (first + last) / 2
 
 
-class MotionLoss(Protocol):
-    """A loss on a motion: `weight` applies in the steps in which it is evaluated, every `every`-th."""
+class MotionLoss(ABC):
+    """A loss on a motion: a frozen dataclass with a ``weight`` that inherits from this."""
 
-    @property
-    def weight(self) -> float: ...
+    weight: float
+    """Its share in the sum of losses, in the steps in which it is evaluated."""
 
-    @property
-    def every(self) -> int: ...
+    every: int = 1
+    """It is evaluated in every ``every``-th step."""
 
+    @abstractmethod
     def __call__(self, motion: Motion, means: Tensor, quats: Tensor, draw: Draw) -> Tensor | None:
         """The unweighted loss, a scalar; None where this motion has nothing of the kind."""
-        ...
 
 
 def soft_norm(x: Tensor, soft: float = SOFT) -> Tensor:
@@ -158,7 +159,7 @@ def _over_a_shift(loss: Arap | Length, change: Callable[..., Tensor], motion: Mo
 
 
 @dataclass(frozen=True)
-class Arap:
+class Arap(MotionLoss):
     """As rigid as possible: a node keeps its place in the frames of its neighbours (MoSca's L_coord).
 
     Compares two moments apart by one of `shifts` (seconds), drawn. Zero for rigid motions of all nodes together.
@@ -174,7 +175,7 @@ class Arap:
 
 
 @dataclass(frozen=True)
-class Length:
+class Length(MotionLoss):
     """Distances to neighbours are kept (MoSca's L_len), between two moments as for :class:`Arap`."""
 
     weight: float = 0.008
@@ -187,7 +188,7 @@ class Length:
 
 
 @dataclass(frozen=True)
-class Velocity:
+class Velocity(MotionLoss):
     """Mean distance travelled in 1/30 s, footprints: weak, it stills what no image holds."""
 
     weight: float = 0.00027
@@ -200,7 +201,7 @@ class Velocity:
 
 
 @dataclass(frozen=True)
-class Acceleration:
+class Acceleration(MotionLoss):
     """Mean second difference of positions over 1/30 s, footprints."""
 
     weight: float = 0.0133
@@ -223,7 +224,7 @@ def _turns(motion: Scaffold, times: list[float], draw: Draw) -> list[Tensor]:
 
 
 @dataclass(frozen=True)
-class RotationVelocity:
+class RotationVelocity(MotionLoss):
     """Mean angle by which a node turns in 1/30 s, radians."""
 
     weight: float = 0.001
@@ -239,7 +240,7 @@ class RotationVelocity:
 
 
 @dataclass(frozen=True)
-class RotationAcceleration:
+class RotationAcceleration(MotionLoss):
     """Mean change of the rotation vector from one 1/30 s to the next, radians."""
 
     weight: float = 0.001
@@ -252,7 +253,3 @@ class RotationAcceleration:
         t = draw.moment(step, step)
         before, after = _turns(motion, [t - step, t, t + step], draw)
         return soft_norm((after - before) * (FRAME / step) ** 2, SOFT_ANGLE).mean()
-
-
-#: The study's: set once on one scene, not tuned.
-MOTION_LOSSES: tuple[MotionLoss, ...] = (Arap(), Length(), Acceleration(), Velocity())

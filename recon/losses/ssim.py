@@ -50,7 +50,7 @@ def photometric(x: Tensor, y: Tensor, usable: Tensor | None, share: float, windo
     """
     if x.ndim != 3 or y.shape != x.shape or (usable is not None and usable.shape != x.shape[:2]):
         found = ", ".join(str(list(t.shape)) for t in (x, y, usable) if t is not None)
-        raise ValueError(f"x, y, usable: expected [h,w,c], [h,w,c] and [h,w], got {found}")
+        raise ValueError(f"x, y, usable: expected [h,w,c], [h,w,c] and [h,w]; found {found}.")
     total = x.shape[-1] * (x.shape[0] * x.shape[1] if usable is None else float(usable.sum()))
     if not total > 0:
         return None

@@ -1,4 +1,4 @@
-"""What a camera does to the light of one instant, as wrappers of the function that renders it.
+"""Effects of a camera on the light of one instant, as wrappers of the function that renders it.
 
 An ``Observe`` renders what the Gaussians show of one video at one world time. An effect takes an Observe and gives
 another: it may ask for several instants (motion blur), for other rows at other times (rolling shutter), or change the
@@ -9,17 +9,26 @@ The moment of a frame is the middle of its exposure and of its readout, as in th
 
 Effects act on what is rendered, *before* a cached backdrop is put behind it: the backdrop is a picture by the camera
 itself and has been through its effects already.
+
+An effect is one class, which says all that others must know of it: what it learns (``groups``, ``parameters``,
+``prior``), how it acts (``wrap``), whether a recording calls for it by itself (``called_for``, ``begun``), how one camera
+looks through it once the fit is done (``alone``), and how ``run.json`` keeps it (``kept``, ``restored``).
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from itertools import pairwise
-from typing import Any, Protocol
+from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
+
+from otsync.clocks.shutter import check_within_a_frame
+from recon.scene.groups import Group
 
 Params = Mapping[str, Tensor]
 
@@ -69,20 +78,73 @@ class Rendered:
 Observe = Callable[[Shot], Rendered]
 
 
-class Effect(Protocol):
-    """A frozen dataclass that changes how videos are observed."""
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """What is known of the videos of a fit before it begins.
+
+    Args:
+        readouts: seconds from the first to the last row that each video's camera declares; None where it declares none.
+        gains: (V,3) factors from the scene's colours to each video's, from the fit of the static part; None: not known.
+    """
+
+    readouts: tuple[float | None, ...]
+    gains: np.ndarray | None = None
+
+
+class Effect(ABC):
+    """A frozen dataclass that changes how videos are observed. Inherit from it; only :meth:`wrap` must be there."""
+
+    groups: ClassVar[tuple[Group, ...]] = ()
+    """The parameter groups that it learns, with the rates that they begin with."""
+
+    instant: ClassVar[bool] = False
+    """Whether it asks only for the frame's own instant and box: then a GPU renders the images of a step at once."""
 
     def parameters(self, n_videos: int) -> dict[str, Tensor]:
-        """Learnable groups at their initial values, by a name of their own; {} when there is nothing to learn."""
-        ...
+        """Learnable groups at their initial values, by the names of ``groups``; {} when there is nothing to learn."""
+        return {}
 
     def prior(self, params: Params) -> Tensor | None:
         """A term of the loss that holds the parameters near where they are believed; None when there is none."""
-        ...
+        return None
 
+    @abstractmethod
     def wrap(self, observe: Observe, params: Params) -> Observe:
         """``observe`` as seen through this effect."""
-        ...
+
+    @classmethod
+    def called_for(cls, recorded: Recorded) -> Effect | None:
+        """The effect that a recording calls for by itself, where the user gave none of this class; None: none."""
+        return None
+
+    def begun(self, recorded: Recorded) -> Effect:
+        """The effect as the fit begins with it: what was left open is taken from the recording."""
+        return self
+
+    def alone(self, video: int | None, learned: Params) -> Effect | None:
+        """The effect for a look through one camera, as its video 0 and without parameters.
+
+        Args:
+            video: the camera's place in the fit; None: it took no part, so that only what holds for all is known of it.
+            learned: parameters that the fit came to.
+
+        Returns:
+            None where the effect does not tell how this camera sees. What learns must say so itself.
+        """
+        return None if self.groups else self
+
+    def check(self, times: np.ndarray) -> None:
+        """ValueError where it cannot be of a camera whose frames are at these seconds of its own clock."""
+        return
+
+    def kept(self) -> dict[str, Any]:
+        """What ``run.json`` keeps of an effect that :meth:`alone` gave: here the fields of a dataclass, as JSON takes them."""
+        return {f.name: getattr(self, f.name) for f in fields(self)} if is_dataclass(self) else {}
+
+    @classmethod
+    def restored(cls, kept: Mapping[str, Any]) -> Effect:
+        """The effect that :meth:`kept` told of. ValueError or TypeError for anything else."""
+        return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in kept.items()})
 
 
 def compose(observe: Observe, effects: Sequence[Effect], params: Params) -> Observe:
@@ -106,34 +168,6 @@ def initial_parameters(effects: Sequence[Effect], n_videos: int) -> dict[str, Te
     return out
 
 
-def with_declared(effects: Sequence[Effect], readouts: Sequence[float | None]) -> tuple[Effect, ...]:
-    """``effects``, and after them the rolling shutter that the videos' cameras declare; the same where none does.
-
-    A shutter among ``effects`` stands for all of them.
-    """
-    if not any(readouts) or any(isinstance(e, RollingShutter) for e in effects):
-        return tuple(effects)
-    return (*effects, RollingShutter(tuple(float(r or 0.0) for r in readouts)))
-
-
-def optics(effects: Sequence[Effect], readout: float | None, video: int | None = None) -> tuple[Effect, ...]:
-    """What blurs and slants the images of one camera, for a look through it alone, as its video 0.
-
-    Args:
-        readout: that the camera declares. video: its place among those ``effects`` are of; None: none of them, so that
-            only what holds for all is known of it.
-    """
-    own = [
-        alone for e in effects if isinstance(e, MotionBlur | RollingShutter) and (alone := e.alone(video)) is not None
-    ]
-    return with_declared(own, [readout])
-
-
-def common_exposure(effects: Sequence[Effect]) -> float:
-    """Seconds that all shutters were open, as far as ``effects`` tell; 0: sharp, or each its own."""
-    return next((e.exposure for e in effects if isinstance(e, MotionBlur) and not isinstance(e.exposure, tuple)), 0.0)
-
-
 def prior(effects: Sequence[Effect], params: Params) -> Tensor | None:
     """Sum of the effects' priors; None when no effect has one."""
     terms = [term for effect in effects if (term := effect.prior(params)) is not None]
@@ -141,13 +175,13 @@ def prior(effects: Sequence[Effect], params: Params) -> Tensor | None:
 
 
 @dataclass(frozen=True, eq=False)
-class Gain:
+class Gain(Effect):
     """Every video's own exposure and white balance: colours times a factor per channel, with a prior towards its start.
 
     Unmodelled gains of 5 % bias offsets by .01 to .03 frame where few small cameras see the scene.
 
     Args:
-        start: initial factors, [V,3] or [V]; None: all 1. Those of the static fit are the best to start from.
+        start: initial factors, [V,3] or [V]; None: those of the static fit, or all 1.
         weight: of the prior ``weight * sum (gain - start)^2``.
         white_balance: one factor per channel; False: one for all three.
     """
@@ -155,6 +189,8 @@ class Gain:
     start: Any = None
     weight: float = 0.02
     white_balance: bool = True
+    groups: ClassVar[tuple[Group, ...]] = (Group("gain", 1e-3),)
+    instant: ClassVar[bool] = True
 
     def parameters(self, n_videos: int) -> dict[str, Tensor]:
         """``gain`` [V,3], or [V,1] without white balance."""
@@ -177,6 +213,15 @@ class Gain:
 
         return with_gain
 
+    @classmethod
+    def called_for(cls, recorded: Recorded) -> Gain | None:
+        """Wherever the static part tells the videos' colours."""
+        return None if recorded.gains is None else cls(start=recorded.gains)
+
+    def begun(self, recorded: Recorded) -> Gain:
+        """From the static part's gains, unless it has a start of its own."""
+        return self if self.start is not None else replace(self, start=recorded.gains)
+
     def _start(self, n_videos: int) -> Tensor:
         channels = 3 if self.white_balance else 1
         if self.start is None:
@@ -192,7 +237,7 @@ class Gain:
 
 
 @dataclass(frozen=True)
-class MotionBlur:
+class MotionBlur(Effect):
     """A shutter that is open for a while: the mean over ``samples`` instants spread evenly over the exposure.
 
     Args:
@@ -214,14 +259,15 @@ class MotionBlur:
         _check_count("exposure", self.exposure, n_videos)
         return {}
 
-    def alone(self, video: int | None) -> MotionBlur | None:
-        """As it is for one video; None: for one that it does not tell of."""
+    def alone(self, video: int | None, learned: Params) -> MotionBlur | None:
+        """With that video's exposure, or the one of all."""
         own = _of_one(self.exposure, video)
         return None if own is None else replace(self, exposure=own)
 
-    def prior(self, params: Params) -> Tensor | None:
-        """None."""
-        return None
+    def check(self, times: np.ndarray) -> None:
+        """An exposure is no longer than a frame."""
+        if not isinstance(self.exposure, tuple):
+            check_within_a_frame(self.exposure, times, "exposure")
 
     def wrap(self, observe: Observe, params: Params) -> Observe:
         """Average what is seen over the exposure."""
@@ -237,44 +283,68 @@ class MotionBlur:
 
 
 @dataclass(frozen=True)
-class RollingShutter:
+class RollingShutter(Effect):
     """Rows are read one after the other: row r is seen at ``t + readout * ((r + 1/2) / height - 1/2)``.
 
     Args:
         readout: seconds of the own clock from the first to the last row (``Camera.readout``), one for all videos or one
-            per video; 0: all rows at once, the same bits.
+            per video; 0: all rows at once, the same bits. None: as the cameras of the recording declare.
         bands: equal bands of rows that share the time of their middle; each one is a rendering of its rows only. They
             divide the whole image, so that a crop shows what the image would. A row is at most
             ``readout / (2 * bands)`` from its own time.
     """
 
-    readout: float | tuple[float, ...]
+    readout: float | tuple[float, ...] | None = None
     bands: int = 8
 
     def __post_init__(self) -> None:
-        _check_seconds("readout", self.readout)
+        if self.readout is not None:
+            _check_seconds("readout", self.readout)
         if self.bands < 1:
             raise ValueError(f"bands: expected at least one band of rows, found {self.bands}")
 
     def parameters(self, n_videos: int) -> dict[str, Tensor]:
         """Nothing to learn."""
-        _check_count("readout", self.readout, n_videos)
+        _check_count("readout", self._known(), n_videos)
         return {}
 
-    def alone(self, video: int | None) -> RollingShutter | None:
-        """As it is for one video; None: for one that it does not tell of."""
-        own = _of_one(self.readout, video)
+    def _known(self) -> float | tuple[float, ...]:
+        if self.readout is None:
+            raise ValueError("readout: expected seconds; found None, which only a recording fills in (with_declared).")
+        return self.readout
+
+    @classmethod
+    def called_for(cls, recorded: Recorded) -> RollingShutter | None:
+        """Wherever a camera declares a readout."""
+        return cls().begun(recorded) if any(recorded.readouts) else None
+
+    def begun(self, recorded: Recorded) -> RollingShutter:
+        """With the readouts that the cameras declare, unless it has its own. ValueError where none declares any."""
+        if self.readout is not None:
+            return self
+        if not any(recorded.readouts):
+            raise ValueError(
+                "readout: expected seconds, since no camera declares any; found none. Give RollingShutter a readout, or "
+                "declare camera.readout in the recording."
+            )
+        return replace(self, readout=tuple(float(r or 0.0) for r in recorded.readouts))
+
+    def alone(self, video: int | None, learned: Params) -> RollingShutter | None:
+        """With that video's readout, or the one of all."""
+        own = None if self.readout is None else _of_one(self.readout, video)
         return None if own is None else replace(self, readout=own)
 
-    def prior(self, params: Params) -> Tensor | None:
-        """None."""
-        return None
+    def check(self, times: np.ndarray) -> None:
+        """A readout is no longer than a frame."""
+        if self.readout is not None and not isinstance(self.readout, tuple):
+            check_within_a_frame(self.readout, times, "readout")
 
     def wrap(self, observe: Observe, params: Params) -> Observe:
         """Show every band of rows at its own time."""
+        known = self._known()
 
         def rolled(shot: Shot) -> Rendered:
-            readout = _of_video(self.readout, shot.video)
+            readout = _of_video(known, shot.video)
             if readout == 0:
                 return observe(shot)
             x0, y0, x1, y1 = shot.box
@@ -315,7 +385,11 @@ def _of_video(seconds: float | tuple[float, ...], video: int) -> float:
 
 
 def _of_one(seconds: float | tuple[float, ...], video: int | None) -> float | None:
-    return seconds if not isinstance(seconds, tuple) else None if video is None else seconds[video]
+    if not isinstance(seconds, tuple) or video is None:
+        return None if isinstance(seconds, tuple) else seconds
+    if video >= len(seconds):
+        raise ValueError(f"effects: expected seconds of every video; found {len(seconds)}, none for video {video}.")
+    return seconds[video]
 
 
 def _check_seconds(name: str, seconds: float | tuple[float, ...]) -> None:

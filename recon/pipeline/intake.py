@@ -1,4 +1,4 @@
-"""What of a recording takes part in a fit: frames that can be read, videos that have a clock; the rest is named."""
+"""The part of a recording that is fitted: frames that can be read, videos that have a clock; the rest is named."""
 
 from __future__ import annotations
 
@@ -39,8 +39,9 @@ def readable(scene: Scene, cache: Any, map: MapLike, progress: Progress) -> Scen
         return cache.arrays("readable", key, compute)
 
     index = []
-    for video, found in zip(scene.videos, map(look, list(zip(scene.videos, scene.masks, strict=True))), strict=True):
-        bad = {int(k): str(why) for k, why in found.items() if k != "looked"}
+    answers = map(look, list(zip(scene.videos, scene.masks, strict=True)))
+    for video, answer in zip(scene.videos, answers, strict=True):
+        bad = {int(k): str(why) for k, why in answer.items() if k != "looked"}
         for k, why in sorted(bad.items())[:3]:
             progress.note(f"video {video.name}, frame {k} is left out: {why}")
         if len(bad) > 3:

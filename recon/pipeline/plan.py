@@ -1,54 +1,56 @@
-"""What is done with a recording, and what is said while it happens."""
+"""How a recording is reconstructed: one dataclass for Python, ``recon fit``, ``otsync run`` and ``recon bench``."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
+
+import tyro
 
 from otsync.types.checks import check_whole
-from recon.fit.densify import Densify
-from recon.fit.problem import Loss
-from recon.fit.verb import LOSSES
+from recon.fit.options import FitOptions
 from recon.motion import ScaffoldOptions
-from recon.observe.effects import Effect
+from recon.observe import Effect, MotionBlur
+from recon.pipeline.readings import read_by
 from recon.scene.device import device_of
 from recon.scene.seed import Seeding
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What is done with a recording.
-
-    Args:
-        width: working pixels. frames: first and last (exclusive) frame of every video; None: all.
-        scaffold: how the motion is built. seeding: how densely Gaussians begin.
-        losses, effects, densify: of the fit. The rolling shutters that cameras declare and the gains of the backdrop
-            are added to the effects by themselves.
-        freeze: parameter groups that the fit holds, "offsets" for instance.
-        batch: images a step. On a CPU each is rendered on a thread of its own; on a GPU all are one rendering, unless
-            a shutter or an exposure is modelled or the scene is drawn together with its static part.
-        views: frames of every camera that are compared at the end. backdrop_steps: of the fit of the static part.
-        save_every: seconds between savings of the fit.
-        device: where static part and motion are fitted: "cpu", or "cuda" for a GPU; the rest is done on the CPU.
-
-    ValueError names a number that makes no sense, and a device that is not there.
-    """
+    """How a recording is reconstructed. ValueError names an option that makes no sense, and a device that is not there."""
 
     width: int = 320
+    """Working pixels of an image's width."""
     frames: tuple[int, int] | None = None
+    """First and last (exclusive) frame of every video to use; default: all."""
+    fit: Annotated[FitOptions, tyro.conf.arg(name="")] = field(default_factory=FitOptions)
+    """How the scene is fitted to its videos."""
+    exposure: float = 0.0
+    """Seconds that the shutters were open, where moving things are blurred: short for --effects motion-blur:exposure=S."""
     scaffold: ScaffoldOptions = field(default_factory=ScaffoldOptions)
+    """How the motion is built."""
     seeding: Seeding = field(default_factory=Seeding)
-    losses: tuple[Loss, ...] = LOSSES
-    effects: tuple[Effect, ...] = ()
-    densify: Densify | None = None
-    freeze: tuple[str, ...] = ()
-    batch: int = 2
-    seed: int = 0
-    views: int = 50
+    """How densely Gaussians begin."""
     backdrop_steps: int = 1500
-    save_every: float = 60.0
+    """Steps of the fit of the static part, before anything moves."""
+    views: int = 50
+    """Frames of every camera that are compared at the end."""
     device: str = "cpu"
+    """cpu, or cuda for a GPU with gsplat: where static part and motion are fitted; the rest is done on the CPU."""
 
     def __post_init__(self) -> None:
-        for name, least in (("width", 1), ("batch", 1), ("views", 1), ("backdrop_steps", 0)):
+        for name, least in (("width", 1), ("views", 1), ("backdrop_steps", 0)):
             check_whole(name, getattr(self, name), least)
+        if self.frames is not None and not 0 <= self.frames[0] < self.frames[1]:
+            raise ValueError(f"frames: expected first < stop, from 0; found {self.frames[0]} {self.frames[1]}.")
+        if self.exposure and any(isinstance(effect, MotionBlur) for effect in self.fit.effects):
+            raise ValueError("exposure, effects: expected motion blur from one of them; found it in both.")
+        read_by(self.fit.losses)
         device_of(self.device)
+        _ = self.effects
+
+    @property
+    def effects(self) -> tuple[Effect, ...]:
+        """The effects that were asked for: those of the fit, and the blur of ``exposure`` before them."""
+        return (MotionBlur(self.exposure), *self.fit.effects) if self.exposure else self.fit.effects

@@ -1,8 +1,4 @@
-"""What a fit begins with, made from a recording and its offsets: what takes part, then every stage, kept on disk.
-
-With :mod:`recon.initial` and :mod:`recon.pipeline` this is the only part of ``recon`` that calls otsync's algorithms,
-and imports them when it runs.
-"""
+"""From a recording and its offsets to all that a fit begins with: who takes part, then every stage, kept on disk."""
 
 from __future__ import annotations
 
@@ -12,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from otsync.clocks.shutter import at_frame_times, check_within_a_frame
+from otsync.clocks.shutter import at_frame_times
 from otsync.compute.threads import MapLike
 from otsync.io import Scene
 from otsync.io.mend import cut
@@ -20,9 +16,10 @@ from otsync.progress import Progress
 from otsync.types import Clock, Offsets, TrackSet
 from recon.backdrop.fit import StaticFit, with_backdrop
 from recon.footage.footage import Footage
-from recon.observe.effects import common_exposure
+from recon.observe.recorded import check_effects
 from recon.pipeline.intake import readable, split
 from recon.pipeline.plan import Plan
+from recon.pipeline.readings import read_by, with_readings
 from recon.pipeline.stages import backdrop_of_scene, initial_scene, lifted_tracks, read_footage
 from recon.pipeline.track_sets import tracks_of
 from recon.scene.gaussians4d import Gaussians4D
@@ -30,7 +27,7 @@ from recon.scene.gaussians4d import Gaussians4D
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """What a fit of a recording begins with.
+    """A recording, ready to be fitted.
 
     Args:
         footage: of the training videos, in the order of ``offsets``. held_out: of the others.
@@ -76,7 +73,7 @@ def prepare(
             tracked and lifted here.
         held_out: names of videos that nothing here sees but their own footage.
         backdrop: the static part, its gains those of the training videos in their order; default: fitted here.
-        cache: an :class:`otsync.priors.cache.Cache`. map: any map-like callable; two threads use two cores.
+        cache: an :class:`otsync.files.cache.Cache`. map: any map-like callable; two threads use two cores.
 
     ValueError names what is missing or does not fit: a backdrop with gains of other videos, nothing that moves.
     """
@@ -84,12 +81,14 @@ def prepare(
 
     plan, progress, cache = plan or Plan(), progress or Progress(), cache or Cache()
     for video in scene.videos:
-        check_within_a_frame(common_exposure(plan.effects), video.times, "exposure")
+        check_effects(plan.effects, video.times)
     if plan.frames is not None:
         scene = cut(scene, *plan.frames)
     with progress.stage("reading"):
         scene = readable(scene, cache, map, progress)
         train, others, offsets, clocks = split(scene, offsets, held_out, progress)
+    for v, video in enumerate(train.videos):
+        check_effects(plan.effects, video.times, v)
     if backdrop is not None and backdrop.gains.shape != (len(train.videos), 3):
         raise ValueError(
             f"backdrop: expected gains of shape ({len(train.videos)},3), of the videos to fit in their order "
@@ -116,5 +115,8 @@ def prepare(
         footage = tuple(
             f if f.background is None else with_backdrop(static, f, gains[v]) for v, f in enumerate(footage)
         )
+    wanted = read_by(plan.fit.losses)
+    if wanted:
+        footage = with_readings(wanted, train, footage, tracks, initial, offsets, plan.width)
     left_out = tuple(n for n in scene.names if n not in train.names and n not in held_out)
     return Prepared(footage, held, clocks, offsets, tuple(tracks), initial, gains, scene.frame, left_out)

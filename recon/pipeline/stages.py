@@ -9,7 +9,7 @@ initial scene    a scaffold through the lifted tracks, Gaussians seeded from dep
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -43,9 +43,9 @@ def lifted_tracks(scene: Scene, offsets: Offsets, cache: Any, map: MapLike, prog
     stages = replace(recordings.Stages(), selection=Selection(**MANY))
     raw = recordings.track_all(scene, stages, cache, map, progress.tell)
     flat: list[TrackSet | None] = []
-    for video, found in zip(scene.videos, raw, strict=True):
+    for video, one in zip(scene.videos, raw, strict=True):
         try:
-            flat.append(recordings.select(video, found, stages, scene.frame))
+            flat.append(recordings.select(video, one, stages, scene.frame))
         except ValueError:
             flat.append(None)
             progress.note(f"video {video.name}: nothing moves enough to be tracked; it only adds images")
@@ -152,18 +152,18 @@ def backdrop_of_scene(
         lifted = [t.positions()[t.seen] for t in tracks]
         points = np.concatenate([p[:: max(1, len(p) // POINTS)] for p in lifted])
         depth = [None if v.depth is None else working_depth(v, width=plan.width) for v in scene.videos]
-        found = fit_backdrop(
+        static = fit_backdrop(
             footage,
             depth=None if all(d is None for d in depth) else depth,
             points=points,
             steps=plan.backdrop_steps,
-            seed=plan.seed,
+            seed=plan.fit.seed,
             device=plan.device,
         )
-        parts = {n: getattr(found.gaussians, n).numpy() for n in GAUSSIAN}
-        return {**parts, "gains": found.gains, "near": np.array(found.near), "psnr": found.psnr}
+        parts = {n: getattr(static.gaussians, n).numpy() for n in GAUSSIAN}
+        return {**parts, "gains": static.gains, "near": np.array(static.near), "psnr": static.psnr}
 
-    key = (*scene_key(scene, tracks), plan.width, plan.backdrop_steps, plan.seed)
+    key = (*scene_key(scene, tracks), plan.width, plan.backdrop_steps, plan.fit.seed)
     if plan.device != "cpu":  # rounds otherwise
         key = (*key, plan.device)
     try:
@@ -179,7 +179,7 @@ def backdrop_of_scene(
 POINTS = 2000
 """Positions of what moves, per video, that the backdrop takes its scale from."""
 
-GAUSSIAN = ("means", "quats", "log_scales", "opacity_logits", "sh")
+GAUSSIAN = tuple(f.name for f in fields(Gaussians))
 
 
 def initial_scene(
@@ -196,18 +196,18 @@ def initial_scene(
     """The scene before any refinement: a scaffold through the tracks, and what the depth maps show of it; kept."""
     clocks = (np.round(offsets.seconds, 6).tolist(), np.round(offsets.rates, 9).tolist(), offsets.reference)
     gains = np.ones((len(footage), 3)) if static is None else static.gains
-    key = (*scene_key(scene, tracks), clocks, gains.tolist(), plan.width, plan.scaffold, plan.seeding, plan.seed)
+    key = (*scene_key(scene, tracks), clocks, gains.tolist(), plan.width, plan.scaffold, plan.seeding, plan.fit.seed)
 
     def build() -> dict[str, np.ndarray]:
         built = seeded(scene, offsets, tracks, footage, gains, plan, cache, map, progress)
         # in the layout that a file gives back: sums over another one differ in their last bits
         return {k: np.array(v, order="C") for k, v in scene_arrays(built).items()}
 
-    found = scene_from_arrays(cache.arrays("initial", key, build))
-    progress.tell(f"initial scene: {len(found)} moving Gaussians")
+    initial = scene_from_arrays(cache.arrays("initial", key, build))
+    progress.tell(f"initial scene: {len(initial)} moving Gaussians")
     if static is None:
-        return found
-    return replace(found, static=static.gaussians, near=static.near)
+        return initial
+    return replace(initial, static=static.gaussians, near=static.near)
 
 
 def seeded(
@@ -233,7 +233,7 @@ def seeded(
         frame_step=frame_step,
         options=plan.scaffold,
         rates=offsets.rates,
-        seed=plan.seed,
+        seed=plan.fit.seed,
     )
     progress.tell(f"scaffold: {len(motion)} nodes of {sum(len(t) for t in tracks)} tracks, footprint {footprint:.4g}")
     worlds = [offsets.clock(v).world(f.times) for v, f in enumerate(footage)]

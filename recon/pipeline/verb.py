@@ -6,7 +6,7 @@ A run that was killed continues from its stages and its checkpoint, and ends wit
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +17,14 @@ from otsync.compute.threads import MapLike
 from otsync.files.arrays import write_json
 from otsync.io import Scene
 from otsync.io.mend import cut
+from otsync.metrics import offset_error
 from otsync.progress import Progress
 from otsync.types import Clock, Offsets, TrackSet
-from recon.evaluate.figures import offset_error
 from recon.evaluate.lpips import Lpips
 from recon.evaluate.views import ViewScore, view
-from recon.fit.optimize import RATES, without
 from recon.fit.verb import Reconstruction, fit
-from recon.observe.effects import Gain, MotionBlur, common_exposure, optics, with_declared
+from recon.observe.effects import Effect
+from recon.observe.recorded import kept, optics, with_declared
 from recon.pipeline.intake import given_clocks, readable
 from recon.pipeline.plan import Plan
 from recon.pipeline.prepare import Prepared, prepare
@@ -35,14 +35,14 @@ from recon.result.report import write_reconstruction_report
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What :func:`reconstruct` came to.
+    """A reconstructed recording.
 
     Args:
-        found: the fit. coarse: the offsets it began with, of the same videos. truth: (V,) seconds, where known.
+        fitted: scene and clocks. coarse: the offsets it began with, of the same videos. truth: (V,) seconds, where known.
         views: how well every camera that was compared is shown. left_out: videos without an offset.
     """
 
-    found: Reconstruction
+    fitted: Reconstruction
     coarse: Offsets
     views: tuple[ViewScore, ...]
     left_out: tuple[str, ...] = ()
@@ -59,91 +59,72 @@ def reconstruct(
     tracks: Sequence[TrackSet] | None = None,
     held_out: Sequence[str] = (),
     truth: Offsets | None = None,
-    steps: int | None = None,
-    budget: float | None = None,
     cache: Any = None,
     map: MapLike = map,
     progress: Progress | None = None,
 ) -> Outcome:
-    """Prepare, fit, evaluate and write the result folder (see :mod:`recon.result`).
+    """Prepare, fit, evaluate and write the result folder (see :mod:`recon.result.folder`).
 
-    A run that was killed continues from its stages and from ``fit.npz``; given ``steps``, it ends with the same files.
+    A run that was killed continues from its stages and from ``fit.npz``; unless it has a budget in seconds, it ends with
+    the same files.
 
     Args:
+        plan: how; ``plan.fit`` is how the scene is fitted.
         tracks: in space, of training videos; default: tracked and lifted here.
-        truth: true offsets of at least the training videos. steps, budget: see :func:`recon.fit.fit`.
+        held_out: names of videos that only the evaluation sees.
+        truth: true offsets of at least the training videos.
+        cache: an :class:`otsync.files.cache.Cache`; default: ``stages`` in ``out``. map: any map-like callable.
     """
     from otsync.files.cache import Cache
 
     plan, progress, cache = plan or Plan(), progress or Progress(), cache or Cache(out / "stages")
-    rates = without(RATES, *plan.freeze)  # says what is wrong before the work
     out.mkdir(parents=True, exist_ok=True)
     clear_parts(out, out / "stages")
     ready = prepare(scene, offsets, tracks, plan=plan, held_out=held_out, cache=cache, map=map, progress=progress)
     true = None if truth is None else true_seconds(truth, ready.offsets)
-    effects = (*with_declared(plan.effects, [f.readout for f in ready.footage]), Gain(start=ready.gains))
+    effects = with_declared(plan.effects, [f.readout for f in ready.footage], ready.gains)
+    kept([effect for effect in effects if not effect.groups])  # says before the work what run.json cannot name
+    options = replace(plan.fit, effects=effects)
     with progress.stage("fit"):
-        found = fit(
-            ready.initial.to(plan.device),
-            ready.footage,
-            ready.offsets,
-            losses=plan.losses,
-            effects=effects,
-            rates=rates,
-            steps=steps,
-            budget=budget,
-            batch=plan.batch,
-            densify=plan.densify,
-            seed=plan.seed,
-            checkpoint=out / "fit.npz",
-            save_every=plan.save_every,
-        )
-    _write_fit(out, found)
+        initial = ready.initial.to(plan.device)
+        fitted = fit(initial, ready.footage, ready.offsets, options, checkpoint=out / "fit.npz")
+    _write_fit(out, fitted)
     with progress.stage("views"):
-        videos, scores = compared(found, ready, plan, progress)
-    outcome = Outcome(found, ready.offsets, scores, ready.left_out, true, Lpips().reason)
-    _write(out, outcome, videos, ready, plan, progress)
+        videos, scores = compared(fitted, effects, ready, plan, progress)
+    outcome = Outcome(fitted, ready.offsets, scores, ready.left_out, true, Lpips().reason)
+    _write(out, outcome, videos, effects, ready, plan, progress)
     return outcome
 
 
 def compared(
-    found: Reconstruction, ready: Prepared, plan: Plan, progress: Progress
+    fitted: Reconstruction, effects: Sequence[Effect], ready: Prepared, plan: Plan, progress: Progress
 ) -> tuple[tuple[FilmedBy, ...], tuple[ViewScore, ...]]:
     """Every camera on the fitted scene, and how well the held-out ones and some of the others are shown.
 
-    A camera that cannot be placed or scored is noted and left out: it shall not cost the fit.
+    A camera that cannot be placed or scored is noted and left out; the fit is kept.
     """
-    gains = found.parameters["gain"].detach().cpu().numpy().astype(float)
+    learned = fitted.parameters
+    gains = learned["gain"].detach().cpu().numpy().astype(float)
+    gains = np.broadcast_to(gains, (len(gains), 3)).copy()
     clocks = [
-        Clock(float(s), float(r), "fitted") for s, r in zip(found.offsets.seconds, found.offsets.rates, strict=True)
+        Clock(float(s), float(r), "fitted") for s, r in zip(fitted.offsets.seconds, fitted.offsets.rates, strict=True)
     ]
-    videos = [FilmedBy.of(f, clocks[n], gains[n]) for n, f in enumerate(ready.footage)]
+    through = [optics(effects, f.readout, n, learned) for n, f in enumerate(ready.footage)]
+    videos = [FilmedBy.of(f, clocks[n], gains[n], through[n]) for n, f in enumerate(ready.footage)]
     scores = []
     for footage in ready.held_out:
+        own = optics(effects, footage.readout, None, learned)
         try:
-            looking = view(
-                found.scene,
-                footage,
-                ready.clocks.get(footage.name),
-                layered=ready.layered,
-                optics=optics(plan.effects, footage.readout),
-            )
+            looking = view(fitted.scene, footage, ready.clocks.get(footage.name), layered=ready.layered, optics=own)
             scores.append(looking.score(most=plan.views))
         except ValueError as error:
             progress.note(f"held-out video {footage.name} is not compared: {error}")
         else:
-            videos.append(FilmedBy.of(footage, looking.clock, looking.gain, held_out=True))
+            videos.append(FilmedBy.of(footage, looking.clock, looking.gain, own, held_out=True))
     for n in evenly(len(ready.footage), SHOWN_TRAINING).tolist():
         footage = ready.footage[n]
         try:
-            looking = view(
-                found.scene,
-                footage,
-                clocks[n],
-                gain=gains[n],
-                layered=ready.layered,
-                optics=optics(plan.effects, footage.readout, n),
-            )
+            looking = view(fitted.scene, footage, clocks[n], gain=gains[n], layered=ready.layered, optics=through[n])
             scores.append(looking.score(most=max(1, plan.views // 4), held_out=False))
         except ValueError as error:
             progress.note(f"video {footage.name} is not compared: {error}")
@@ -154,33 +135,39 @@ SHOWN_TRAINING = 2
 """Training cameras that are compared as well, to show what the held-out ones lack."""
 
 
-def _write_fit(out: Path, found: Reconstruction) -> None:
+def _write_fit(out: Path, fitted: Reconstruction) -> None:
     """Scene and clocks, before anything is done with them that may fail.
 
     ``run.json`` of an earlier run goes first: from here until the new one is written the folder is not finished, so
     that a kill cannot leave the old cameras beside the new scene.
     """
     (out / "run.json").unlink(missing_ok=True)
-    found.scene.save(out / "scene.npz")
-    found.offsets.save(out / "offsets.json")
+    fitted.scene.save(out / "scene.npz")
+    fitted.offsets.save(out / "offsets.json")
 
 
 def _write(
-    out: Path, outcome: Outcome, videos: Sequence[FilmedBy], ready: Prepared, plan: Plan, progress: Progress
+    out: Path,
+    outcome: Outcome,
+    videos: Sequence[FilmedBy],
+    effects: Sequence[Effect],
+    ready: Prepared,
+    plan: Plan,
+    progress: Progress,
 ) -> None:
     """The rest of the result folder; run.json last but for the report, since with it the folder counts as finished."""
-    found = outcome.found
-    metrics = metrics_of(outcome.views, found.stats, outcome.lpips_reason)
+    fitted = outcome.fitted
+    metrics = metrics_of(outcome.views, fitted.stats, outcome.lpips_reason)
     if outcome.truth is not None:
-        metrics["offset_error"] = offset_figures(found.offsets, outcome.truth)
+        metrics["offset_error"] = offset_figures(fitted.offsets, outcome.truth)
     write_json(out / "metrics.json", metrics)
     options = {
         "width": plan.width,
         "frames": plan.frames,
-        "seed": plan.seed,
-        "freeze": list(plan.freeze),
+        "seed": plan.fit.seed,
+        "freeze": list(plan.fit.freeze),
         "layered": ready.layered,
-        "exposure": common_exposure(plan.effects),
+        "optics": kept([own for effect in effects if (own := effect.alone(None, fitted.parameters)) is not None]),
     }
     save_run(
         out,
@@ -192,7 +179,7 @@ def _write(
     )
     write_reconstruction_report(
         out / "report.html",
-        found,
+        fitted,
         outcome.coarse,
         [f.name for f in ready.footage],
         outcome.views,
@@ -205,8 +192,7 @@ def _write(
 
 def offset_figures(offsets: Offsets, true: np.ndarray) -> dict[str, Any]:
     """Mean and largest absolute error in frames, relative to the reference; None where there is no other video."""
-    step = 1.0 / float(offsets.fps[offsets.reference])
-    error = offset_error(offsets.seconds, true, step, reference=offsets.reference)
+    error = offset_error(offsets.seconds, true, float(offsets.fps[offsets.reference]), reference=offsets.reference)
     alone = len(error.errors) < 2
     return {
         "mean_frames": None if alone else error.mean,
@@ -238,8 +224,8 @@ def evaluate(
 ) -> tuple[tuple[ViewScore, ...], str]:
     """Scores of the named cameras against a finished result, and why LPIPS is missing ("" when it is not).
 
-    Clocks: as ``offsets`` say, else those of the result, else found on the frozen scene. Views are through the shutters
-    that the scene's cameras declare and the exposure that the result was fitted with, where all cameras had the same.
+    Clocks: as ``offsets`` say, else those of the result, else found on the frozen scene. A camera of the result is looked
+    through the effects that the fit gave it, any other through those that held for all, and the shutter that it declares.
     """
     from otsync.files.cache import Cache
 
@@ -252,15 +238,12 @@ def evaluate(
     part = readable(part, cache, map, progress)
     known = {v.name: v for v in result.videos}
     scores = []
-    exposure = float(result.options.get("exposure", 0.0))
-    blur = (MotionBlur(exposure),) if exposure else ()
     for footage in read_footage(part, int(result.options["width"]), cache, map, progress):
         own = known.get(footage.name)
         clock, gain = (None, None) if own is None else (own.clock, own.gain)
         if offsets is not None and (own is None or own.held_out):
             clock = given_clocks(offsets).get(footage.name, clock)
-        looking = view(
-            result.scene, footage, clock, gain=gain, layered=result.layered, optics=optics(blur, footage.readout)
-        )
+        through = optics(result.optics, footage.readout) if own is None else own.optics
+        looking = view(result.scene, footage, clock, gain=gain, layered=result.layered, optics=through)
         scores.append(looking.score(most=most, lpips=lpips, held_out=own is None or own.held_out))
     return tuple(scores), lpips.reason

@@ -1,15 +1,19 @@
 """A 4D scene as files that other tools read: 3DGS .ply at a moment or as a sequence, .splat, plain arrays, tracks.
 
-No public format stores splined motion: a sequence of .ply is what every viewer of 3DGS can play. ``.npz`` keeps
-everything and is read back by :meth:`Gaussians4D.load`; the dense trajectories are an ordinary otsync track set.
+No public format stores splined motion: every viewer of 3DGS can play a sequence of .ply. ``.npz`` keeps everything and
+is read back by :meth:`Gaussians4D.load`; the dense trajectories are an ordinary otsync track set.
+
+A format is one :class:`Exporter`: to add one, write it in one file and name it in ``EXPORTERS`` of recon/result/__init__.py,
+or ``@register("exporters")`` it in a file of your own.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal, get_args
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -17,8 +21,6 @@ from otsync.files.arrays import write_json
 from otsync.types import TrackSet
 from recon.scene.gaussians4d import Gaussians4D
 from recon.scene.ply import save_ply, save_splat
-
-Format = Literal["ply", "ply-sequence", "splat", "checkpoint", "tracks"]
 
 MAX_FRAMES = 100_000
 """Frames of one export; more is a wrong unit of time rather than a wish."""
@@ -70,22 +72,81 @@ def scene_tracks(scene: Gaussians4D, times: Sequence[float], name: str = "scene"
     return TrackSet(scene.tracks(times), features=features, timestamps=np.asarray(times, float), name=name, frame=frame)
 
 
-def export(
-    scene: Gaussians4D, kind: Format, out: str | os.PathLike[str], times: Sequence[float], frame: str = "world"
-) -> None:
-    """Write ``scene`` in one of the formats; ply and splat hold one moment, so ``times`` has one entry for them."""
-    if kind not in get_args(Format):
-        raise ValueError(f"format: expected one of {', '.join(get_args(Format))}; found {kind!r}.")
-    if kind != "checkpoint":
-        check_times(scene, times)
-    if kind in ("ply", "splat"):
-        if len(times) != 1:
-            raise ValueError(f"times: expected one moment for {kind}; found {len(times)}. Use ply-sequence for more.")
-        save: Callable = save_ply if kind == "ply" else save_splat
-        save(scene.at(float(times[0])), out)
-    elif kind == "ply-sequence":
+class Exporter(ABC):
+    """A format that a scene is written in."""
+
+    name: ClassVar[str]
+    """How the shell spells it."""
+
+    file: ClassVar[str]
+    """Name of the file or folder that it writes by default."""
+
+    holds: ClassVar[Literal["moment", "frames", "everything"]] = "frames"
+    """What it holds of time: one moment, the frames that are asked for, or all that the scene knows."""
+
+    @abstractmethod
+    def write(self, scene: Gaussians4D, out: Path, times: Sequence[float], frame: str) -> None:
+        """Write ``scene`` to ``out``.
+
+        Args:
+            times: world seconds: one of them for a format that holds a moment.
+            frame: name of the world frame that the recording declares.
+        """
+
+
+class Ply(Exporter):
+    """A moment as 3DGS .ply, which every viewer of Gaussians opens."""
+
+    name, file, holds = "ply", "scene.ply", "moment"
+
+    def write(self, scene: Gaussians4D, out: Path, times: Sequence[float], frame: str) -> None:
+        save_ply(scene.at(float(times[0])), out)
+
+
+class Splat(Exporter):
+    """A moment as .splat, small, for viewers in a browser."""
+
+    name, file, holds = "splat", "scene.splat", "moment"
+
+    def write(self, scene: Gaussians4D, out: Path, times: Sequence[float], frame: str) -> None:
+        save_splat(scene.at(float(times[0])), out)
+
+
+class PlySequence(Exporter):
+    """A folder with a .ply of every frame."""
+
+    name, file = "ply-sequence", "sequence"
+
+    def write(self, scene: Gaussians4D, out: Path, times: Sequence[float], frame: str) -> None:
         export_ply_sequence(scene, times, out)
-    elif kind == "checkpoint":
+
+
+class Checkpoint(Exporter):
+    """The whole scene with its motion, as plain arrays."""
+
+    name, file, holds = "checkpoint", "scene4d.npz", "everything"
+
+    def write(self, scene: Gaussians4D, out: Path, times: Sequence[float], frame: str) -> None:
         scene.save(out)
-    else:
+
+
+class Tracks(Exporter):
+    """The trajectories of all moving Gaussians, as an otsync track set."""
+
+    name, file = "tracks", "tracks.npz"
+
+    def write(self, scene: Gaussians4D, out: Path, times: Sequence[float], frame: str) -> None:
         scene_tracks(scene, times, frame=frame).save(out)
+
+
+def export(
+    scene: Gaussians4D, exporter: Exporter, out: str | os.PathLike[str], times: Sequence[float], frame: str = "world"
+) -> None:
+    """Write ``scene`` in a format. ValueError for times that it cannot hold, or that the videos do not cover."""
+    if exporter.holds != "everything":
+        check_times(scene, times)
+    if exporter.holds == "moment" and len(times) != 1:
+        raise ValueError(
+            f"times: expected one moment for {exporter.name}; found {len(times)}. Use a sequence for more."
+        )
+    exporter.write(scene, Path(out), times, frame)

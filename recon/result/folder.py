@@ -1,7 +1,7 @@
 """The folder of a reconstruction: writing it, and reading it back.
 
 scene.npz      the 4D scene          offsets.json   the refined clocks
-run.json       cameras, clocks and colour gains of every video, options, wall times, notes
+run.json       cameras, clocks, colour gains and effects of every video, options, wall times, notes
 metrics.json   figures of the views  report.html    all of it to look at
 fit.npz        the fit's last state  stages/        earlier results, from which a killed run continues
 """
@@ -22,9 +22,11 @@ from otsync.types import Camera, Clock, Offsets
 from otsync.types.clock import Source
 from recon.evaluate.views import ViewScore
 from recon.footage.footage import Footage
+from recon.observe.effects import Effect
+from recon.observe.recorded import kept, restored
 from recon.scene.gaussians4d import Gaussians4D
 
-FORMAT, VERSION = "otsync.reconstruction", 1
+FORMAT, VERSION = "otsync.reconstruction", 2
 MAX_VIDEOS = 10_000
 MAX_SIDE, MAX_PIXELS = 16_384, 2**26
 """Of one image: a foreign run.json or a requested width may take no more memory."""
@@ -37,6 +39,7 @@ class FilmedBy:
     Args:
         camera: at working size, without distortion. gain: factors of R, G, B from the scene's colours to its images.
         clock: where it stands in world time. times: (T,) seconds of its frames on its own clock.
+        optics: the effects that its images are looked through, see :func:`recon.observe.recorded.optics`.
     """
 
     name: str
@@ -45,14 +48,22 @@ class FilmedBy:
     gain: np.ndarray
     times: np.ndarray
     held_out: bool = False
+    optics: tuple[Effect, ...] = ()
 
     def __repr__(self) -> str:
         role = "held out" if self.held_out else "fitted"
         return f"FilmedBy({self.name!r}, {len(self.times)} frames, {self.clock}, {role})"
 
     @classmethod
-    def of(cls, footage: Footage, clock: Clock, gain: np.ndarray, held_out: bool = False) -> FilmedBy:
-        return cls(footage.name, footage.camera, clock, gain, footage.times, held_out)
+    def of(
+        cls,
+        footage: Footage,
+        clock: Clock,
+        gain: np.ndarray,
+        optics: tuple[Effect, ...] = (),
+        held_out: bool = False,
+    ) -> FilmedBy:
+        return cls(footage.name, footage.camera, clock, gain, footage.times, held_out, optics)
 
     def pose(self, t: float) -> np.ndarray:
         """w2c (4,4) at world second ``t``: of a moving camera that of the nearest frame."""
@@ -68,6 +79,7 @@ class SavedReconstruction:
 
     Args:
         options: those of the fit, as run.json has them. frame: name of the world frame.
+        optics: the effects that any other camera is looked through, apart from the shutter that it declares.
     """
 
     scene: Gaussians4D
@@ -75,6 +87,7 @@ class SavedReconstruction:
     videos: tuple[FilmedBy, ...]
     options: dict[str, Any] = field(default_factory=dict)
     frame: str = "world"
+    optics: tuple[Effect, ...] = ()
 
     @property
     def layered(self) -> bool:
@@ -116,6 +129,7 @@ def save_run(
                 "clock": clock,
                 "gain": [float(g) for g in v.gain],
                 "times": v.times.tolist(),
+                "optics": kept(v.optics),
             }
         )
     document = {
@@ -171,23 +185,26 @@ def load_result(folder: str | os.PathLike[str]) -> SavedReconstruction:
         )
     document = read_json(folder / "run.json")
     if not isinstance(document, dict) or document.get("format") != FORMAT or document.get("version") != VERSION:
-        raise ValueError(f"{folder / 'run.json'}: expected format {FORMAT!r}, version {VERSION}; found another.")
+        raise ValueError(
+            f"{folder / 'run.json'}: expected format {FORMAT!r}, version {VERSION}; found another. Run the fit again."
+        )
     try:
         rows = document["videos"]
         if not isinstance(rows, list) or not 1 <= len(rows) <= MAX_VIDEOS:
             raise ValueError(f"expected 1 to {MAX_VIDEOS} videos")
         videos = tuple(_filmed_by(row) for row in rows)
         options, frame = _options(document["options"]), str(document["frame"])
+        optics = restored(options["optics"])
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
         raise ValueError(
             f"{folder / 'run.json'}: not a sound reconstruction; {type(error).__name__}: {error}. Run the fit again."
         ) from None
     scene, offsets = Gaussians4D.load(folder / "scene.npz"), Offsets.load(folder / "offsets.json")
-    return SavedReconstruction(scene, offsets, videos, options, frame)
+    return SavedReconstruction(scene, offsets, videos, options, frame, optics)
 
 
 def _options(given: dict[str, Any]) -> dict[str, Any]:
-    """The options of the fit. ValueError where those that evaluation needs (width, frames, exposure) are unsound."""
+    """The options of the fit. ValueError where those that evaluation needs (width, frames) are unsound."""
     options = dict(given)
     if type(options["width"]) is not int or not 1 <= options["width"] <= MAX_SIDE:
         raise ValueError(f"options.width: expected 1 to {MAX_SIDE} pixels; found {options['width']!r}")
@@ -199,9 +216,6 @@ def _options(given: dict[str, Any]) -> dict[str, Any]:
         and 0 <= frames[0] < frames[1]
     ):
         raise ValueError(f"options.frames: expected null, or first and last frame; found {frames!r}")
-    exposure = options.get("exposure", 0.0)
-    if type(exposure) not in (int, float) or not 0 <= exposure < math.inf:
-        raise ValueError(f"options.exposure: expected seconds of 0 or more; found {exposure!r}")
     return options
 
 
@@ -259,4 +273,4 @@ def _filmed_by(row: dict[str, Any]) -> FilmedBy:
     times = np.array(row["times"], float)
     if times.ndim != 1 or not len(times) or (camera.w2c.ndim == 3 and len(times) != len(camera.w2c)):
         raise ValueError(f"times: expected one second per frame; found shape {times.shape}")
-    return FilmedBy(str(row["name"]), camera, clock, gain, times, bool(row["held_out"]))
+    return FilmedBy(str(row["name"]), camera, clock, gain, times, bool(row["held_out"]), restored(row["optics"]))

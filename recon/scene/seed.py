@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+import tyro
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
@@ -37,22 +38,20 @@ APART = 8 * 1 / 30
 
 @dataclass(frozen=True)
 class Seeding:
-    """How densely a scene is seeded.
+    """How densely Gaussians begin."""
 
-    Args:
-        voxel: footprints between seeds. support: pixels that must have seen a voxel, so that stray depths seed nothing.
-        reach: voxels around a Gaussian in which no other is seeded.
-        scale: standard deviation of a seed, in voxels. opacity: of a seed.
-        sh_degree: 1 to 4 where the colours of what moves depend on the direction from which they are seen (sheen,
-            strong lamps), in the world's directions; 0: they do not, and nothing is computed for it.
-    """
-
-    voxel: float = 2.7
+    voxel: tyro.conf.OmitArgPrefixes[float] = 2.7
+    """Working pixels between the Gaussians that what moves begins with: finer is slower and shows more."""
     support: int = 2
+    """Pixels that must have seen a voxel, so that stray depths seed nothing."""
     reach: float = 1.3
+    """Voxels within which a Gaussian of an earlier moment counts as being there already."""
     scale: float = 0.55
+    """Standard deviation of a Gaussian at the start, in voxels."""
     opacity: float = 0.8
-    sh_degree: int = 0
+    """Of a Gaussian at the start."""
+    sh_degree: tyro.conf.OmitArgPrefixes[int] = 0
+    """Harmonics of the colours of what moves, 1 to 4 where they depend on the view (sheen); 0: they do not."""
 
     def __post_init__(self) -> None:
         for name in ("voxel", "reach", "scale"):

@@ -73,14 +73,17 @@ def test_outliers_are_never_right():
 
 
 def test_offset_error_by_hand():
-    error = offset_error([0.0, 1.1, np.nan, -0.5], [0.0, 1.0, 2.0, -0.4], 30)
+    answer = offset_error([0.0, 1.1, np.nan, -0.5], [0.0, 1.0, 2.0, -0.4], 30)
+    error = answer.errors
+    assert (answer.mean, answer.max) == (pytest.approx(3), pytest.approx(3))  # without the reference and the unknown
     np.testing.assert_allclose(error, [0, 3, np.nan, -3])
-    shifted = offset_error([1.0, 2.1, np.nan, 0.5], [0.0, 1.0, 2.0, -0.4], 30)
+    shifted = offset_error([1.0, 2.1, np.nan, 0.5], [0.0, 1.0, 2.0, -0.4], 30).errors
     np.testing.assert_allclose(shifted, error, atol=1e-12)
-    np.testing.assert_allclose(offset_error([0, 0.1, 0.2], [0, 0, 0], 10, "median"), [-1, 0, 1], atol=1e-12)
-    np.testing.assert_allclose(offset_error([0, 0.1, 0.2], [0, 0, 0], 10, reference=1), [-1, 0, 1], atol=1e-12)
-    assert np.isnan(offset_error([np.nan, 1.0], [0.0, 1.0], 30)).all()
-    assert np.isnan(offset_error([np.nan, np.nan], [0.0, 1.0], 30, "median")).all()
+    np.testing.assert_allclose(offset_error([0, 0.1, 0.2], [0, 0, 0], 10, "median").errors, [-1, 0, 1], atol=1e-12)
+    np.testing.assert_allclose(offset_error([0, 0.1, 0.2], [0, 0, 0], 10, reference=1).errors, [-1, 0, 1], atol=1e-12)
+    assert np.isnan(offset_error([np.nan, 1.0], [0.0, 1.0], 30).errors).all()
+    assert np.isnan(offset_error([np.nan, np.nan], [0.0, 1.0], 30, "median").errors).all()
+    assert np.isnan(offset_error([0.0], [5.0], 30).mean)
 
 
 @given(
@@ -89,7 +92,7 @@ def test_offset_error_by_hand():
     st.sampled_from(["reference", "median"]),
 )
 def test_the_gauge_takes_out_a_common_shift(true, shift, gauge):
-    errors = offset_error(np.array(true) + shift, true, 30, gauge)
+    errors = offset_error(np.array(true) + shift, true, 30, gauge).errors
     np.testing.assert_allclose(errors, 0, atol=1e-9)
 
 

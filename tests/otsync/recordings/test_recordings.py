@@ -52,7 +52,7 @@ def synced(recording, tmp_path_factory) -> Path:
 def test_pixels_to_offsets(synced):
     found = Offsets.load(synced / "offsets.json")
     np.testing.assert_allclose(found.frames, TRUE, atol=0.25)
-    told = json.loads((synced / "run.json").read_text())
+    told = json.loads((synced / "sync.json").read_text())
     assert told["route"] == "epipolar"
     assert any("fewer than the 5" in line for line in told["why"])
     assert set(told["seconds"]) == {"tracks", "epipolar"}

@@ -1,10 +1,10 @@
-"""What the benchmark of configurations measures, and that rows which took hours are never lost or mixed."""
+"""The benchmark of configurations: its figures, its rows, and that rows which took hours are never lost or mixed."""
 
 from __future__ import annotations
 
 import json
 import re
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,14 +13,17 @@ import torch
 
 from otsync.files.cache import Cache
 from otsync.io import open_scene
+from otsync.plugins import forget, register
 from otsync.progress import Progress
 from otsync.types import Clock, Offsets, TrackSet
 from recon.bench import fits as bench
-from recon.bench.configurations import CONFIGURATIONS
+from recon.bench.configurations import OWN, configurations
 from recon.bench.plot import curve, held, plot
 from recon.bench.rows import find, measured_before, paper_tables
+from recon.fit.options import FitOptions
+from recon.losses import ImageLoss, Mask
 from recon.motion import HermiteSpline, PerGaussian
-from recon.observe.effects import Gain, RollingShutter
+from recon.observe.effects import Effect, Gain, RollingShutter
 from recon.pipeline.plan import Plan
 from recon.pipeline.prepare import prepare
 from recon.scene.gaussians4d import Gaussians4D
@@ -90,11 +93,12 @@ def test_held_out_views_are_drawn_as_the_fit_drew_them(truth, monkeypatch, layer
 
     monkeypatch.setattr(bench, "view", looking)
     ready = SimpleNamespace(held_out=capture().held_out, clocks={"held0": Clock(0.0)}, layered=layered)
-    figures = bench.held_out_figures(replace(truth, span=(0.0, (FRAMES - 1) * STEP)), ready)  # type: ignore[arg-type]
+    fitted = SimpleNamespace(scene=replace(truth, span=(0.0, (FRAMES - 1) * STEP)), parameters={})
+    figures = bench.held_out_figures(fitted, (), ready, 16)  # type: ignore[arg-type]
     assert seen == [layered] and figures["psnr"] > 20 and np.isnan(figures["lpips"])
 
 
-TINY = bench.Protocol(held_out=("held0",), width=SIZE[0], backdrop_steps=5)
+TINY = bench.Protocol(Plan(width=SIZE[0], backdrop_steps=5), held_out=("held0",))
 
 
 @pytest.fixture(scope="module")
@@ -156,18 +160,72 @@ def test_declared_readouts_reach_the_fit_by_video(world, monkeypatch):
     readouts, seen, fit = {"cam0": 0.01, "cam1": None, "cam2": 0.03}, [], bench.fit
 
     def spied(*args, **options):
-        seen.append(([f.name for f in args[1]], options["effects"]))
+        seen.append(([f.name for f in args[1]], args[3].effects))
         return fit(*args, **options)
 
     monkeypatch.setattr(bench, "fit", spied)
     scene, truth, cache = world
     videos = tuple(replace(v, camera=replace(v.camera, readout=readouts.get(v.name))) for v in scene.videos)
     rolled = material((replace(scene, videos=videos), truth, cache), "cam2", "cam0", "cam1")
-    row = bench.measure("ours", CONFIGURATIONS["ours"], rolled, TINY, 1.0, 0, 1, cache, map)
+    row = bench.measure("ours", OWN["ours"], rolled, TINY, 1.0, 0, 1, cache, map)
     ((names, (shutter, gain)),) = seen
     assert names == ["cam2", "cam0", "cam1"] and shutter == RollingShutter((0.03, 0.01, 0.0))
     assert isinstance(gain, Gain) and np.array_equal(gain.start, rolled.backdrop.gains)
-    assert row["images"] == TINY.batch
+    assert row["images"] == TINY.plan.fit.batch
+
+
+@dataclass(frozen=True)
+class Dimming(Effect):
+    """A plugin's effect."""
+
+    strength: float = 0.5
+
+    def wrap(self, observe, params):
+        return observe
+
+
+@dataclass(frozen=True)
+class Colourless(ImageLoss):
+    """A plugin's loss."""
+
+    weight: float = 0.5
+
+    def __call__(self, seen):
+        return (seen.rendered.mean(-1) - seen.image.mean(-1)).square().mean()
+
+
+def test_every_loss_and_every_plugin_is_a_row():
+    register("losses")(Colourless)
+    register("effects")(Dimming)
+    try:
+        rows = configurations()
+    finally:
+        forget(Colourless, Dimming)
+    plan = Plan()
+    assert rows.keys() >= OWN.keys() | {"without mask", "with depth", "with track", "with colourless", "with dimming"}
+    assert "with photometric" not in rows and "with feature" not in rows and "with gain" not in rows
+    assert rows["with colourless"].change(plan).fit.losses == (*plan.fit.losses, Colourless())
+    assert rows["with dimming"].change(plan).effects == (Dimming(),)
+    kept = rows["without mask"].change(plan).fit.losses
+    assert Mask() in plan.fit.losses and set(kept) == set(plan.fit.losses) - {Mask()}
+    bare = replace(plan, fit=replace(plan.fit, losses=kept))
+    for name, given in (("without mask", bare), ("with depth", rows["with depth"].change(plan))):
+        with pytest.raises(ValueError, match="rows: expected a loss"):
+            rows[name].change(given)
+    assert (
+        rows["fixed"].change(plan).fit.freeze == ("offsets",)
+        and "offsets" in OWN["ours"].change(plan).fit.active_rates()
+    )
+
+
+def test_lengths_and_steps_exclude_each_other():
+    assert bench.Protocol().steps == (bench.STEPS,) and bench.Protocol(lengths=(3, 9)).steps == (3, 9)
+    assert bench.Protocol(Plan(fit=FitOptions(budget=3))).steps == (0,)
+    for fit in (FitOptions(steps=3), FitOptions(budget=3)):
+        with pytest.raises(ValueError, match="lengths: expected without steps and budget"):
+            bench.Protocol(Plan(fit=fit), lengths=(3,))
+    with pytest.raises(ValueError, match="save_every"):
+        bench.Protocol(Plan(fit=FitOptions(save_every=5)))
 
 
 def row(name: str, amplitude: float = 1.0, seed: int = 0, **figures: float | None) -> dict:

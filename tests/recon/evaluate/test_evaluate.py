@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from recon.bench import paper_table
 from recon.evaluate import figures as evaluate
-from recon.evaluate.figures import acceleration, coherence, following_error, offset_error, psnr, score_image, ssim
+from recon.evaluate.figures import acceleration, coherence, following_error, psnr, score_image, ssim
 from recon.evaluate.lpips import Lpips
 
 
@@ -85,25 +85,6 @@ def test_scores_of_a_frame_and_their_mean():
     for wrong in ((x[..., 0], y[..., 0]), (x, y[:-1]), (x, y, mask[:-1])):
         with pytest.raises(ValueError, match=r"image|mask"):
             psnr(*wrong)
-
-
-def test_offset_error_fixes_the_gauge():
-    true = np.array([0.0, 0.5, -0.2, 1.0])
-    found = true + 0.7 + np.array([0.0, 0.01, -0.03, 0.02])
-    error = offset_error(found, true, frame_step=0.02)
-    np.testing.assert_allclose(error.errors, [0, 0.5, -1.5, 1.0], atol=1e-9)
-    assert error.mean == pytest.approx(1.0) and error.max == pytest.approx(1.5)
-    median = offset_error(found, true, 0.02, gauge="median")
-    np.testing.assert_allclose(median.errors, [-0.25, 0.25, -1.75, 0.75], atol=1e-9)
-    assert median.mean == pytest.approx(0.75) and np.median(median.errors) == pytest.approx(0, abs=1e-9)
-    assert offset_error(found, true, 0.02, reference=1).errors[1] == 0
-    found[2] = np.nan
-    part = offset_error(found, true, 0.02)
-    assert part.mean == pytest.approx(0.75) and np.isnan(part.errors[2])
-    assert math.isnan(offset_error([np.nan, 1.0], [0.0, 1.0], 0.02).mean)
-    for wrong in ({"frame_step": 0.0}, {"reference": 4}, {"gauge": "first"}, {"estimated": [0.0]}):
-        with pytest.raises(ValueError, match=next(iter(wrong))):
-            offset_error(**{"estimated": found, "true": true, "frame_step": 0.02, **wrong})
 
 
 def rigid(n=30, frames=41, seed=0):

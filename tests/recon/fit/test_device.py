@@ -13,9 +13,10 @@ from torch.optim import optimizer
 from recon.backdrop import fit as backdrop
 from recon.fit.densify import Densify
 from recon.fit.optimize import RATES
+from recon.fit.options import DEFAULT_LOSSES, FitOptions
 from recon.fit.problem import Problem
 from recon.fit.run import Run
-from recon.fit.verb import LOSSES, fit
+from recon.fit.verb import fit
 from recon.losses.image import Depth, Feature, Sightings, Track
 from recon.losses.motion import RotationAcceleration, RotationVelocity
 from recon.motion import PerGaussian, ScaffoldOptions, Static, build_scaffold
@@ -92,7 +93,7 @@ def blurred(capture, scene):
 
 
 def turning(capture, scene):
-    return scene, capture.footage, {"losses": (*LOSSES, RotationVelocity(), RotationAcceleration())}
+    return scene, capture.footage, {"losses": (*DEFAULT_LOSSES, RotationVelocity(), RotationAcceleration())}
 
 
 def dual_quaternions(capture, scene):
@@ -136,7 +137,7 @@ def given(capture, scene):
     ]
     features = torch.linspace(0, 1, 2 * len(scene)).reshape(-1, 2)
     rates = {**RATES, "features": 0.01, "clock_rates": 1e-3}
-    losses = (*LOSSES, Depth(1.0, scale="median"), Track(0.1), Feature(1.0))
+    losses = (*DEFAULT_LOSSES, Depth(1.0, scale="median"), Track(0.1), Feature(1.0))
     return replace(scene, features=features), footage, {"losses": losses, "rates": rates}
 
 
@@ -177,7 +178,9 @@ def test_images_rendered_at_once_are_each_of_them(capture, scene, case):
     """What a GPU is given: losses, gradients of their sum, and what densification reads, from boxes of any size."""
     start, footage, options = case(capture, scene)
     effects = options.get("effects", ())
-    run = Run(Problem.of(start, footage, believed(capture), LOSSES, effects, 4, 0), dict(RATES), None, 10)
+    run = Run(
+        Problem.of(start, footage, believed(capture), FitOptions(effects=effects, batch=4)), dict(RATES), None, 10
+    )
     values, names, keys = run.values(), list(run.adam.groups), [(0, 1), (1, 4), (2, 6), (1, 0)]
     assert len({run.problem.clips[v].box(k) for v, k in keys}) == 4
     whole = run.image_gradient(values, names, keys, True)
@@ -193,9 +196,11 @@ def test_images_rendered_at_once_are_each_of_them(capture, scene, case):
 def test_only_where_it_is_exact_are_images_rendered_at_once(capture, scene, second):
     for case, at_once in ((plain, True), (given, True), (blurred, False), (joint, False)):
         start, footage, options = case(capture, scene)
-        problem = Problem.of(start.to(second), footage, believed(capture), LOSSES, options.get("effects", ()), 2, 0)
+        problem = Problem.of(
+            start.to(second), footage, believed(capture), FitOptions(effects=options.get("effects", ()))
+        )
         assert problem.at_once is at_once
-        assert not Problem.of(start, footage, believed(capture), LOSSES, (), 2, 0).at_once
+        assert not Problem.of(start, footage, believed(capture)).at_once
 
 
 def test_a_fit_begun_elsewhere_continues_there_and_here(capture, scene, second, tmp_path, monkeypatch):
@@ -252,7 +257,7 @@ def test_a_gpu_without_gsplat_says_what_to_install(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "gsplat" else find(name))
     with pytest.raises(ValueError, match=r"expected gsplat, which renders on 'cuda:1'.* pip install 'otsync\[cuda\]'"):
         device_of("cuda:1")
-    with pytest.raises(ValueError, match=r"there \(cpu, cuda:0, cuda:1\); found 'cuda:2'"):
+    with pytest.raises(ValueError, match=r"one of cpu, cuda:0, cuda:1; found 'cuda:2'"):
         device_of("cuda:2")
 
 

@@ -18,13 +18,16 @@ from otsync.compute.threads import get_threads
 from otsync.types import Offsets
 from recon.fit.densify import Densify
 from recon.fit.optimize import RATES, without
+from recon.fit.options import DEFAULT_LOSSES, FitOptions
 from recon.fit.problem import Problem
 from recon.fit.run import Diverged, Run
-from recon.fit.verb import LOSSES, fit
+from recon.fit.verb import fit
+from recon.losses import ImageLoss
 from recon.losses.image import Mask, Photometric
 from recon.motion import HermiteSpline, PerGaussian, Scaffold, Static, build_scaffold
 from recon.observe.cameras import Clip, observer
-from recon.observe.effects import Gain, MotionBlur, RollingShutter, Shot, with_declared
+from recon.observe.effects import Gain, MotionBlur, RollingShutter, Shot
+from recon.observe.recorded import with_declared
 from recon.raster import set_threads
 from recon.scene.gaussians import Gaussians
 from recon.scene.gaussians4d import Gaussians4D
@@ -84,10 +87,10 @@ def same(a, b) -> bool:
     return all(torch.equal(ga[n], gb[n]) for n in ga) and np.array_equal(a.history.loss, b.history.loss)
 
 
-class Squared:
+class Squared(ImageLoss):
     """A loss without kinks, which finite differences would stumble over."""
 
-    weight, needs = 1.0, frozenset()
+    weight = 1.0
 
     def __call__(self, seen):
         return (seen.rendered - seen.image).square().mean()
@@ -111,7 +114,7 @@ def gradient_against_differences(problem, group, index, step):
     "effects", [(), (MotionBlur(0.02),), (RollingShutter(0.02, 4),)], ids=["plain", "blur", "rolling"]
 )
 def test_the_clock_s_gradient_is_that_of_the_image(capture, scene, effects):
-    problem = Problem.of(scene, capture.footage, believed(capture), (Squared(),), effects, 1, 0)
+    problem = Problem.of(scene, capture.footage, believed(capture), FitOptions((Squared(),), effects, batch=1))
     found, expected = gradient_against_differences(problem, "offsets", 1, 3e-4)
     assert found == pytest.approx(
         expected, rel=0.1
@@ -120,7 +123,7 @@ def test_the_clock_s_gradient_is_that_of_the_image(capture, scene, effects):
 
 def test_the_sign_of_an_offset(capture, scene):
     """A video that started later has a positive offset: t_world = t_own + offset."""
-    problem = Problem.of(scene, capture.footage, believed(capture, np.array([0, 0.05, 0])), LOSSES, (), 1, 0)
+    problem = Problem.of(scene, capture.footage, believed(capture, np.array([0, 0.05, 0])), FitOptions(batch=1))
     run = Run(problem, dict(RATES), None, 1)
     later, now = (
         run.look(run.values(), 1, 2),
@@ -133,7 +136,7 @@ def test_every_video_is_seen_through_its_own_readout(capture, scene):
     readouts = [0.02, None, 0.06]
 
     def losses(effects) -> list[float]:
-        problem = Problem.of(scene, capture.footage, believed(capture), (Squared(),), effects, 1, 0)
+        problem = Problem.of(scene, capture.footage, believed(capture), FitOptions((Squared(),), effects, batch=1))
         run = Run(problem, dict(RATES), None, 1)
         return [run.image_gradient(run.values(), ["offsets"], [(v, 4)], False).losses[0] for v in range(3)]
 
@@ -215,7 +218,7 @@ def test_losses_and_effects_of_plain_classes_are_known_again(capture, scene, tmp
 
     def key(loss, effect=None, frame=0):
         footage = [replace(f, depth={frame: np.ones(f.size[::-1], np.float32)}) for f in capture.footage]
-        problem = Problem.of(scene, footage, believed(capture), (loss,), (), 1, 0)
+        problem = Problem.of(scene, footage, believed(capture), FitOptions((loss,), batch=1))
         return problem.key((loss,), () if effect is None else (effect,))
 
     class Effect:
@@ -388,7 +391,7 @@ def test_losses_on_what_is_given_beside_the_images(capture, scene):
         with pytest.raises(ValueError, match=f"losses: {type(loss).__name__} compares with"):
             fit(scene, capture.footage, believed(capture), losses=(Photometric(), loss), steps=1)
         rates = {**RATES, "features": 0.01}
-        with_it = fit(whole, given, believed(capture), losses=(*LOSSES, loss), steps=3, rates=rates)
+        with_it = fit(whole, given, believed(capture), losses=(*DEFAULT_LOSSES, loss), steps=3, rates=rates)
         assert not torch.equal(with_it.scene.dynamic.means, plain.scene.dynamic.means)
     assert not torch.equal(with_it.scene.features, whole.features)
 

@@ -57,7 +57,7 @@ def test_rates_that_make_no_sense_are_refused(rates):
 
 
 def test_freezing_what_has_no_rate_is_a_mistake():
-    with pytest.raises(ValueError, match="groups: expected"):
+    with pytest.raises(ValueError, match="freeze: expected"):
         without(RATES, "offset")
 
 

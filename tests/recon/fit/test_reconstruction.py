@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from otsync.metrics import offset_error
 from otsync.types import Clock, Offsets
-from recon.evaluate.figures import offset_error
 from recon.evaluate.views import view
 from recon.fit.optimize import RATES, without
 from recon.fit.verb import fit
@@ -18,7 +18,7 @@ def refined(seed: int, steps: int, rates=RATES):
     capture = synthetic(seed)
     believed = Offsets.known([f.name for f in capture.footage], np.zeros(len(capture.footage)), 30)
     result = fit(initial_scene(capture, believed), capture.footage, believed, steps=steps, rates=rates)
-    error = offset_error(result.offsets.seconds, capture.offsets, capture.frame_step)
+    error = offset_error(result.offsets.seconds, capture.offsets, 1 / capture.frame_step)
     held = view(result.scene, capture.held_out[0], Clock(0.0), gain=np.ones(3)).score(most=24, pictures=0).mean
     return error, held, result
 

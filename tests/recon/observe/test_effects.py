@@ -16,10 +16,9 @@ from recon.observe.effects import (
     Shot,
     compose,
     initial_parameters,
-    optics,
     prior,
-    with_declared,
 )
+from recon.observe.recorded import optics, with_declared
 from recon.raster import render
 
 WIDTH, HEIGHT, FOCAL, DISTANCE = 64, 48, 200.0, 10.0

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from otsync.recordings.routes import synchronize_scene
 from otsync.types import Offsets, Status, TrackSet
 from recon.cli import main
 from recon.cli.tables import offset_table
+from recon.fit.options import FitOptions
 from recon.footage.footage import footage_of
 from recon.pipeline.intake import only, readable, split
 from recon.pipeline.plan import Plan
@@ -34,6 +36,10 @@ from tests.recon.worlds import CAMERAS, FRAMES, SIZE, capture, write_world
 
 STEP = 1 / 30
 QUICK = Plan(width=SIZE[0], views=4, backdrop_steps=60)
+
+
+def quick(steps: int, **changes: Any) -> Plan:
+    return replace(QUICK, fit=FitOptions(steps=steps, **changes))
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +57,7 @@ def done(world, start, tmp_path_factory):
     """A whole run, and where it lies."""
     out = tmp_path_factory.mktemp("done")
     truth = Offsets.load(world / "truth.json")
-    outcome = reconstruct(open_scene(world), start, out, plan=QUICK, held_out=("held0",), truth=truth, steps=60)
+    outcome = reconstruct(open_scene(world), start, out, plan=quick(60), held_out=("held0",), truth=truth)
     return outcome, out
 
 
@@ -69,8 +75,8 @@ def test_a_run_writes_everything_and_reads_it_back(done):
     result = load_result(out)
     assert [v.name for v in result.videos] == ["cam0", "cam1", "cam2", "held0"]
     assert [v.held_out for v in result.videos] == [False] * CAMERAS + [True]
-    np.testing.assert_array_equal(result.offsets.seconds, outcome.found.offsets.seconds)
-    assert result.video("cam1").clock.offset == outcome.found.offsets.seconds[1]
+    np.testing.assert_array_equal(result.offsets.seconds, outcome.fitted.offsets.seconds)
+    assert result.video("cam1").clock.offset == outcome.fitted.offsets.seconds[1]
     assert result.video("held0").clock.how == "given"
     np.testing.assert_allclose(result.video("cam2").camera.K, capture().footage[2].K)
     with pytest.raises(ValueError, match="expected one of cam0"):
@@ -79,7 +85,7 @@ def test_a_run_writes_everything_and_reads_it_back(done):
 
 def test_the_scene_covers_every_frame_and_metrics_hold_no_wall_time(done):
     outcome, out = done
-    low, high = outcome.found.scene.span
+    low, high = outcome.fitted.scene.span
     assert low <= 0 and high >= (FRAMES - 1) * STEP
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["held_out"]["psnr"] == metrics["views"][0]["psnr"] > 15
@@ -89,7 +95,7 @@ def test_the_scene_covers_every_frame_and_metrics_hold_no_wall_time(done):
 
 
 def test_the_reference_keeps_its_place(done):
-    assert done[0].found.offsets.seconds[0] == 0
+    assert done[0].fitted.offsets.seconds[0] == 0
 
 
 def test_running_again_changes_nothing(done, world, start, tmp_path):
@@ -99,13 +105,12 @@ def test_running_again_changes_nothing(done, world, start, tmp_path):
         open_scene(world),
         start,
         tmp_path / "again",
-        plan=QUICK,
+        plan=quick(60),
         held_out=("held0",),
-        steps=60,
         truth=Offsets.load(world / "truth.json"),
     )
     assert same_files(out, tmp_path / "again")
-    np.testing.assert_array_equal(again.found.offsets.seconds, outcome.found.offsets.seconds)
+    np.testing.assert_array_equal(again.fitted.offsets.seconds, outcome.fitted.offsets.seconds)
 
 
 def same_files(a, b) -> bool:
@@ -130,7 +135,7 @@ def test_an_interrupted_fit_continues_to_the_same_numbers(done, world, start, tm
             raise KeyboardInterrupt
         return real(self, *args, **kwargs)
 
-    args = {"plan": QUICK, "held_out": ("held0",), "steps": 60, "truth": Offsets.load(world / "truth.json")}
+    args = {"plan": quick(60), "held_out": ("held0",), "truth": Offsets.load(world / "truth.json")}
     monkeypatch.setattr(Run, "one_step", stopping)
     with pytest.raises(KeyboardInterrupt):
         reconstruct(open_scene(world), start, tmp_path, **args)
@@ -144,7 +149,7 @@ def test_held_out_videos_change_nothing_in_the_fit(done, world, start, tmp_path)
     """Their images are never seen: a run without them ends with the same scene."""
     scene = open_scene(world).take(["cam0", "cam1", "cam2"])
     shutil.copytree(done[1] / "stages", tmp_path / "stages")
-    reconstruct(scene, start, tmp_path, plan=QUICK, steps=60)
+    reconstruct(scene, start, tmp_path, plan=quick(60))
     one, two = read_npz(done[1] / "scene.npz"), read_npz(tmp_path / "scene.npz")
     assert all(np.array_equal(one[k], two[k]) for k in one)
 
@@ -154,7 +159,7 @@ def test_a_camera_that_cannot_be_compared_does_not_cost_the_fit(done, world, sta
     at = start.names.index("held0")
     far = replace(start, seconds=start.seconds + 9.0 * (np.arange(len(start)) == at))
     progress = Progress()
-    outcome = reconstruct(open_scene(world), far, tmp_path, plan=QUICK, held_out=("held0",), steps=3, progress=progress)
+    outcome = reconstruct(open_scene(world), far, tmp_path, plan=quick(3), held_out=("held0",), progress=progress)
     assert any("held-out video held0 is not compared" in n and "Check its offset" in n for n in progress.notes)
     assert not any(v.held_out for v in outcome.views) and outcome.views
     assert [v.name for v in load_result(tmp_path).videos] == ["cam0", "cam1", "cam2"]
@@ -172,7 +177,7 @@ def test_a_kill_while_writing_leaves_scene_and_clocks_but_nothing_finished(
     (tmp_path / "scene.npz").unlink()
     monkeypatch.setattr(f"recon.pipeline.verb.{killed_in}", killed)
     with pytest.raises(KeyboardInterrupt):
-        reconstruct(open_scene(world), start, tmp_path, plan=QUICK, held_out=("held0",), steps=60)
+        reconstruct(open_scene(world), start, tmp_path, plan=quick(60), held_out=("held0",))
     assert (tmp_path / "scene.npz").exists() and (tmp_path / "offsets.json").exists()
     with pytest.raises(FileNotFoundError, match="expected a finished reconstruction"):
         load_result(tmp_path)
@@ -191,14 +196,10 @@ def test_what_killed_writers_left_is_removed(tmp_path):
 
 def test_frozen_offsets_stay(world, start, done, tmp_path):
     shutil.copytree(done[1] / "stages", tmp_path / "stages")
-    outcome = reconstruct(
-        open_scene(world), start, tmp_path, plan=replace(QUICK, freeze=("offsets",)), held_out=("held0",), steps=3
-    )
-    np.testing.assert_array_equal(outcome.found.offsets.seconds, np.zeros(CAMERAS))
-    with pytest.raises(ValueError, match="groups: expected some of"):
-        reconstruct(
-            open_scene(world), start, tmp_path, plan=replace(QUICK, freeze=("clocks",)), held_out=("held0",), steps=3
-        )
+    outcome = reconstruct(open_scene(world), start, tmp_path, plan=quick(3, freeze=("offsets",)), held_out=("held0",))
+    np.testing.assert_array_equal(outcome.fitted.offsets.seconds, np.zeros(CAMERAS))
+    with pytest.raises(ValueError, match="freeze: expected some of"):
+        reconstruct(open_scene(world), start, tmp_path, plan=quick(3, freeze=("clocks",)), held_out=("held0",))
 
 
 def test_bad_frames_are_left_out_and_named(world, start, tmp_path):
@@ -324,12 +325,11 @@ def test_one_camera_with_depth_is_a_scene(world, start, tmp_path):
         open_scene(world).take(["cam0", "held0"]),
         start,
         tmp_path,
-        plan=QUICK,
+        plan=quick(4),
         held_out=("held0",),
-        steps=4,
         truth=Offsets.load(world / "truth.json"),
     )
-    assert outcome.found.offsets.names == ("cam0",) and len(outcome.found.scene) > 100
+    assert outcome.fitted.offsets.names == ("cam0",) and len(outcome.fitted.scene) > 100
     # no other video, no error of a clock: said so, in a file that any reader of JSON takes
     error = json.loads((tmp_path / "metrics.json").read_text())["offset_error"]
     assert error == {"mean_frames": None, "max_frames": None, "frames": [0.0]}
@@ -342,8 +342,8 @@ def test_one_track_carries_the_whole_scene(world, start, tmp_path):
     longest = capture().tracks[0]
     one = longest.take(np.argsort(-longest.seen.sum(1))[:1])
     assert isinstance(one, TrackSet) and len(one) == 1
-    outcome = reconstruct(open_scene(world), start, tmp_path, tracks=[one], plan=QUICK, held_out=("held0",), steps=4)
-    assert outcome.found.scene.motion.parameters()["knots"].shape[1] == 1
+    outcome = reconstruct(open_scene(world), start, tmp_path, tracks=[one], plan=quick(4), held_out=("held0",))
+    assert outcome.fitted.scene.motion.parameters()["knots"].shape[1] == 1
 
 
 def test_stages_are_shared_with_the_synchronisation_before(world, start, tmp_path, monkeypatch):

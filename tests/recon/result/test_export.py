@@ -12,7 +12,17 @@ from plyfile import PlyData
 
 from otsync.types import Camera, TrackSet
 from recon.motion import HermiteSpline, PerGaussian
-from recon.result.export import check_times, export, frame_times, scene_tracks
+from recon.result.export import (
+    Checkpoint,
+    Ply,
+    PlySequence,
+    Splat,
+    Tracks,
+    check_times,
+    export,
+    frame_times,
+    scene_tracks,
+)
 from recon.result.orbit import orbit
 from recon.result.video import write_images
 from recon.rotations import look_at
@@ -49,30 +59,30 @@ def scene() -> Gaussians4D:
 
 
 def test_a_ply_of_a_moment_holds_the_warped_means_first_and_then_the_static_ones(scene, tmp_path):
-    export(scene, "ply", tmp_path / "a.ply", [0.37])
+    export(scene, Ply(), tmp_path / "a.ply", [0.37])
     vertex = PlyData.read(str(tmp_path / "a.ply"))["vertex"].data
     xyz = np.stack([vertex[k] for k in "xyz"], 1)
     assert len(xyz) == 55
     np.testing.assert_array_equal(xyz[:40], scene.moving(0.37).means.numpy())
     np.testing.assert_array_equal(xyz[40:], scene.static.means.numpy())
     with pytest.raises(ValueError, match="one moment"):
-        export(scene, "ply", tmp_path / "b.ply", [0.1, 0.2])
+        export(scene, Ply(), tmp_path / "b.ply", [0.1, 0.2])
 
 
 def test_a_sequence_has_one_ply_a_frame_and_tells_their_seconds(scene, tmp_path):
     times = frame_times(scene, 10)
-    export(scene, "ply-sequence", tmp_path / "seq", times)
+    export(scene, PlySequence(), tmp_path / "seq", times)
     told = json.loads((tmp_path / "seq" / "frames.json").read_text())["frames"]
     assert [f["seconds"] for f in told] == pytest.approx(np.arange(11) / 10)
     for frame in (told[0], told[7]):
         read = load_ply(tmp_path / "seq" / frame["file"])
         np.testing.assert_array_equal(read.means[:40].numpy(), scene.moving(frame["seconds"]).means.numpy())
     with pytest.raises(ValueError, match="another sequence"):
-        export(scene, "ply-sequence", tmp_path / "seq", times[:4])
+        export(scene, PlySequence(), tmp_path / "seq", times[:4])
 
 
 def test_a_splat_file_holds_32_bytes_a_gaussian(scene, tmp_path):
-    export(scene, "splat", tmp_path / "a.splat", [0.5])
+    export(scene, Splat(), tmp_path / "a.splat", [0.5])
     assert (tmp_path / "a.splat").stat().st_size == 55 * 32
     record = np.frombuffer((tmp_path / "a.splat").read_bytes(), "<f4").reshape(55, 8)[:, :3]
     expected = scene.at(0.5).means.numpy()
@@ -80,7 +90,7 @@ def test_a_splat_file_holds_32_bytes_a_gaussian(scene, tmp_path):
 
 
 def test_a_checkpoint_is_the_scene_at_every_time(scene, tmp_path):
-    export(scene, "checkpoint", tmp_path / "s.npz", [])
+    export(scene, Checkpoint(), tmp_path / "s.npz", [])
     read = Gaussians4D.load(tmp_path / "s.npz")
     for t in (-0.1, 0.0, 0.41, 1.2):
         for a, b in zip(vars(read.at(t)).values(), vars(scene.at(t)).values(), strict=True):
@@ -89,7 +99,7 @@ def test_a_checkpoint_is_the_scene_at_every_time(scene, tmp_path):
 
 def test_tracks_are_a_track_set_on_the_worlds_clock(scene, tmp_path):
     times = frame_times(scene)
-    export(scene, "tracks", tmp_path / "t.npz", times, frame="studio")
+    export(scene, Tracks(), tmp_path / "t.npz", times, frame="studio")
     read = TrackSet.load(tmp_path / "t.npz")
     assert read.frame == "studio" and len(read) == 40 and read.n_frames == 31
     np.testing.assert_allclose(read.times, times)
@@ -102,9 +112,7 @@ def test_times_beyond_what_was_filmed_are_refused(scene, tmp_path):
     check_times(scene, [0.0, 1.0 + 1 / 30])
     for t in (-0.2, 1.2, float("nan")):
         with pytest.raises(ValueError, match="which the videos cover"):
-            export(scene, "ply", tmp_path / "a.ply", [t])
-    with pytest.raises(ValueError, match="expected one of ply"):
-        export(scene, "obj", tmp_path / "a.obj", [0.1])
+            export(scene, Ply(), tmp_path / "a.ply", [t])
     with pytest.raises(ValueError, match="fps"):
         frame_times(scene, -3)
 
