@@ -1,4 +1,6 @@
-"""Docstrings are written for a terminal: their roles, double colons and lists of files become Markdown for the API pages."""
+"""Docstrings are written for a terminal: their roles, double colons and lists of files become Markdown for the API
+pages.
+"""
 
 from __future__ import annotations
 

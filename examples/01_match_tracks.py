@@ -12,7 +12,8 @@ from otsync.simulate import matching_world
 
 def main(n: int = 500, seed: int = 0) -> None:
     # Two half-views of one articulated figure, 50 degrees apart, each in a rigid frame of its own. Features nearly
-    # repeat left and right; a fifth of the tracks are outliers. In your own work: a = TrackSet(xyz, visible, features, fps=30).
+    # repeat left and right; a fifth of the tracks are outliers. In your own work: a = TrackSet(xyz, visible, features,
+    # fps=30).
     a, b, truth = matching_world(n, seed=seed)
     print(a, b, sep="\n")
 

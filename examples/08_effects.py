@@ -2,8 +2,8 @@
 
     python examples/08_effects.py --effect rolling --seeds 201 202 203 --steps 800
 
-Five cameras film a simulated scene through one effect, with unknown clocks; the fit begins at offsets of zero, once with
-the effect's model in its tuple and once without. An effect that is not in the tuple is not computed.
+Five cameras film a simulated scene through one effect, with unknown clocks; the fit begins at offsets of zero, once
+with the effect's model in its tuple and once without. An effect that is not in the tuple is not computed.
 """
 
 from __future__ import annotations

@@ -58,8 +58,8 @@ def open_end_path(cost, level):
 def lag_statistics(a, wa, qa, b, wb, qb, lags, least, count, power, residual):
     """Variances of every match over its common frames at every lag; the mean over exactly these frames is removed.
 
-    a (M,3,Ta), b (M,3,Tb): 0 where unseen; wa (M,Ta), wb: 1 seen, 0 not; qa = |a|^2, qb. Frame i of a meets i - lag of b.
-    Fills (M,K): frames in common; Var(a) + Var(b); Var(a - b). All 0 below ``least`` frames in common.
+    a (M,3,Ta), b (M,3,Tb): 0 where unseen; wa (M,Ta), wb: 1 seen, 0 not; qa = |a|^2, qb. Frame i of a meets i - lag of
+    b. Fills (M,K): frames in common; Var(a) + Var(b); Var(a - b). All 0 below ``least`` frames in common.
     """
     M, _, Ta = a.shape
     Tb = b.shape[2]

@@ -133,7 +133,10 @@ def sync_recording(
     truth: Path | None = None,
     as_json: bool = False,
 ) -> int:
-    """``otsync sync SCENE``: offsets.json, sync.json and report.html in ``out``. Exit code 1 when an answer is flagged."""
+    """``otsync sync SCENE``: offsets.json, sync.json and report.html in ``out``.
+
+    Exit code 1 when an answer is flagged.
+    """
     from ..files.arrays import write_json
     from ..files.cache import Cache
     from ..io import open_scene

@@ -68,7 +68,8 @@ def run_command(
 
     Args:
         commands: gives what loads each command, by name: a dataclass with a ``run`` method that returns the exit code.
-            Asked after plugins are loaded; only the command that runs is loaded, so that its rivals cost no start-up time.
+            Asked after plugins are loaded; only the command that runs is loaded, so that its rivals cost no start-up
+            time.
         refused: errors that mean an answer is not to be trusted: exit code 1. Bad arguments or files (ValueError,
             OSError, a package that is not installed) give 2, an interrupt 130.
         interrupted: what an interrupted run leaves behind, in words.
@@ -117,7 +118,8 @@ def _listed(name: str, load: Load) -> Callable[..., Any]:
 def shared_options(args: list[str]) -> list[str] | None:
     """Heed the options that every command takes, and give back the rest; None when the version is asked for.
 
-    They may stand anywhere before a ``--``. ValueError for both of --verbose and --quiet, and for plugins that do not load.
+    They may stand anywhere before a ``--``. ValueError for both of --verbose and --quiet, and for plugins that do not
+    load.
     """
     if args == ["--version"]:
         return None

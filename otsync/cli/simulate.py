@@ -76,7 +76,8 @@ class Simulate:
         stale = sorted({p.name for p in self.out.glob("*.npz")} - {f"{t.name}.npz" for t in tracks})
         if stale:
             raise ValueError(
-                f"{self.out}: expected a folder without track sets of another world; it holds {stale[0]}. Choose another."
+                f"{self.out}: expected a folder without track sets of another world; it holds {stale[0]}. "
+                "Choose another."
             )
         for t in tracks:
             t.save(self.out / f"{t.name}.npz")

@@ -73,7 +73,8 @@ def fitting(n: int, budget: float) -> str:
     if not able:
         fastest = min((predicted(name, n), name) for name in FRONTIER if name.startswith("Anchored"))
         raise ValueError(
-            f"budget: expected at least {fastest[0]:.2g} s, predicted for {fastest[1]} at {n} tracks; found {budget:g}. "
+            f"budget: expected at least {fastest[0]:.2g} s, predicted for {fastest[1]} at {n} tracks; found "
+            f"{budget:g}. "
             "Raise it, or take fewer tracks."
         )
     return max(able, key=lambda name: (accuracy(name, n), -predicted(name, n)))

@@ -16,8 +16,8 @@ class Matcher:
     """Base of otsync's matchers. A callable of your own needs none of it; what it lacks has these defaults.
 
     Attributes:
-        costs: the linear costs that it minimises, by which its answer is checked (:mod:`otsync.match.vouch`) and pairs are
-            matched once more at known times; () when it minimises something else.
+        costs: the linear costs that it minimises, by which its answer is checked (:mod:`otsync.match.vouch`) and pairs
+            are matched once more at known times; () when it minimises something else.
     """
 
     costs: tuple[Cost, ...] = ()

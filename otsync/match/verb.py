@@ -1,4 +1,4 @@
-"""``match(a, b, matcher)``: correspondences between the tracks of two videos (paper, Sec. 3.3), and the slot of matchers."""
+"""``match(a, b, matcher)``: correspondences between the tracks of two videos (paper, Sec. 3.3)."""
 
 from __future__ import annotations
 

@@ -65,7 +65,7 @@ def geometry(a: TrackSet, b: TrackSet, i: Int[np.ndarray, " M"], j: Int[np.ndarr
 def relative_cost(
     costs: tuple[Cost, ...], a: TrackSet, b: TrackSet, i: Int[np.ndarray, " M"], j: Int[np.ndarray, " M"]
 ) -> float:
-    """Mean cost of the pairs over the mean cost of random ones; 0.4, as between related videos, where it tells nothing."""
+    """Mean cost of the pairs over the mean cost of random ones; 0.4, as of related videos, where it tells nothing."""
     if not costs:
         return 0.4
     rng = np.random.default_rng(0)

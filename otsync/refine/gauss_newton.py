@@ -192,7 +192,8 @@ def _linearise(sides: tuple[Side, Side], clock: Clock, centre: float, fit_rate: 
         there, t_b = side.there(clock), side.time_b(clock)
         ok = side.own.support(side.own.times) & side.other.support(there)
         first, value, slope = side.other.basis(there)
-        # d(other curve's argument)/d offset: t_b = (t_a - offset) / rate from a's frames, t_a = rate t_b + offset from b's
+        # d(other curve's argument)/d offset: t_b = (t_a - offset) / rate from a's frames, t_a = rate t_b + offset from
+        # b's
         sign = 1 / clock.rate if side.forward else -1.0
         rr, g, h = np.empty((M, T)), np.empty((P, M, T)), np.empty((P, P, M, T))
         least = MIN_FRAMES / side.own.frame
@@ -249,7 +250,9 @@ def _linearise(sides: tuple[Side, Side], clock: Clock, centre: float, fit_rate: 
 
 
 def neighbours(x: Float[np.ndarray, "M 3"], groups: int) -> Int[np.ndarray, " M"]:
-    """Group of each point: nearest of ``groups`` points far from each other (farthest-point sampling from the middle)."""
+    """Group of each point: nearest of ``groups`` points far from each other (farthest-point sampling from the
+    middle).
+    """
     distance = np.linalg.norm(x - np.median(x, 0), axis=1)
     nearest = np.zeros(len(x), np.int64)
     closest = np.full(len(x), np.inf)

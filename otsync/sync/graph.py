@@ -47,7 +47,8 @@ class Graph:
         for name, switch, off in (("complete", "extra", 0), ("starts", "curves", False)):
             if getattr(self, switch) == off and getattr(self, name) != type(self).__dataclass_fields__[name].default:
                 raise ValueError(
-                    f"Graph.{name}, Graph.{switch}: expected one of them; {name} is not used with {switch}={off}. Leave it out."
+                    f"Graph.{name}, Graph.{switch}: expected one of them; {name} is not used with {switch}={off}. "
+                    "Leave it out."
                 )
 
     def pairs(self, n: int, centre: int) -> list[Pair]:

@@ -135,7 +135,9 @@ def to_offsets(tracks: Sequence[TrackSet], verdict: Verdict, seconds: float) -> 
 
 
 def check_tracks(tracks: Sequence[TrackSet], reference: int | Literal["auto"], *, xyz: bool = True) -> int | None:
-    """ValueError unless there are at least two sound track sets; the reference's index, None when it is to be chosen."""
+    """ValueError unless there are at least two sound track sets; the reference's index, None when it is to be
+    chosen.
+    """
     if isinstance(tracks, TrackSet) or len(tracks) < 2:
         raise ValueError("tracks: expected a sequence of at least two track sets, one per video; found fewer.")
     chosen = None

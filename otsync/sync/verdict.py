@@ -1,4 +1,4 @@
-"""From the answers of pairs to the clocks of videos: a robust solution, its contradictions resolved, and whom to trust."""
+"""From the answers of pairs to the clocks of videos: a robust solution, its contradictions, and whom to trust."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ CONFIRMED = 1.5 * FRAME
 """Doubtful pairs this close to the solution by themselves confirm it."""
 
 STANDING_MARGIN = 0.1
-"""Lead of the summed curves' peak, as a share of it, that keeps a flagged estimate; sums are steadier than one curve."""
+"""Lead of the summed curves' peak, as a share of it, that keeps a flagged estimate: sums are steadier."""
 
 CAPTURED = 3.0 * FRAME
 """The new fit counts when it ends this close to where it began."""
@@ -178,9 +178,9 @@ def _linked(network: Network, x: np.ndarray) -> Network:
     """Only the pairs that link videos: those that vouch for themselves, and flagged ones between videos that stand out.
 
     A flagged pair must agree with the solution. A video stands out when the sum of all its pairs' curves peaks at its
-    place as an undoubted pair's curve would. That keeps an estimate for videos that no pair vouches for, on the clock of
-    the anchor's group. Groups of three and more held together by pairs that vouch are never joined by flagged ones: the
-    curves of strangers with the views of one scene add up too.
+    place as an undoubted pair's curve would. That keeps an estimate for videos that no pair vouches for, on the clock
+    of the anchor's group. Groups of three and more held together by pairs that vouch are never joined by flagged ones:
+    the curves of strangers with the views of one scene add up too.
     """
     n, edges, vouches = network.n, network.edges, network.vouches
     curves = CurveSum(n, edges, FRAME)

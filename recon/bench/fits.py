@@ -46,8 +46,8 @@ from recon.scene.gaussians4d import Gaussians4D
 
 Row = dict[str, Any]
 FIGURES = 3
-"""Version of what the figures mean: rows of another one are not continued. 2: tracks at their videos' own times. 3: rows of
-several lengths."""
+"""Version of what the figures mean: rows of another one are not continued. 2: tracks at their videos' own times. 3:
+rows of several lengths."""
 
 REACH = 5.0  # footprints within which a held-out track must have a Gaussian, to be followed
 PUBLISHED = (
@@ -65,8 +65,8 @@ class Protocol:
     held_out: tuple[str, ...] = ()
     """Names of videos that no fit sees: every row is compared with them."""
     cameras: tuple[str, ...] | None = None
-    """Names of the videos that train; default: all that are not held out. Depth, and with it the tracks' positions, and the
-    static part always come from all of them: few cameras are few images of what moves, nothing else."""
+    """Names of the videos that train; default: all that are not held out. Depth, and with it the tracks' positions, and
+    the static part always come from all of them: few cameras are few images of what moves, nothing else."""
     amplitudes: tuple[float, ...] = (1.0,)
     """Frames: errors of the clocks are drawn uniformly within them."""
     seeds: tuple[int, ...] = (0,)
@@ -316,7 +316,8 @@ def run(
     """Measure the named configurations; write ``recon.csv`` and ``recon.json`` to ``out`` row by row.
 
     Rows that an earlier run into ``out`` has measured by the same protocol are kept. At the end ``recon.md`` holds the
-    longest fits in the paper's layout, and ``recon.svg`` shows what accuracy costs in time. Returns all rows of the file.
+    longest fits in the paper's layout, and ``recon.svg`` shows what accuracy costs in time. Returns all rows of the
+    file.
 
     Args:
         name: of the recording in the tables; one of the paper's scenes stands beside its figures.
@@ -372,7 +373,9 @@ def about(protocol: Protocol, scene: Scene, truth: Offsets) -> Mapping[str, Any]
 
 
 def described(options: Any) -> dict[str, Any]:
-    """Options as JSON takes them, those of parts beside those of the whole; objects as they would be written in Python."""
+    """Options as JSON takes them, those of parts beside those of the whole; objects as they would be written in
+    Python.
+    """
     out: dict[str, Any] = {}
     for name, value in vars(options).items():
         if isinstance(value, Plan | FitOptions):

@@ -1,7 +1,7 @@
 """``recon lifting``: the worth of lifted features to the matcher, and the cost of lifting.
 
-On a truly synchronised recording in metres. Two sources of tracks: optical flow, lifted by depth, as otsync uses it; and
-the Gaussians of a fit of every video alone (:mod:`recon.features.tracks`). Two ways to their features from the same
+On a truly synchronised recording in metres. Two sources of tracks: optical flow, lifted by depth, as otsync uses it;
+and the Gaussians of a fit of every video alone (:mod:`recon.features.tracks`). Two ways to their features from the same
 maps: the mean over the pixels where a track is seen, and lifting by compositing weights. Each is thinned alike, matched
 alike, and scored by the share of matches that are within 15 cm at the true time.
 """
@@ -87,7 +87,9 @@ def run(
     cache: Path | None = None,
     tell: Callable[[str], None] = print,
 ) -> tuple[list[Row], Row]:
-    """Measure, and write ``lifting.csv`` and ``lifting.json`` to ``out``: precision by matching, and the cost of lifting."""
+    """Measure, and write ``lifting.csv`` and ``lifting.json`` to ``out``: precision by matching, and the cost of
+    lifting.
+    """
     from otsync.files.cache import Cache
     from otsync.progress import Progress
     from recon.pipeline.stages import read_footage
@@ -130,7 +132,8 @@ def run(
 
 def tables(rows: Sequence[Row], cost: Row) -> str:
     """The figures of :func:`run` as text."""
-    return f"Precision within {MATCH_RADIUS:g} m at the true time, by angle between the cameras:\n{table(rows)}\n{table([cost])}"
+    title = f"Precision within {MATCH_RADIUS:g} m at the true time, by angle between the cameras:"
+    return f"{title}\n{table(rows)}\n{table([cost])}"
 
 
 def sources_of(

@@ -22,8 +22,8 @@ PANELS = (
 def plot(rows: Sequence[dict[str, Any]], path: Path) -> None:
     """Offset error and held-out PSNR against the time of the fit; the mean over seeds, of the smallest errors put in.
 
-    Time is CPU seconds, which another process hardly changes; of fits on a GPU, where the CPU waits, it is wall seconds.
-    Rows whose offsets are true or held have no error of the fit's, and stand in the panels of PSNR alone.
+    Time is CPU seconds, which another process hardly changes; of fits on a GPU, where the CPU waits, it is wall
+    seconds. Rows whose offsets are true or held have no error of the fit's, and stand in the panels of PSNR alone.
     """
     import matplotlib
 

@@ -7,14 +7,19 @@ interrupted: the same command continues where it stopped.
 
 from __future__ import annotations
 
-from otsync.cli.shell import run_command
+import sys
+
+from otsync.cli.shell import missing_package, run_command
 from recon.cli.commands import commands
 
 
 def main(args: list[str] | None = None) -> int:
     """Entry point of the ``recon`` command."""
-    from recon.fit.run import Diverged
-
+    try:
+        from recon.fit.run import Diverged
+    except ModuleNotFoundError as error:  # torch, most likely
+        print(f"recon: {missing_package(error)}", file=sys.stderr)
+        return 2
     return run_command(
         "recon",
         commands,

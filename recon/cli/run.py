@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -56,6 +55,13 @@ class Run:
         from recon.fit.run import Diverged
         from recon.pipeline.intake import readable
 
+        for name in ("masks", "points", "features"):
+            if getattr(self.recording, name) is not None:
+                raise ValueError(
+                    f"--recording.{name}: expected without it, since the reconstruction tracks by its own; found "
+                    f"{getattr(self.recording, name)}. Synchronise with otsync sync, then reconstruct with recon fit."
+                )
+        threads = self.recording.threads()
         scene = opened(self.scene, self.allow_outside or self.recording.allow_outside)
         if self.recording.cameras:
             scene = scene.take(
@@ -63,7 +69,7 @@ class Run:
             )
         scene.take(self.held_out)  # names that are not there
         cache, progress = Cache(self.recording.cache or self.out / "stages"), Progress(tell)
-        with ThreadPoolExecutor(self.recording.workers or os.cpu_count() or 1) as pool:
+        with ThreadPoolExecutor(threads) as pool:
             part = scene if self.plan.frames is None else cut(scene, *self.plan.frames)
             with progress.stage("reading"):  # the reconstruction cuts and reads again, from what is kept
                 part = readable(part, cache, pool.map, progress)

@@ -66,7 +66,8 @@ class Render:
             raise ValueError("--turns: expected with --path; found --camera.")
         if self.fps is not None and not self.out.suffix and (self.times or self.frames is not None):
             raise ValueError(
-                "--fps: expected with a video in --out, or to choose the times of images; found a folder of images whose "
+                "--fps: expected with a video in --out, or to choose the times of images; found a folder of images "
+                "whose "
                 f"times {'--times' if self.times else '--frames'} chooses."
             )
         if self.fps is not None and not 0 < self.fps <= 1000:
@@ -175,7 +176,9 @@ class Export:
     result: tyro.conf.Positional[Path]
     """Folder that recon fit or otsync run wrote."""
     format: one_of("exporters", EXPORTERS) = "ply"
-    """ply and splat hold a moment, ply-sequence every frame; checkpoint is the whole scene, tracks an otsync track set."""
+    """ply and splat hold a moment, ply-sequence every frame; checkpoint is the whole scene, tracks an otsync track
+    set.
+    """
     at: float | None = None
     """World second of the moment; default: the middle."""
     fps: float | None = None

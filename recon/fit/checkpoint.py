@@ -1,4 +1,4 @@
-"""Checkpoints of a fit: plain arrays in one file, written whole or not at all, refused when they belong to another fit."""
+"""Checkpoints of a fit: plain arrays in one file, written whole or not at all; those of another fit are refused."""
 
 from __future__ import annotations
 
@@ -29,8 +29,10 @@ class Snapshot:
         step, steps: done, and in all.
         scene: arrays of the scene as it stood (constants of the motion too: densification changes them).
         groups, moments: the optimiser's parameters and averages.
-        history: one row per record, see :class:`recon.fit.History`. since: (loss, psnr) of the images since the last row.
-        densified: how often the scene was made denser. pull: [2,N] what that is decided by, gathered since the last time.
+        history: one row per record, see :class:`recon.fit.History`. since: (loss, psnr) of the images since the last
+            row.
+        densified: how often the scene was made denser. pull: [2,N] what that is decided by, gathered since the last
+            time.
     """
 
     step: int

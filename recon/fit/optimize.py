@@ -88,7 +88,9 @@ def check_rates(rates: Mapping[str, float], groups: Mapping[str, Tensor]) -> dic
 
 
 class Adam:
-    """torch's Adam over named groups, whose steps are given in the groups' own units and whose state is plain tensors."""
+    """torch's Adam over named groups, whose steps are given in the groups' own units and whose state is plain
+    tensors.
+    """
 
     BETAS = (0.9, 0.99)
 
@@ -106,7 +108,8 @@ class Adam:
             return declared[name].scale(footprint, frame_step) if name in declared else 1.0
 
         self.rates = {name: rate * unit(name) for name, rate in rates.items()}
-        # torch's fused CPU kernel walks parameters and gradients as flat memory: strides of their own would scramble them
+        # torch's fused CPU kernel walks parameters and gradients as flat memory: strides of their own would scramble
+        # them
         self.groups = {
             name: groups[name].detach().clone(memory_format=torch.contiguous_format).requires_grad_()
             for name in self.rates

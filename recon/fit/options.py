@@ -36,7 +36,9 @@ DEFAULT_LOSSES: tuple[Loss, ...] = (
     Velocity(),
     Acceleration(),
 )
-"""The losses of the study of the paper's scene; depth, tracks and features enter only at initialisation unless added."""
+"""The losses of the study of the paper's scene; depth, tracks and features enter only at initialisation unless
+added.
+"""
 
 DEFAULT_STEPS = 2000
 
@@ -83,7 +85,8 @@ class FitOptions:
         positive("save_every", self.save_every, zero=True)
         if self.densify is not None and any(isinstance(x, ImageLoss) and x.reads == "tracks" for x in self.losses):
             raise ValueError(
-                "losses, densify: expected one of Track and densification; found both. Tracks are tied to Gaussians, which "
+                "losses, densify: expected one of Track and densification; found both. Tracks are tied to Gaussians, "
+                "which "
                 "densification replaces."
             )
         self.active_rates()

@@ -75,7 +75,8 @@ class Problem:
         for loss in on_images:
             if loss.reads is not None and not any(getattr(f, loss.reads) for f in footage):
                 raise ValueError(
-                    f"losses: {type(loss).__name__} compares with the {loss.reads} of footage; found none in any video. "
+                    f"losses: {type(loss).__name__} compares with the {loss.reads} of footage; found none in any "
+                    f"video. "
                     f"Give Footage.{loss.reads}, or leave the loss out."
                 )
             if "features" in loss.needs and scene.features is None:

@@ -128,7 +128,9 @@ class Run:
                 self._pull += r.pull
 
     def look(self, values: dict[str, Tensor], video: int, frame: int, later: float = 0.0) -> Tensor:
-        """The image [h,w,3] of a frame's box as the scene gives it, ``later`` seconds after the frame, without a graph."""
+        """The image [h,w,3] of a frame's box as the scene gives it, ``later`` seconds after the frame, without a
+        graph.
+        """
         p, clip = self.problem, self.problem.clips[video]
         box = clip.box(frame)
         observe = observer(assemble(self.scene, values), p.clips, values["offsets"])

@@ -1,10 +1,10 @@
 """fit(): one scene, many videos, their clocks: everything that has a learning rate is refined from the images.
 
-One step renders a few frames (on a CPU each on a thread of its own, on a GPU all at once where it can), blends them over
-their backgrounds, and follows the losses' gradients. The offsets are parameters like any other: a frame's time becomes
-world time by its video's offset, and the motion can be differentiated in time. Only differences of offsets are seen. All
-of them move during the fit, because holding the reference still leaves a slow common mode between all others and the
-motion; at the end the reference is put back to where it was.
+One step renders a few frames (on a CPU each on a thread of its own, on a GPU all at once where it can), blends them
+over their backgrounds, and follows the losses' gradients. The offsets are parameters like any other: a frame's time
+becomes world time by its video's offset, and the motion can be differentiated in time. Only differences of offsets are
+seen. All of them move during the fit, because holding the reference still leaves a slow common mode between all others
+and the motion; at the end the reference is put back to where it was.
 """
 
 from __future__ import annotations
@@ -94,9 +94,9 @@ def fit(
 
     Args:
         footage: the videos; each is found by name in ``offsets``, whose reference keeps its place.
-        options: how the scene is fitted; ``changes`` are fields of it: ``fit(scene, footage, offsets, steps=200)``. What
-            is not among its losses and effects is not computed; not even a rolling shutter that a camera declares, which
-            :func:`recon.observe.recorded.with_declared` adds.
+        options: how the scene is fitted; ``changes`` are fields of it: ``fit(scene, footage, offsets, steps=200)``.
+            What is not among its losses and effects is not computed; not even a rolling shutter that a camera declares,
+            which :func:`recon.observe.recorded.with_declared` adds.
         checkpoint: file that the fit is kept in, every ``save_every`` seconds and on Ctrl-C; a fit that was killed
             continues from it and ends with the same numbers (on a GPU, whose sums run in any order, nearly so).
 

@@ -2,7 +2,8 @@
 
 Every loss is a frozen dataclass ``(seen) -> scalar | None``, unweighted; None says that the frame lacks what the loss
 compares with. What is not in a fit's tuple of losses is not computed, and ``needs`` tells the renderer which extra
-channels it must render. Colours are in 0..1; lengths enter in footprints, pixels or ratios, so a scene's unit does not matter.
+channels it must render. Colours are in 0..1; lengths enter in footprints, pixels or ratios, so a scene's unit does not
+matter.
 """
 
 from __future__ import annotations
@@ -74,7 +75,9 @@ class Seen:
 
 
 class ImageLoss(ABC):
-    """A comparison of one rendered frame with the filmed one: a frozen dataclass with a ``weight`` that inherits from this."""
+    """A comparison of one rendered frame with the filmed one: a frozen dataclass with a ``weight`` that inherits from
+    this.
+    """
 
     weight: float
     """Its share in the sum of losses."""

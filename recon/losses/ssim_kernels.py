@@ -1,8 +1,8 @@
 """L1 + SSIM of two images and its gradient in one sweep over the rows, for the CPU.
 
-Images are [h,w,c] as they come, a row of w * c floats: the horizontal neighbour of a value lies c floats further, so that
-neither channels nor pixels need to be moved. A handful of rows is alive at a time and stays in the cache: row i + r enters,
-local moments and the derivatives of SSIM appear at row i, the gradient at row i - r (r: the window's radius).
+Images are [h,w,c] as they come, a row of w * c floats: the horizontal neighbour of a value lies c floats further, so
+that neither channels nor pixels need to be moved. A handful of rows is alive at a time and stays in the cache: row i +
+r enters, local moments and the derivatives of SSIM appear at row i, the gradient at row i - r (r: the window's radius).
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """How a camera sees the scene: effects on the light, and views with their backgrounds.
 
-To add an effect: one class in one file, and its name in :data:`EFFECTS`; or ``@register("effects")`` in a file of your own.
+To add an effect: one class in one file, and its name in :data:`EFFECTS`; or ``@register("effects")`` in a file of your
+own.
 """
 
 from recon.observe.effects import Effect, Gain, MotionBlur, RollingShutter

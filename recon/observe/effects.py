@@ -11,8 +11,8 @@ Effects act on what is rendered, *before* a cached backdrop is put behind it: th
 itself and has been through its effects already.
 
 An effect is one class, which says all that others must know of it: what it learns (``groups``, ``parameters``,
-``prior``), how it acts (``wrap``), whether a recording calls for it by itself (``called_for``, ``begun``), how one camera
-looks through it once the fit is done (``alone``), and how ``run.json`` keeps it (``kept``, ``restored``).
+``prior``), how it acts (``wrap``), whether a recording calls for it by itself (``called_for``, ``begun``), how one
+camera looks through it once the fit is done (``alone``), and how ``run.json`` keeps it (``kept``, ``restored``).
 """
 
 from __future__ import annotations
@@ -138,7 +138,9 @@ class Effect(ABC):
         return
 
     def kept(self) -> dict[str, Any]:
-        """What ``run.json`` keeps of an effect that :meth:`alone` gave: here the fields of a dataclass, as JSON takes them."""
+        """What ``run.json`` keeps of an effect that :meth:`alone` gave: here the fields of a dataclass, as JSON takes
+        them.
+        """
         return {f.name: getattr(self, f.name) for f in fields(self)} if is_dataclass(self) else {}
 
     @classmethod
@@ -324,7 +326,8 @@ class RollingShutter(Effect):
             return self
         if not any(recorded.readouts):
             raise ValueError(
-                "readout: expected seconds, since no camera declares any; found none. Give RollingShutter a readout, or "
+                "readout: expected seconds, since no camera declares any; found none. Give RollingShutter a readout, "
+                "or "
                 "declare camera.readout in the recording."
             )
         return replace(self, readout=tuple(float(r or 0.0) for r in recorded.readouts))

@@ -1,4 +1,6 @@
-"""Effects of a recording: those that it calls for by itself, those that one camera is looked through, and run.json's."""
+"""Effects of a recording: those that it calls for by itself, those that one camera is looked through, and
+run.json's.
+"""
 
 from __future__ import annotations
 
@@ -79,7 +81,8 @@ def restored(kept: Iterable[Mapping[str, Any]]) -> tuple[Effect, ...]:
         name = one["name"]
         if name not in choices:
             raise ValueError(
-                f"effects: expected some of {', '.join(choices)}; found {name!r}. Load the file that adds it (--plugin)."
+                f"effects: expected some of {', '.join(choices)}; found {name!r}. Load the file that adds it "
+                f"(--plugin)."
             )
         effects.append(choices[name].restored({k: v for k, v in one.items() if k != "name"}))
     return tuple(effects)

@@ -66,7 +66,8 @@ def split(
     train = [n for n in scene.names if n in known and n not in held_out]
     if reference not in train:
         raise ValueError(
-            f"offsets: expected the reference ({reference}) among the videos to fit; found {', '.join(train) or 'none'}. "
+            f"offsets: expected the reference ({reference}) among the videos to fit; found "
+            f"{', '.join(train) or 'none'}. "
             "Hold out another video, or synchronise with another reference."
         )
     for name in scene.names:

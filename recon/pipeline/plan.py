@@ -18,7 +18,9 @@ from recon.scene.seed import Seeding
 
 @dataclass(frozen=True)
 class Plan:
-    """How a recording is reconstructed. ValueError names an option that makes no sense, and a device that is not there."""
+    """How a recording is reconstructed. ValueError names an option that makes no sense, and a device that is not
+    there.
+    """
 
     width: int = 320
     """Working pixels of an image's width."""
@@ -27,7 +29,9 @@ class Plan:
     fit: Annotated[FitOptions, tyro.conf.arg(name="")] = field(default_factory=FitOptions)
     """How the scene is fitted to its videos."""
     exposure: float = 0.0
-    """Seconds that the shutters were open, where moving things are blurred: short for --effects motion-blur:exposure=S."""
+    """Seconds that the shutters were open, where moving things are blurred: short for --effects
+    motion-blur:exposure=S.
+    """
     scaffold: ScaffoldOptions = field(default_factory=ScaffoldOptions)
     """How the motion is built."""
     seeding: Seeding = field(default_factory=Seeding)

@@ -1,4 +1,6 @@
-"""What losses compare with beyond images and masks: depth maps and point tracks of a recording, put into its footage."""
+"""What losses compare with beyond images and masks: depth maps and point tracks of a recording, put into its
+footage.
+"""
 
 from __future__ import annotations
 
@@ -31,8 +33,10 @@ def read_by(losses: Sequence[Loss]) -> frozenset[str]:
     for loss in losses:
         if isinstance(loss, ImageLoss) and loss.reads is not None and loss.reads not in SUPPLIED:
             raise ValueError(
-                f"losses: {type(loss).__name__} compares with {loss.reads}, which are not made of a recording; expected "
-                f"losses that read {' or '.join(SUPPLIED)}. Call recon.fit.fit with footage of your own, or leave it out."
+                f"losses: {type(loss).__name__} compares with {loss.reads}, which are not made of a recording; "
+                f"expected "
+                f"losses that read {' or '.join(SUPPLIED)}. Call recon.fit.fit with footage of your own, or leave it "
+                f"out."
             )
     return frozenset(loss.reads for loss in losses if isinstance(loss, ImageLoss) and loss.reads is not None)
 

@@ -38,7 +38,8 @@ class Outcome:
     """A reconstructed recording.
 
     Args:
-        fitted: scene and clocks. coarse: the offsets it began with, of the same videos. truth: (V,) seconds, where known.
+        fitted: scene and clocks. coarse: the offsets it began with, of the same videos. truth: (V,) seconds, where
+            known.
         views: how well every camera that was compared is shown. left_out: videos without an offset.
     """
 
@@ -65,8 +66,8 @@ def reconstruct(
 ) -> Outcome:
     """Prepare, fit, evaluate and write the result folder (see :mod:`recon.result.folder`).
 
-    A run that was killed continues from its stages and from ``fit.npz``; unless it has a budget in seconds, it ends with
-    the same files.
+    A run that was killed continues from its stages and from ``fit.npz``; unless it has a budget in seconds, it ends
+    with the same files.
 
     Args:
         plan: how; ``plan.fit`` is how the scene is fitted.
@@ -224,8 +225,9 @@ def evaluate(
 ) -> tuple[tuple[ViewScore, ...], str]:
     """Scores of the named cameras against a finished result, and why LPIPS is missing ("" when it is not).
 
-    Clocks: as ``offsets`` say, else those of the result, else found on the frozen scene. A camera of the result is looked
-    through the effects that the fit gave it, any other through those that held for all, and the shutter that it declares.
+    Clocks: as ``offsets`` say, else those of the result, else found on the frozen scene. A camera of the result is
+    looked through the effects that the fit gave it, any other through those that held for all, and the shutter that it
+    declares.
     """
     from otsync.files.cache import Cache
 

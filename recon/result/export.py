@@ -3,8 +3,8 @@
 No public format stores splined motion: every viewer of 3DGS can play a sequence of .ply. ``.npz`` keeps everything and
 is read back by :meth:`Gaussians4D.load`; the dense trajectories are an ordinary otsync track set.
 
-A format is one :class:`Exporter`: to add one, write it in one file and name it in ``EXPORTERS`` of recon/result/__init__.py,
-or ``@register("exporters")`` it in a file of your own.
+A format is one :class:`Exporter`: to add one, write it in one file and name it in ``EXPORTERS`` of
+recon/result/__init__.py, or ``@register("exporters")`` it in a file of your own.
 """
 
 from __future__ import annotations

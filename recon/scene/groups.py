@@ -17,8 +17,8 @@ class Group:
 
     Args:
         rate: Adam's step at the start, in ``unit``; None: frozen unless a fit gives it one.
-        unit: "footprints" (the world size of a working pixel), "frames" (of the reference, in seconds), or "own": as the
-            parameters are.
+        unit: "footprints" (the world size of a working pixel), "frames" (of the reference, in seconds), or "own": as
+            the parameters are.
         rows: what a row belongs to, if densification changes how many there are. axis: along which the rows lie.
     """
 
@@ -46,7 +46,9 @@ SCENE = (
     Group("features", rows="gaussians"),
     Group("static.means", unit="footprints"),
 )
-"""Of a scene. Rates are the study's metres and colours, expressed so; other groups of static Gaussians are as they are."""
+"""Of a scene. Rates are the study's metres and colours, expressed so; other groups of static Gaussians are as they
+are.
+"""
 
 CLOCKS = (Group("offsets", 0.02, "frames"), Group("clock_rates"))
 """Of the videos' clocks."""

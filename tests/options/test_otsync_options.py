@@ -27,8 +27,8 @@ REFUSED = "refused"
 REASONS = {
     "sync workers": "results do not depend on it (tests/otsync/sync/test_sync.py); 0 is refused",
     "sync recording.workers": "results do not depend on it (tests/otsync/recordings/test_recordings.py)",
-    "sync graph.starts": "more starts of a search: they matter where the obvious ones fail (tests/otsync/sync/test_graph.py)",
-    "match matcher:FusedGromovWasserstein.device": "where products are computed, not what; an unknown one is refused below",
+    "sync graph.starts": "more starts of a search: they matter where the obvious ones fail (test_graph.py)",
+    "match matcher:FusedGromovWasserstein.device": "where products are computed; an unknown one is refused below",
     "match matcher:GromovWasserstein.device": "as of FusedGromovWasserstein",
 }
 """Options that change nothing that can be compared, and why that is right."""
@@ -278,7 +278,8 @@ def test_the_other_options_of_sync(films, tmp_path):
 @pytest.mark.parametrize(
     "option",
     [
-        ["matcher:nearest-neighbor"], ["aligner:dtw"], ["refiner:unrefined"], ["--graph.extra", "0"], ["--rematch", "0"],
+        ["matcher:nearest-neighbor"], ["aligner:dtw"], ["refiner:unrefined"], ["--graph.extra", "0"],
+        ["--rematch", "0"],
         ["--rate", "fit"], ["--workers", "2"],
     ],
 )  # fmt: skip

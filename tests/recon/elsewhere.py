@@ -1,8 +1,8 @@
 """A pretended second device: tensors that compute on the CPU, but must not meet the CPU's own.
 
 torch's "meta" device stands in for a GPU. Every operation there runs on real numbers, so that a whole fit can be held
-against the same fit on the CPU, and raises where tensors of two devices meet: stricter than CUDA, which lets a scalar of
-the CPU pass. What only a GPU can tell (its kernels, their rounding, races) is not seen here.
+against the same fit on the CPU, and raises where tensors of two devices meet: stricter than CUDA, which lets a scalar
+of the CPU pass. What only a GPU can tell (its kernels, their rounding, races) is not seen here.
 """
 
 from __future__ import annotations

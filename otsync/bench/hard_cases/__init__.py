@@ -1,1 +1,1 @@
-"""The catalogue of hard cases: one table that every solver of a slot runs, ours and others'; ``docs/stability.md`` shows it."""
+"""The catalogue of hard cases: one table for every solver of a slot; ``docs/stability.md`` shows it."""

@@ -10,8 +10,9 @@ from .case import Case
 HEAD = """# Hard cases
 
 What a plain solver (POT called directly, or the paper's method) does, and what otsync does instead. Generated from the
-table in `otsync/bench/hard_cases` by `make stability`; the tests run every row on every solver of its slot, each within a
-time limit: it answers rightly, flags its answer, or refuses the input with a ValueError.
+table in `otsync/bench/hard_cases` by `make stability`; the tests run every row on every solver of its slot: it answers
+rightly, flags its answer, or refuses the input with a ValueError, and never hangs. `otsync bench hard-cases` runs the
+table from the shell, plugins included.
 """
 
 

@@ -131,7 +131,9 @@ def shortlist(
     groups: tuple[np.ndarray, np.ndarray] | None = None,
     allowed: Int[np.ndarray, "Ga C"] | None = None,
 ) -> Candidates:
-    """The ``keep`` cheapest partners of every track, among the groups of b ``allowed`` for its own (None: among all)."""
+    """The ``keep`` cheapest partners of every track, among the groups of b ``allowed`` for its own (None: among
+    all).
+    """
     from . import kernels
 
     sa, sb = signs

@@ -1,4 +1,6 @@
-"""Every solver runs the whole catalogue: it answers rightly or refuses; never a confident wrong answer, nan or a hang."""
+"""Every solver runs the whole catalogue: it answers rightly or refuses; never a confident wrong answer, nan or a
+hang.
+"""
 
 from __future__ import annotations
 

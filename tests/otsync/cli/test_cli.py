@@ -317,8 +317,8 @@ def test_an_interrupted_command_says_so(tmp_path):
     time.sleep(1.0)
     run.send_signal(signal.SIGINT)
     _, err = run.communicate(timeout=120)
-    # a compiled extension that is just being imported may abort instead; a signal that reaches the interpreter's own end
-    # gives -SIGINT, which a shell shows as 130 too
+    # a compiled extension that is just being imported may abort instead; a signal that reaches the interpreter's own
+    # end gives -SIGINT, which a shell shows as 130 too
     assert run.returncode in (130, -signal.SIGINT, -signal.SIGABRT), err
     assert list((tmp_path / "out").iterdir()) == []
 

@@ -139,7 +139,8 @@ def test_a_small_benchmark_runs_from_end_to_end(tmp_path):
 def test_peak_memory_of_twenty_thousand_tracks():
     code = (
         "import resource; from otsync import AnchoredFGW; from otsync.simulate import matching_world;"
-        "AnchoredFGW()(*matching_world(20000, 1)[:2]); print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20)"
+        "AnchoredFGW()(*matching_world(20000, 1)[:2]); print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / "
+        "2**20)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert float(done.stdout) < 2

@@ -707,7 +707,9 @@ class Counted(Exporter):
 
 
 def test_a_loss_an_effect_and_a_format_of_one_file_are_found_by_every_command(world, tmp_path):
-    """In the help, in a fit, in its run.json and in the evaluation that reads it, in an export, and among bench's rows."""
+    """In the help, in a fit, in its run.json and in the evaluation that reads it, in an export, and among bench's
+    rows.
+    """
     plugin = tmp_path / "my_own_things.py"
     plugin.write_text(MINE)
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OTSYNC_PLUGINS": str(plugin), "COLUMNS": "2000"}

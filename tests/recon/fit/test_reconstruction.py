@@ -28,7 +28,8 @@ def refined(seed: int, steps: int, rates=RATES):
 def test_offsets_and_held_out_views(seed):
     error, held, result = refined(seed, 3000)
     print(
-        f"seed {seed}: mean {error.mean:.4f} max {error.max:.4f} held-out {held['psnr']:.2f} / {held['mask_psnr']:.2f} dB, "
+        f"seed {seed}: mean {error.mean:.4f} max {error.max:.4f} held-out {held['psnr']:.2f} / "
+        f"{held['mask_psnr']:.2f} dB, "
         f"{result.stats['seconds']:.0f} s, {result.stats['gaussians']:.0f} Gaussians"
     )
     assert error.mean <= 0.06 and error.max <= 0.12
