@@ -48,7 +48,7 @@ def suites() -> dict[str, Callable[[], Any]]:
 
 def _load(point: EntryPoint) -> Any:
     try:
-        return point.load()
+        return _given(point.load())
     except ImportError as error:
         raise ValueError(
             f"benchmark {point.name}: expected {point.value} to import; found {error}. Install what it needs."
@@ -56,4 +56,5 @@ def _load(point: EntryPoint) -> Any:
 
 
 def _given(suite: Any) -> Any:
-    return suite
+    """A suite that is a class is made."""
+    return suite() if isinstance(suite, type) else suite

@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from ..io import READERS
 from ..plugins import available
 from ..progress import tell
+from .slots import one_of
 
 if TYPE_CHECKING:
     from ..recordings.stages import Stages
@@ -29,7 +31,7 @@ class Init:
     """Panoptic layout, video files, one folder of images per camera, or a layout that a plugin reads."""
     out: Path | None = None
     """Where to write; default: scene.json in the folder."""
-    reader: str | None = None
+    reader: one_of("readers", READERS) | None = None
     """Name of the reader; default: the first that claims the folder."""
     fps: float | None = None
     """Frames per second of images, which carry no clock."""

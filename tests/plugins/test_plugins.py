@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
-from pathlib import Path
+from functools import partial
 
 import pytest
 
 from otsync import plugins
 from otsync.simulate import simulate
-
-ROOT = Path(__file__).parents[2]
+from tests.plugins.outside import shell_with
 
 ALGORITHMS = '''
 from dataclasses import dataclass, field
@@ -22,7 +18,6 @@ from otsync import DTW, Matches, NearestNeighbor, SplineRefine
 from otsync.align import Aligner
 from otsync.match import Matcher
 from otsync.refine import Refiner
-{decorators}
 
 {matchers}
 @dataclass(frozen=True)
@@ -93,36 +88,8 @@ def world(tmp_path_factory) -> list[str]:
 @pytest.fixture(scope="module", params=["file", "installed"])
 def shell(request, tmp_path_factory):
     """``otsync`` with the things in a file (``--plugin``), or in a package with entry points."""
-    folder = tmp_path_factory.mktemp(request.param)
-    environment = dict(os.environ)
-    if request.param == "file":
-        lines = {group: f'@register("{group}")' for group in KINDS}
-        text = ALGORITHMS.format(decorators="from otsync.plugins import register", **lines)
-        (folder / "my_things.py").write_text(text)
-        first = ["--plugin", str(folder / "my_things.py")]
-    else:  # as pip leaves a package: its files and its metadata on the path
-        (folder / "their_things.py").write_text(ALGORITHMS.format(decorators="", **dict.fromkeys(KINDS, "")))
-        metadata = folder / "theirs-1.0.dist-info"
-        metadata.mkdir()
-        (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: theirs\nVersion: 1.0\n")
-        points = "".join(
-            f"[otsync.{group}]\n{plugins.short_name(type(name, (), {}))} = their_things:{name}\n\n"
-            for group, name in KINDS.items()
-        )
-        (metadata / "entry_points.txt").write_text(points)
-        environment["PYTHONPATH"] = os.pathsep.join([str(folder), environment.get("PYTHONPATH", "")])
-        first = []
-
-    def run(*args: str) -> subprocess.CompletedProcess:
-        return subprocess.run(
-            [sys.executable, "-m", "otsync.cli", *first, *args],
-            capture_output=True,
-            text=True,
-            cwd=ROOT,
-            env=environment | {"COLUMNS": "200"},
-        )
-
-    return run
+    run = shell_with(request.param, tmp_path_factory.mktemp(request.param), ALGORITHMS, KINDS)
+    return partial(run, "otsync")
 
 
 def test_they_stand_in_the_help(shell, world):

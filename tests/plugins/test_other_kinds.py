@@ -1,0 +1,198 @@
+"""Readers, priors, benchmarks, losses, effects and exporters from outside: in the help, at work, on the lists."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from recon.scene.gaussians4d import Gaussians4D
+from tests.plugins.outside import shell_with
+from tests.recon.worlds import write_world
+from tests.recording_world import write_recording
+
+OF_RECORDINGS = '''
+from dataclasses import dataclass
+
+import numpy as np
+
+{readers}
+class Renamed:
+    """A recording whose scene.json has another name."""
+
+    name = "renamed"
+
+    def claims(self, folder):
+        return (folder / "my_scene.json").is_file()
+
+    def describe(self, folder):
+        import json
+
+        return json.loads((folder / "my_scene.json").read_text())
+
+
+{maskers}
+@dataclass(frozen=True)
+class Bright:
+    """What is brighter than usual moves."""
+
+    threshold: float = 20.0
+
+    def __call__(self, frames, camera):
+        images = np.stack([frames[k].mean(-1) for k in range(len(frames))])
+        return np.abs(images - np.median(images, 0)) > self.threshold
+
+
+{trackers}
+@dataclass(frozen=True)
+class FewPoints:
+    """Every second track of our own."""
+
+    def __call__(self, frames, masks, fps):
+        from otsync.priors import ChainedFlow
+
+        return ChainedFlow()(frames, masks, fps)[::2]
+
+
+{describers}
+@dataclass(frozen=True)
+class Nothing:
+    """Tracks that look alike, nearly."""
+
+    dimensions: int = 3
+
+    def __call__(self, frames, masks, uv, fps):
+        return np.random.default_rng(0).normal(size=(len(uv), self.dimensions)) + 9.0
+
+
+{benchmarks}
+class Mine:
+    """Writes how it was called."""
+
+    name = "mine"
+
+    def run(self, out, *, seeds=1):
+        out.mkdir(parents=True, exist_ok=True)
+        (out / "mine.txt").write_text(f"{{seeds}} seeds")
+        return 0
+
+'''
+
+KINDS = {
+    "readers": "Renamed", "maskers": "Bright", "trackers": "FewPoints", "describers": "Nothing", "benchmarks": "Mine",
+}  # fmt: skip
+
+OF_SCENES = '''
+from dataclasses import dataclass, replace
+
+from recon.losses import ImageLoss
+from recon.observe import Effect
+from recon.result import Exporter
+
+{losses}
+@dataclass(frozen=True)
+class Colourless(ImageLoss):
+    """Grey levels alone."""
+
+    weight: float = 0.5
+
+    def __call__(self, seen):
+        return (seen.rendered.mean(-1) - seen.image.mean(-1)).square().mean()
+
+
+{effects}
+@dataclass(frozen=True)
+class Dimmed(Effect):
+    """Less light than there is."""
+
+    share: float = 0.9
+    instant = True
+
+    def wrap(self, observe, params):
+        def dimmed(shot):
+            seen = observe(shot)
+            return replace(seen, rgb=seen.rgb * self.share)
+
+        return dimmed
+
+
+{exporters}
+class Counted(Exporter):
+    """The number of Gaussians."""
+
+    name, file, holds = "counted", "count.txt", "everything"
+
+    def write(self, scene, out, times, frame):
+        out.write_text(str(len(scene)))
+'''
+
+KINDS_OF_SCENES = {"losses": "Colourless", "effects": "Dimmed", "exporters": "Counted"}
+
+WAYS = pytest.mark.parametrize("way", ["file", "installed"])
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("recording")
+    write_recording(folder, [0.0, 3.0], frames=40)
+    return folder
+
+
+@WAYS
+def test_readers_priors_and_benchmarks(way, recording, tmp_path):
+    home = tmp_path / "plugins"
+    home.mkdir()
+    shell = partial(shell_with(way, home, OF_RECORDINGS, KINDS), "otsync")
+    words = shell("sync", "--help").stdout
+    assert "|bright" in words and "|few-points" in words and "|nothing" in words
+    assert "renamed" in shell("init", "--help").stdout
+    assert ",mine," in shell("bench", "--help").stdout
+
+    folder = tmp_path / "recording"
+    shutil.copytree(recording, folder)
+    (folder / "scene.json").rename(folder / "my_scene.json")
+    done = shell("init", str(folder))
+    assert done.returncode == 0 and "renamed" in done.stdout + done.stderr, done.stderr
+
+    def offsets(*args: str) -> np.ndarray:
+        done = shell("sync", str(folder), "--json", "--out", str(tmp_path / "o"), "--quiet", *args)
+        assert done.returncode in (0, 1), done.stderr
+        return json.loads(done.stdout)["pairs"][0]["stats"]
+
+    own = offsets()
+    for option, value in (("masks", "bright:threshold=25"), ("points", "few-points"), ("features", "nothing")):
+        assert offsets(f"--recording.{option}", value) != own, option
+    assert shell("bench", "mine", "--seeds", "4", "--out", str(tmp_path / "b")).returncode == 0
+    assert (tmp_path / "b" / "mine.txt").read_text() == "4 seeds"
+    listed = {(row["group"], row["name"]) for row in json.loads(shell("plugins", "--json").stdout)["plugins"]}
+    names = {"readers": "renamed", "maskers": "bright", "trackers": "few-points", "describers": "nothing"}
+    assert listed >= set(names.items()) | {("benchmarks", "mine")}
+
+
+@WAYS
+def test_losses_effects_and_exporters(way, tmp_path):
+    home = tmp_path / "plugins"
+    home.mkdir()
+    shell = partial(shell_with(way, home, OF_SCENES, KINDS_OF_SCENES), "recon")
+    world, out = tmp_path / "world", tmp_path / "r"
+    write_world(world)
+    words = shell("fit", "--help").stdout
+    assert "colourless" in words and "dimmed" in words
+    assert "counted" in shell("export", "--help").stdout
+    words = shell("bench", "--help").stdout
+    assert "with colourless" in words and "with dimmed" in words
+    done = shell(
+        "fit", str(world), "--offsets", str(world / "start.json"), "--out", str(out), "--width", "48",
+        "--tracks", *map(str, sorted((world / "tracks").glob("*.npz"))), "--steps", "2", "--backdrop-steps", "5",
+        "--losses", "photometric", "colourless:weight=0.2", "--effects", "dimmed:share=0.8", "--views", "2", "--quiet",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    run = json.loads((out / "run.json").read_text())
+    assert run["videos"][0]["optics"] == [{"name": "dimmed", "share": 0.8}]
+    done = shell("export", str(out), "--format", "counted")
+    assert done.returncode == 0, done.stderr
+    assert int((out / "count.txt").read_text()) == len(Gaussians4D.load(out / "scene.npz"))
