@@ -50,7 +50,7 @@ def run(out: Path, *, only: Sequence[str] = ()) -> int:
     unknown = sorted(set(only) - {name for _, name, _ in rows()})
     if unknown:
         names = dict.fromkeys(name for _, name, _ in rows())
-        raise ValueError(f"--only: expected some of {', '.join(names)}; found {', '.join(unknown)}.")
+        raise ValueError(f"--only: expected some of {'; '.join(names)}. Found {'; '.join(unknown)}.")
     lines: list[dict[str, Any]] = []
     for case, name, solver in counted(chosen, "hard cases", "row", len(chosen)):
         started = time.perf_counter()
@@ -61,15 +61,26 @@ def run(out: Path, *, only: Sequence[str] = ()) -> int:
         except Exception as error:  # a solver of somebody else's may raise anything
             kind, fine = f"{type(error).__name__}: {error}", False
         seconds = time.perf_counter() - started
-        lines.append({"solver": name, "case": case.name, "outcome": kind, "accepted": fine, "seconds": seconds})
+        lines.append(
+            {
+                "solver": name,
+                "case": case.name,
+                "outcome": kind,
+                "expected": " or ".join(case.expect),
+                "accepted": fine,
+                "seconds": seconds,
+            }
+        )
     write_rows(out, "hard_cases", lines)
     summary = []
     for name in dict.fromkeys(line["solver"] for line in lines):
         own = [line for line in lines if line["solver"] == name]
-        kinds = {kind: sum(line["outcome"] == kind for line in own) for kind in ("right", "flagged", "refused")}
+        kinds = {
+            kind: sum(line["outcome"] == kind for line in own) for kind in ("right", "flagged", "refused", "WRONG")
+        }
         summary.append({"solver": name, "rows": len(own), **kinds, "not accepted": sum(not x["accepted"] for x in own)})
     print(table(summary))
     for line in lines:
         if not line["accepted"]:
-            print(f"{line['solver']}: {line['case']}: {line['outcome']}")
+            print(f"{line['solver']}: {line['case']}: {line['outcome']}; accepted: {line['expected']}")
     return 0 if all(line["accepted"] for line in lines) else 1
