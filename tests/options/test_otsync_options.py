@@ -45,14 +45,26 @@ def slot(kind: str, name: str, **values: object) -> dict[str, list[str]]:
 
 
 MATCHER_OPTIONS = (
-    slot("matcher", "AnchoredFGW", anchors=40, cells=60, mass=0.4, alpha=2.0, tau=0.2, beta=0.2, landmarks=20, rounds=1,
-         partners=2, seed=3)
+    slot(
+        "matcher",
+        "AnchoredFGW",
+        anchors=40,
+        cells=60,
+        mass=0.4,
+        alpha=2.0,
+        tau=0.2,
+        beta=0.2,
+        landmarks=20,
+        rounds=1,
+        partners=2,
+        seed=3,
+    )
     | slot("matcher", "FusedGromovWasserstein", alpha=3.0, max_iter=2, tol=0.5)
     | slot("matcher", "PartialFGW", mass=0.3, alpha=3.0, tol=10.0)
     | slot("matcher", "EntropicFGW", reg=0.09, alpha=3.0, max_iter=2, tol=1.0)
     | slot("matcher", "GromovWasserstein", max_iter=2, tol=0.5)
     | slot("matcher", "OptimalTransport", reg=0.3)
-)  # fmt: skip
+)
 
 SCAN, FIT = "aligner:LikelihoodScan", "refiner:SplineRefine"
 ALIGNER_OPTIONS = (
@@ -63,20 +75,28 @@ ALIGNER_OPTIONS = (
     | {
         f"{SCAN}.trust.{name}": [f"--aligner.trust.{name.replace('_', '-')}", value]
         for name, value in {
-            "evidence": "1e9", "margin": "10", "disagreement": "-1", "alias": "-1", "overlap": "1e9", "matches": "1e9",
-            "motion": "1e9", "rate_gain": "-1",
+            "evidence": "1e9",
+            "margin": "10",
+            "disagreement": "-1",
+            "alias": "-1",
+            "overlap": "1e9",
+            "matches": "1e9",
+            "motion": "1e9",
+            "rate_gain": "-1",
         }.items()
     }
-)  # fmt: skip
-REFINER_OPTIONS = (
-    slot("refiner", "SplineRefine", windows="0.3 0.2", smoothing=3.0, limit=10)
-    | {
-        f"{FIT}.trust.{name}": [f"--refiner.trust.{name.replace('_', '-')}", value]
-        for name, value in {
-            "moved": "-1", "spread": "-1", "correlation": "2", "blur": "-1", "overlap": "1e9", "matches": "1e9",
-        }.items()
-    }
-)  # fmt: skip
+)
+REFINER_OPTIONS = slot("refiner", "SplineRefine", windows="0.3 0.2", smoothing=3.0, limit=10) | {
+    f"{FIT}.trust.{name}": [f"--refiner.trust.{name.replace('_', '-')}", value]
+    for name, value in {
+        "moved": "-1",
+        "spread": "-1",
+        "correlation": "2",
+        "blur": "-1",
+        "overlap": "1e9",
+        "matches": "1e9",
+    }.items()
+}
 NOT_READ = {
     **{f"{SCAN}.trust.{name}": "aligner" for name in ("moved", "spread", "correlation", "blur", "rate_sigmas")},
     **{f"{FIT}.trust.{name}": "refiner" for name in ("disagreement", "alias", "motion", "rate_gain")},
@@ -278,11 +298,15 @@ def test_the_other_options_of_sync(films, tmp_path):
 @pytest.mark.parametrize(
     "option",
     [
-        ["matcher:nearest-neighbor"], ["aligner:dtw"], ["refiner:unrefined"], ["--graph.extra", "0"],
+        ["matcher:nearest-neighbor"],
+        ["aligner:dtw"],
+        ["refiner:unrefined"],
+        ["--graph.extra", "0"],
         ["--rematch", "0"],
-        ["--rate", "fit"], ["--workers", "2"],
+        ["--rate", "fit"],
+        ["--workers", "2"],
     ],
-)  # fmt: skip
+)
 def test_what_the_route_of_a_recording_decides_is_refused(option, recording, tmp_path):
     code, _, err = run(["sync", str(recording), "--out", str(tmp_path / "o"), *option])
     name = option[0].lstrip("-").partition(":")[0].partition(".")[0]
@@ -347,9 +371,14 @@ def test_options_of_simulate_and_demo(tmp_path):
 
     plain = world()
     for args in (
-        ["--motion", "boxes"], ["--preset", "hard"], ["--videos", "3"], ["--frames", "25"], ["--fps", "25"],
-        ["--max-offset", "5"], ["--seed", "8"],
-    ):  # fmt: skip
+        ["--motion", "boxes"],
+        ["--preset", "hard"],
+        ["--videos", "3"],
+        ["--frames", "25"],
+        ["--fps", "25"],
+        ["--max-offset", "5"],
+        ["--seed", "8"],
+    ):
         assert world(*args) != plain, args
 
     def demo(*args: str) -> str:

@@ -83,8 +83,12 @@ class Mine:
 '''
 
 KINDS = {
-    "readers": "Renamed", "maskers": "Bright", "trackers": "FewPoints", "describers": "Nothing", "benchmarks": "Mine",
-}  # fmt: skip
+    "readers": "Renamed",
+    "maskers": "Bright",
+    "trackers": "FewPoints",
+    "describers": "Nothing",
+    "benchmarks": "Mine",
+}
 
 OF_SCENES = '''
 from dataclasses import dataclass, replace
@@ -186,10 +190,29 @@ def test_losses_effects_and_exporters(way, tmp_path):
     words = shell("bench", "--help").stdout
     assert "with colourless" in words and "with dimmed" in words
     done = shell(
-        "fit", str(world), "--offsets", str(world / "start.json"), "--out", str(out), "--width", "48",
-        "--tracks", *map(str, sorted((world / "tracks").glob("*.npz"))), "--steps", "2", "--backdrop-steps", "5",
-        "--losses", "photometric", "colourless:weight=0.2", "--effects", "dimmed:share=0.8", "--views", "2", "--quiet",
-    )  # fmt: skip
+        "fit",
+        str(world),
+        "--offsets",
+        str(world / "start.json"),
+        "--out",
+        str(out),
+        "--width",
+        "48",
+        "--tracks",
+        *map(str, sorted((world / "tracks").glob("*.npz"))),
+        "--steps",
+        "2",
+        "--backdrop-steps",
+        "5",
+        "--losses",
+        "photometric",
+        "colourless:weight=0.2",
+        "--effects",
+        "dimmed:share=0.8",
+        "--views",
+        "2",
+        "--quiet",
+    )
     assert done.returncode == 0, done.stderr
     run = json.loads((out / "run.json").read_text())
     assert run["videos"][0]["optics"] == [{"name": "dimmed", "share": 0.8}]

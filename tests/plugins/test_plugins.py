@@ -130,8 +130,11 @@ def test_they_run_from_the_shell_with_their_options(shell, world, tmp_path):
 def test_they_are_on_the_lists_of_benchmarks_and_of_hard_cases(shell, tmp_path):
     listed = json.loads(shell("plugins", "--json").stdout)["plugins"]
     assert {(row["group"], row["name"]) for row in listed} >= {
-        ("matchers", "every-other"), ("aligners", "my-warping"), ("refiners", "my-refiner"), ("commands", "greet"),
-    }  # fmt: skip
+        ("matchers", "every-other"),
+        ("aligners", "my-warping"),
+        ("refiners", "my-refiner"),
+        ("commands", "greet"),
+    }
     done = shell("bench", "hard-cases", "--only", "every-other", "my-warping", "my-refiner", "--out", str(tmp_path))
     assert done.returncode in (0, 1), done.stderr
     ran = json.loads((tmp_path / "hard_cases.json").read_text())["rows"]
