@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[2]
 def figures(effect: str, steps: int) -> dict[str, list[float]]:
     command = [sys.executable, ROOT / "examples" / "08_effects.py", "--effect", effect, "--steps", str(steps)]
     done = subprocess.run(
-        command, capture_output=True, text=True, timeout=900, env={**os.environ, "PYTHONPATH": str(ROOT)}
+        command, capture_output=True, text=True, timeout=3600, env={**os.environ, "PYTHONPATH": str(ROOT)}
     )
     assert done.returncode == 0, done.stderr[-2000:]
     rows = [line.split() for line in done.stdout.splitlines()[1:]]

@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[2]
 
 def run(script: str, *args: str, cwd: Path) -> str:
     done = subprocess.run(
-        [sys.executable, ROOT / "examples" / script, *args], capture_output=True, text=True, cwd=cwd, timeout=300
+        [sys.executable, ROOT / "examples" / script, *args], capture_output=True, text=True, cwd=cwd, timeout=3600
     )
     assert done.returncode == 0, done.stderr[-2000:]
     return done.stdout

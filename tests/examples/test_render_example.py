@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[2]
 def test_a_circling_camera_becomes_a_video(tmp_path):
     command = [sys.executable, ROOT / "examples" / "05_render.py", "--frames", "6", "--width", "96", "--height", "64"]
     done = subprocess.run(
-        command, cwd=tmp_path, capture_output=True, text=True, timeout=300, env={**os.environ, "PYTHONPATH": str(ROOT)}
+        command, cwd=tmp_path, capture_output=True, text=True, timeout=3600, env={**os.environ, "PYTHONPATH": str(ROOT)}
     )
     assert done.returncode == 0, done.stderr[-2000:]
     with av.open(str(tmp_path / "circle.mp4")) as video:

@@ -633,7 +633,7 @@ def command(world: Path, out: Path) -> list[str]:
 def test_a_run_killed_at_any_moment_ends_with_the_same_files(world, tmp_path):
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     began = time.monotonic()
-    subprocess.run(command(world, tmp_path / "whole"), check=True, capture_output=True, env=environment, timeout=600)
+    subprocess.run(command(world, tmp_path / "whole"), check=True, capture_output=True, env=environment, timeout=3600)
     whole = time.monotonic() - began
     rng = np.random.default_rng(int(time.time()))
     for n in range(2):
@@ -664,11 +664,11 @@ def test_ctrl_c_exits_with_130_and_says_how_to_go_on(world, tmp_path):
     args = [*command(world, tmp_path / "r")]
     args[args.index("200")] = "100000"
     run = subprocess.Popen(args, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment)
-    deadline = time.monotonic() + 120
+    deadline = time.monotonic() + 3600
     while not (tmp_path / "r" / "fit.npz").exists() and time.monotonic() < deadline:
         time.sleep(0.2)
     run.send_signal(signal.SIGINT)
-    _, told = run.communicate(timeout=60)
+    _, told = run.communicate(timeout=3600)
     assert run.returncode == 130 and b"continues from here" in told and b"Traceback" not in told
 
 
@@ -716,7 +716,7 @@ def test_a_loss_an_effect_and_a_format_of_one_file_are_found_by_every_command(wo
 
     def recon(*args: str) -> str:
         run = subprocess.run(
-            [sys.executable, "-m", "recon.cli", *args], capture_output=True, text=True, env=environment, timeout=600
+            [sys.executable, "-m", "recon.cli", *args], capture_output=True, text=True, env=environment, timeout=3600
         )
         assert run.returncode == 0, run.stderr
         return run.stdout

@@ -475,7 +475,7 @@ def test_the_process_that_compiles_the_kernels_gives_the_same_bits_as_those_that
     for name in ("compiled", "loaded"):
         (tmp_path / "fit.npz").unlink(missing_ok=True)
         subprocess.run(
-            [sys.executable, "-c", code.replace("{name}", name)], cwd=ROOT, env=environment, check=True, timeout=600
+            [sys.executable, "-c", code.replace("{name}", name)], cwd=ROOT, env=environment, check=True, timeout=3600
         )
     assert (tmp_path / "compiled.json").read_bytes() == (tmp_path / "loaded.json").read_bytes()
 
@@ -491,7 +491,7 @@ def test_sigkill_at_random_moments_changes_nothing(tmp_path):
     for _ in range(40):
         process = start("killed")
         seen = (tmp_path / "killed.npz").exists()
-        deadline = time.monotonic() + 60
+        deadline = time.monotonic() + 3600
         while not seen and process.poll() is None and time.monotonic() < deadline:
             seen = (tmp_path / "killed.npz").exists()
             time.sleep(0.01)
