@@ -177,11 +177,11 @@ def test_readers_priors_and_benchmarks(way, recording, tmp_path):
     assert listed >= set(names.items()) | {("benchmarks", "mine")}
 
 
-@WAYS
-def test_losses_effects_and_exporters(way, tmp_path):
+def test_losses_effects_and_exporters_of_a_package(tmp_path):
+    """Those of a file: tests/recon/cli/test_recon_cli.py."""
     home = tmp_path / "plugins"
     home.mkdir()
-    shell = partial(shell_with(way, home, OF_SCENES, KINDS_OF_SCENES), "recon")
+    shell = partial(shell_with("installed", home, OF_SCENES, KINDS_OF_SCENES), "recon")
     world, out = tmp_path / "world", tmp_path / "r"
     write_world(world)
     words = shell("fit", "--help").stdout
