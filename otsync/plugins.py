@@ -29,6 +29,8 @@ GROUPS: dict[str, str] = {
     "matchers": "callables (a, b) -> Matches",
     "aligners": "callables (a, b, matches) -> Alignment",
     "refiners": "callables (a, b, matches, alignment) -> Alignment",
+    "costs": "terms that matchers minimise: objects with matrix(a, b) and pairs(a, b, i, j)",
+    "methods": "what stands in every slot under one name: objects of otsync.Method",
     "maskers": "what moves in a video: callables (WorkingFrames) -> masks",
     "trackers": "callables (WorkingFrames, masks, fps) -> point tracks",
     "describers": "callables (WorkingFrames, masks, uv, fps) -> a feature per track",

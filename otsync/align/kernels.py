@@ -94,8 +94,8 @@ def lag_statistics(a, wa, qa, b, wb, qb, lags, least, count, power, residual):
 
 
 @kernel(fastmath={"contract", "reassoc", "nsz"})
-def windowed_evidence(a, wa, qa, b, wb, qb, lags, block, least, floor, out):
-    """Sum over matches and windows of n/2 log((Var a + Var b + floor) / (Var(a - b) + floor)) at every lag.
+def windowed_evidence(a, wa, qa, b, wb, qb, lags, block, least, floor, weight, out):
+    """Sum over matches (times their ``weight``) and windows of n/2 log((Var a + Var b + floor) / (Var(a - b) + floor)) at every lag.
 
     Arrays as for :func:`lag_statistics`. Windows are two blocks of ``block`` frames long and start every block,
     counted from the first common frame, which treats a and b alike; the first and last block are windows of their own
@@ -142,4 +142,4 @@ def windowed_evidence(a, wa, qa, b, wb, qb, lags, block, least, floor, out):
                 dx, dy, dz = sx - SX, sy - SY, sz - SZ
                 rest = both - 2 * (now[9] + before[9]) - (dx * dx + dy * dy + dz * dz) / c
                 power, residual = max((both - own) / c, 0.0), max(rest / c, 0.0)
-                out[n] += 0.25 * c * np.log((power + floor) / (residual + floor))
+                out[n] += weight[m] * (0.25 * c * np.log((power + floor) / (residual + floor)))

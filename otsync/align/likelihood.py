@@ -50,8 +50,8 @@ class LikelihoodScan(Aligner):
 
         LLR = n/2 log((Var a + Var b + e²) / (Var(a - b) + e²)),   e = ½ sqrt(median_m min_k Var(a - b))
 
-    summed over velocities of ±2 and ±5 frames and, with weight ½, positions in windows of 40 frames, divided by the
-    number of matches. The logarithm lets a wrong match add about nothing instead of a veto; the factor n gives no
+    summed over velocities of ±2 and ±5 frames and, with weight ½, positions in windows of 40 frames, averaged over the
+    matches (by their ``weight``, where they have one). The logarithm lets a wrong match add about nothing instead of a veto; the factor n gives no
     reward for a tiny overlap; a point at rest adds nothing; e makes the noise scale automatic, so no unit enters.
     Constant errors (depth bias, another surface point) drop out of velocities and of demeaned windows.
 
@@ -82,7 +82,7 @@ class LikelihoodScan(Aligner):
         lags = pair.lags(max(1, round(self.min_overlap * pair.fps)), self.max_lag)
         if len(matches) == 0 or len(lags) == 0:
             return unanswered(pair, matches)
-        curves = evidence(pair, lags)
+        curves = evidence(pair, lags, matches.shares)
         score = curves.total
         if not np.isfinite(score).any():
             return unanswered(pair, matches)
@@ -158,9 +158,13 @@ class Curves:
     motion: Float[np.ndarray, " K"]
 
 
-def evidence(pair: CommonClock, lags: Int[np.ndarray, " K"]) -> Curves:
-    """The scan's score and its parts at ``lags``."""
+def evidence(
+    pair: CommonClock, lags: Int[np.ndarray, " K"], weight: Float[np.ndarray, " M"] | None = None
+) -> Curves:
+    """The scan's score and its parts at ``lags``; ``weight``: of the matches, with mean 1."""
     from . import kernels
+
+    weight = np.ones(len(pair.a)) if weight is None else weight
 
     def frames(seconds: float) -> int:
         return max(1, round(seconds * pair.fps))
@@ -171,11 +175,11 @@ def evidence(pair: CommonClock, lags: Int[np.ndarray, " K"]) -> Curves:
     floor = noise_floor(count, power, residual)
     windows = np.zeros(len(lags))
     kernels.windowed_evidence(
-        *positions[0].arrays, *positions[1].arrays, lags, frames(BLOCK), frames(MIN_WINDOW), floor, windows
+        *positions[0].arrays, *positions[1].arrays, lags, frames(BLOCK), frames(MIN_WINDOW), floor, weight, windows
     )
     observed = (count > 0).sum(0).astype(float)
     windows = np.where(observed > 0, windows / len(pair.a), -np.inf)
-    fast, slow = (velocity_score(pair, lags, frames(half), least) for half in (FAST, SLOW))
+    fast, slow = (velocity_score(pair, lags, frames(half), least, weight) for half in (FAST, SLOW))
     shared = 0.5 * (count * (power - residual)).sum(0) / np.maximum(count.sum(0), 1)
     extent = 0.5 * (positions[0].extent + positions[1].extent)
     return Curves(
@@ -230,12 +234,21 @@ def noise_floor(count: np.ndarray, power: np.ndarray, residual: np.ndarray) -> f
     return floor or 1.0
 
 
-def velocity_score(pair: CommonClock, lags: Int[np.ndarray, " K"], half: int, least: int) -> Float[np.ndarray, " K"]:
-    """Mean LLR of the velocities over ±``half`` frames."""
+def velocity_score(
+    pair: CommonClock,
+    lags: Int[np.ndarray, " K"],
+    half: int,
+    least: int,
+    weight: Float[np.ndarray, " M"] | None = None,
+) -> Float[np.ndarray, " K"]:
+    """Mean LLR of the velocities over ±``half`` frames, the matches counted by ``weight`` (mean 1)."""
     a, b = Signal.of(velocity(pair.a, half)), Signal.of(velocity(pair.b, half))
     count, power, residual = statistics(a, b, lags, least)
     floor = noise_floor(count, power, residual)
-    score = 0.5 * (count * np.log((power + floor) / (residual + floor))).sum(0) / len(pair.a)
+    gain = count * np.log((power + floor) / (residual + floor))
+    if weight is not None:
+        gain *= weight[:, None]
+    score = 0.5 * gain.sum(0) / len(pair.a)
     return np.where((count > 0).any(0), score, -np.inf)
 
 

@@ -18,6 +18,7 @@ from .slots import one_of
 
 if TYPE_CHECKING:
     from ..recordings.stages import Stages
+    from ..sync.method import Method
 
 
 @dataclass
@@ -131,6 +132,7 @@ def sync_recording(
     out: Path,
     options: RecordingOptions,
     *,
+    method: Method | None = None,
     reference: str | None = None,
     truth: Path | None = None,
     as_json: bool = False,
@@ -150,26 +152,27 @@ def sync_recording(
     scene = open_scene(path, allow_outside=options.allow_outside)
     if options.cameras:
         scene = scene.take(options.cameras)
-    chosen = 0
+    chosen: int | Literal["auto"] = 0
     if reference is not None:
-        if reference not in scene.names:
-            raise ValueError(f"--reference: expected one of {', '.join(scene.names)}; found {reference!r}.")
-        chosen = scene.names.index(reference)
+        if reference not in (*scene.names, "auto"):
+            raise ValueError(f"--reference: expected auto or one of {', '.join(scene.names)}; found {reference!r}.")
+        chosen = "auto" if reference == "auto" else scene.names.index(reference)
     known = None if truth is None else true_offsets(truth, scene.names)
-    if known is not None:
-        known = known - known[chosen]
     for note in scene.notes:
         tell(f"note: {note}")
     with ThreadPoolExecutor(threads) as pool:
         found = synchronize_scene(
             scene,
             route=options.route,
+            method=method,
             stages=stages,
             reference=chosen,
             cache=Cache(options.cache or out / "stages"),
             map=pool.map,
             tell=tell,
         )
+    if known is not None:
+        known = known - known[found.offsets.component]
     found.offsets.save(out / "offsets.json")
     write_json(out / "sync.json", {"route": found.route, "why": list(found.why), "seconds": found.seconds})
     write_recording_report(out / "report.html", scene, found, truth=None if known is None else list(known))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable
-from typing import Annotated, Any, Literal, Union
+from functools import cache
+from typing import Annotated, Any, Literal, Union, get_type_hints
 
 import tyro
 
@@ -39,3 +41,11 @@ def _maker(thing: Any) -> Any:
         return thing
 
     return make
+
+
+@cache
+def partial(cls: type) -> Any:
+    """A dataclass with the fields of ``cls``, each None: "not named on the command line"."""
+    hints = get_type_hints(cls)
+    own = [(f.name, hints[f.name] | None, None) for f in dataclasses.fields(cls)]
+    return dataclasses.make_dataclass(cls.__name__, own, frozen=True, namespace={"__doc__": cls.__doc__})

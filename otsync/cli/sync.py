@@ -4,23 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import tyro
 
-from ..align import ALIGNERS, LikelihoodScan
-from ..match import MATCHERS
-from ..refine import REFINERS, SplineRefine
-from ..refine.slot import Rate
-from ..sync.graph import Graph
 from ..sync.verb import unique_names
 from ..types import TrackSet
+from .method import MethodOptions
 from .recordings import RecordingOptions, sync_recording
-from .slots import slot
 from .tables import refuse_unused, report, true_offsets, with_progress
-
-RECORDING_BRINGS = ("matcher", "aligner", "refiner", "graph", "rematch", "rate", "workers")
-"""Options that the route of a recording decides by itself."""
 
 
 @dataclass
@@ -31,10 +23,9 @@ class Sync:
 
     A recording: otsync sync recording/ --out result
 
-    The paper's method: otsync sync world/*.npz --rematch 0 --graph.extra 0 matcher:fused-gromov-wasserstein aligner:dtw
-    refiner:unrefined
+    The paper's method: otsync sync recording/ --method paper
 
-    A recording's route brings its own matcher, aligner and refiner; --recording.route chooses another.
+    An ablation: otsync sync recording/ matcher:optimal-transport aligner:dtw refiner:unrefined
     """
 
     tracks: tyro.conf.Positional[tuple[Path, ...]]
@@ -46,19 +37,9 @@ class Sync:
     """Name of the reference video, or "auto" for the one with the surest pairs; default: the first."""
     truth: Path | None = None
     """truth.json of a simulated world: adds errors to the table."""
-    rate: Rate | None = None
-    """Frame rates as declared, or fitted on long clips and kept where significant; default: as the refiner says."""
-    rematch: int = 1
-    """How often trusted pairs are matched again at the synchronised times."""
     workers: int = 1
     """Processes that pairs are spread over; results do not depend on it."""
-    graph: Graph = field(default_factory=Graph)
-    matcher: slot("matchers", MATCHERS, optional=True) = None
-    """Default: by size, fused Gromov-Wasserstein below 200 tracks and its anchored form above."""
-    aligner: slot("aligners", ALIGNERS) = field(default_factory=LikelihoodScan)
-    """From matches to the offset of a pair, to the frame."""
-    refiner: slot("refiners", REFINERS) = field(default_factory=SplineRefine)
-    """From the frame to a fraction of it."""
+    slots: Annotated[MethodOptions, tyro.conf.arg(name="")] = field(default_factory=MethodOptions)
     recording: RecordingOptions = field(default_factory=RecordingOptions)
 
     json: bool = False
@@ -66,9 +47,15 @@ class Sync:
 
     def run(self) -> int:
         if len(self.tracks) == 1 and self.tracks[0].suffix != ".npz":
-            refuse_unused(self, RECORDING_BRINGS, f"a recording ({self.tracks[0]}), whose route brings its own,")
+            refuse_unused(self, ("workers",), f"a recording ({self.tracks[0]}), which has --recording.workers,")
             return sync_recording(
-                self.tracks[0], self.out, self.recording, reference=self.reference, truth=self.truth, as_json=self.json
+                self.tracks[0],
+                self.out,
+                self.recording,
+                method=self.slots.chosen(),
+                reference=self.reference,
+                truth=self.truth,
+                as_json=self.json,
             )
         refuse_unused(self, ("recording",), "synchronising track sets")
         if len(self.tracks) < 2:
@@ -86,18 +73,14 @@ class Sync:
                 raise ValueError(f"--reference: expected auto or one of {', '.join(names)}; found {self.reference!r}.")
             reference = "auto" if self.reference == "auto" else names.index(self.reference)
         known = None if self.truth is None else true_offsets(self.truth, names)
+        method = self.slots.chosen()
         self.out.mkdir(parents=True, exist_ok=True)  # before the work, not after it
         offsets = with_progress(
             tracks,
             "synchronising",
             self.workers,
             reference=reference,
-            matcher=self.matcher,
-            aligner=self.aligner,
-            refiner=self.refiner,
-            graph=self.graph,
-            rematch=self.rematch,
-            rate=self.rate,
+            method=method,
         )
         truth = None if known is None else known - known[offsets.component]
         return report(offsets, tracks, truth, self.out, "Synchronisation report", as_json=self.json)

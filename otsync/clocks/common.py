@@ -72,7 +72,7 @@ def strongest(matches: Matches, limit: int) -> Matches:
     assert matches.score is not None
     shuffled = np.random.default_rng(0).permutation(len(matches))
     chosen = np.sort(shuffled[np.argsort(-matches.score[shuffled], kind="stable")[:limit]])
-    return Matches(matches.pairs[chosen], matches.score[chosen])
+    return matches.take(chosen)
 
 
 def nominal_fps(tracks: TrackSet) -> float:

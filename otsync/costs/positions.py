@@ -5,12 +5,12 @@ Both measure in units of the scene: ``scale`` times the median distance between 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..types import TrackSet
+from ..types import Clock, TrackSet
 from .linear import Cost
 
 SCALE_SAMPLES = 2000
@@ -37,6 +37,12 @@ class CurveDistance:
     share: float = 0.8
     samples: int = 50
 
+    needs_xyz = True
+
+    def at(self, clock: Clock) -> SynchronousDistance:
+        """What tells the same better once the clocks are known."""
+        return SynchronousDistance(clock.offset, rate=clock.rate)
+
     def matrix(self, a: TrackSet, b: TrackSet) -> Float[np.ndarray, "Na Nb"]:
         return all_pairs(self, a, b)
 
@@ -57,6 +63,12 @@ class MedianPosition:
     weight: float = 1.0
     scale: float = 0.3
     cap: float = 3.0
+
+    needs_xyz = True
+
+    def at(self, clock: Clock) -> SynchronousDistance:
+        """What tells the same better once the clocks are known."""
+        return SynchronousDistance(clock.offset, rate=clock.rate)
 
     def matrix(self, a: TrackSet, b: TrackSet) -> Float[np.ndarray, "Na Nb"]:
         return all_pairs(self, a, b)
@@ -85,6 +97,12 @@ class SynchronousDistance:
     min_overlap: float = 12 / 30
     rate: float = 1.0
 
+    needs_xyz = True
+
+    def at(self, clock: Clock) -> SynchronousDistance:
+        """The same at another clock."""
+        return replace(self, offset=clock.offset, rate=clock.rate)
+
     def matrix(self, a: TrackSet, b: TrackSet) -> Float[np.ndarray, "Na Nb"]:
         return all_pairs(self, a, b)
 
@@ -101,6 +119,18 @@ class SynchronousDistance:
         least = max(2, round(self.min_overlap / step))
         distance = paired_frame_distances(xa, xb, i, j, at, least)
         return capped(distance, self.scale * scene_scale(xa, xb), self.cap)
+
+
+def at_clock(costs: tuple[Cost, ...], clock: Clock) -> tuple[Cost, ...]:
+    """The costs to match by once ``t_a = rate * t_b + offset`` is known.
+
+    A cost with a form for known times (a method ``at(clock)``) takes it; the others stay. Where none has one, the
+    distance at equal times joins them.
+    """
+    told = [c.at(clock) if hasattr(c, "at") else c for c in costs]
+    if all(new is old for new, old in zip(told, costs, strict=True)):
+        told.append(SynchronousDistance(clock.offset, rate=clock.rate))
+    return tuple(dict.fromkeys(told))
 
 
 def capped(distance: np.ndarray, unit: float, cap: float) -> np.ndarray:

@@ -95,7 +95,7 @@ class EpipolarScan(Aligner):
             lags = lags[np.abs(origin + lags / fps) <= self.max_lag + 1e-9]
         if len(matches) == 0 or len(lags) == 0:
             return _nothing(fps, Status.FEW_MATCHES if len(matches) == 0 else Status.NO_OVERLAP)
-        total = self.evidence(xa, xb, fundamentals(a.camera, b.camera), matches.pairs, lags, fps, unit_of(a, b))
+        total = self.evidence(xa, xb, fundamentals(a.camera, b.camera), matches.pairs, lags, fps, unit_of(a, b), matches.weight)
         if np.ptp(total) == 0:
             return _nothing(fps, Status.NO_OVERLAP)
         return self._answer(lags, total, origin, fps, len(matches))
@@ -109,13 +109,14 @@ class EpipolarScan(Aligner):
         lags: Int[np.ndarray, " K"],
         fps: float,
         unit: float,
+        weight: Float[np.ndarray, " M"] | None = None,
     ) -> Float[np.ndarray, " K"]:
         """Summed evidence per lag, in nats; mean over the mixtures of a's and of b's tracks."""
         scores = self.scores(xa, xb, F, pairs, lags, fps, unit)
         if not scores:
             return np.zeros(len(lags))
         both = np.sum(scores, axis=0)
-        return 0.5 * (mixture(both, pairs[:, 0]) + mixture(both, pairs[:, 1]))
+        return 0.5 * (mixture(both, pairs[:, 0], weight) + mixture(both, pairs[:, 1], weight))
 
     def scores(
         self,
@@ -199,16 +200,23 @@ class EpipolarScan(Aligner):
         )
 
 
-def mixture(score: Float[np.ndarray, "M K"], track: Int[np.ndarray, " M"]) -> Float[np.ndarray, " K"]:
+def mixture(
+    score: Float[np.ndarray, "M K"], track: Int[np.ndarray, " M"], prior: Float[np.ndarray, " M"] | None = None
+) -> Float[np.ndarray, " K"]:
     """Σ over tracks of the log-mean-exp over its candidates, from the floor up, levelling off towards the cap.
+
+    ``prior``: what a candidate counts beside the others of its track, in any unit; None: all alike.
 
     A hard cap makes plateaus of neighbouring lags where tracks live long; at 8 nats they hid one answer in ten.
     """
     order = np.argsort(track, kind="stable")
     edges = np.flatnonzero(np.diff(track[order], prepend=-1))
     weight = np.exp(np.minimum(score[order], MIXTURE_CAP))
+    counts = np.diff(np.append(edges, len(order)))[:, None].astype(float)
+    if prior is not None:
+        weight *= prior[order, None]
+        counts = np.maximum(np.add.reduceat(prior[order], edges), np.finfo(float).tiny)[:, None]
     sums = np.add.reduceat(weight, edges, axis=0)
-    counts = np.diff(np.append(edges, len(order)))[:, None]
     nats = np.log(sums / counts + np.exp(FLOOR))
     return np.where(nats > 0, -TRACK_CAP * np.expm1(-np.maximum(nats, 0) / TRACK_CAP), nats).sum(0)
 

@@ -6,7 +6,8 @@ problem.py      one FGW problem in the paper's units; from a plan to matches
 dense.py        the matchers over a full cost matrix: nearest neighbour, OT, FGW, GW, entropic and partial FGW
 sinkhorn.py     stabilised Sinkhorn
 anchored/       FGW for tens of thousands of tracks
-candidates.py   several partners a track
+candidates.py   several partners a track, by cost alone
+unbalanced.py   transport with relaxed marginals, several partners a track
 synchronous.py  matching once more, at known times
 vouch.py        whether matches are to be trusted
 frontier.py     which matcher fits which time
@@ -17,6 +18,7 @@ from .candidates import Candidates
 from .dense import EntropicFGW, FusedGromovWasserstein, GromovWasserstein, NearestNeighbor, OptimalTransport, PartialFGW
 from .slot import Matcher
 from .synchronous import SynchronousMatching
+from .unbalanced import SemirelaxedFGW, UnbalancedFGW, UnbalancedOT
 from .verb import match, matcher_for
 
 __all__ = [
@@ -29,7 +31,10 @@ __all__ = [
     "NearestNeighbor",
     "OptimalTransport",
     "PartialFGW",
+    "SemirelaxedFGW",
     "SynchronousMatching",
+    "UnbalancedFGW",
+    "UnbalancedOT",
     "match",
     "matcher_for",
 ]
@@ -40,7 +45,11 @@ MATCHERS = (
     PartialFGW,
     EntropicFGW,
     GromovWasserstein,
+    UnbalancedFGW,
+    SemirelaxedFGW,
     OptimalTransport,
+    UnbalancedOT,
     NearestNeighbor,
+    Candidates,
 )
 """Matchers that the shell, the benchmarks and the catalogue of hard cases offer; plugins come on top."""

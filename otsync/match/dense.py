@@ -18,7 +18,7 @@ from ..types import Matches, TrackSet
 from ..types.checks import positive
 from .problem import FLAT, Problem, by_score, from_plan, is_flat, linear_cost, no_information, uniform
 from .sinkhorn import sinkhorn
-from .slot import Matcher
+from .slot import Matcher, StructuralMatcher
 
 log = logging.getLogger("otsync")
 
@@ -74,7 +74,7 @@ class OptimalTransport(Matcher):
 
 
 @dataclass(frozen=True)
-class FusedGromovWasserstein(Matcher):
+class FusedGromovWasserstein(StructuralMatcher):
     """The paper's FGW by POT's conditional gradient.
 
     F(γ) = Σ (C^a_ik - C^b_jl)² γ_ij γ_kl + α/2 <M, γ>, C divided by the common median of both videos.
@@ -123,7 +123,7 @@ class FusedGromovWasserstein(Matcher):
 
 
 @dataclass(frozen=True)
-class GromovWasserstein(Matcher):
+class GromovWasserstein(StructuralMatcher):
     """Structure only, no features: it cannot see mirror images, and shows what features add."""
 
     max_iter: int = 500
@@ -135,7 +135,7 @@ class GromovWasserstein(Matcher):
 
 
 @dataclass(frozen=True)
-class EntropicFGW(Matcher):
+class EntropicFGW(StructuralMatcher):
     """FGW by projected gradient with entropic steps (stabilised Sinkhorn).
 
     Args:
@@ -177,7 +177,7 @@ class EntropicFGW(Matcher):
 
 
 @dataclass(frozen=True)
-class PartialFGW(Matcher):
+class PartialFGW(StructuralMatcher):
     """FGW that transports only ``mass`` of both videos and leaves the rest unmatched.
 
     Balanced marginals force every outlier onto something; measured at N = 2000, mass .65 raises precision from

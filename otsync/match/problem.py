@@ -123,11 +123,17 @@ def from_plan(
 
 
 def by_score(
-    pairs: np.ndarray, score: np.ndarray, *, plan: Any = None, flags: tuple[Status, ...] = (), stats: dict[str, float]
+    pairs: np.ndarray,
+    score: np.ndarray,
+    *,
+    weight: np.ndarray | None = None,
+    plan: Any = None,
+    flags: tuple[Status, ...] = (),
+    stats: dict[str, float],
 ) -> Matches:
     """Matches in order of score, best first, ties by a's index."""
     order = np.argsort(-score, kind="stable")
-    return Matches(pairs[order], score[order], plan, flags, stats)
+    return Matches(pairs[order], score[order], plan, flags, stats, None if weight is None else weight[order])
 
 
 def no_information(M: np.ndarray) -> Matches:

@@ -33,6 +33,11 @@ class Matcher:
         return None
 
     @property
+    def needs_xyz(self) -> bool:
+        """Whether it reads positions in space; one that reads pixels and features alone says False."""
+        return any(getattr(cost, "needs_xyz", False) for cost in self.costs)
+
+    @property
     def needs_features(self) -> bool:
         """Whether track sets without features are refused before any work."""
         return any(isinstance(cost, Cosine) for cost in self.costs)
@@ -41,6 +46,14 @@ class Matcher:
     def of(matcher: MatcherLike) -> Matcher:
         """``matcher`` itself, or a callable of somebody else's with the defaults."""
         return matcher if isinstance(matcher, Matcher) else Foreign(matcher)
+
+
+class StructuralMatcher(Matcher):
+    """Base of matchers that compare distances among the tracks of one video: they read positions in space."""
+
+    @property
+    def needs_xyz(self) -> bool:
+        return True
 
 
 @dataclass(frozen=True)
@@ -52,6 +65,10 @@ class Foreign(Matcher):
     @property
     def costs(self) -> tuple[Cost, ...]:  # type: ignore[override]
         return getattr(self.call, "costs", ())
+
+    @property
+    def needs_xyz(self) -> bool:
+        return getattr(self.call, "needs_xyz", super().needs_xyz)
 
     def __call__(self, a: TrackSet, b: TrackSet) -> Matches:
         return self.call(a, b)

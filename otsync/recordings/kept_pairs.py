@@ -63,6 +63,8 @@ def pack(answer: Answer) -> dict[str, np.ndarray]:
         "refined": _words(answer.refined) | _numbers(answer.refined),
     }
     out = {"told": np.array(json.dumps(told)), "pairs": matches.pairs, "score": np.asarray(matches.score, float)}
+    if matches.weight is not None:
+        out["weight"] = matches.weight
     for name, alignment in (("scanned", answer.scanned), ("refined", answer.refined)):
         out[f"{name}_hypotheses"] = np.asarray(alignment.hypotheses, float)
         if alignment.curve is not None:
@@ -92,7 +94,7 @@ def unpack(pair: tuple[int, int], arrays: dict[str, np.ndarray]) -> Answer:
             **words(of),
         )
 
-    matches = Matches(arrays["pairs"], arrays["score"], **words(told["matches"]))
+    matches = Matches(arrays["pairs"], arrays["score"], weight=arrays.get("weight"), **words(told["matches"]))
     return Answer(pair, matches, alignment("scanned"), alignment("refined"))
 
 

@@ -34,11 +34,12 @@ from ..io.scene import Scene
 from ..priors.slots import cache_key
 from ..priors.stereo import Rig
 from ..progress import Progress, Tell
+from ..sync.method import Method
 from ..sync.verb import synchronize
 from ..types import Offsets, Status, TrackSet, Video
 from .kept_pairs import KeptPairs
 from .lift import depth_at
-from .stages import Stages, with_labels
+from .stages import Stages, with_labels, with_method
 from .tracking import pixel_tracks, track_labels
 
 Route = Literal["auto", "tracks", "epipolar", "stereo"]
@@ -67,7 +68,8 @@ def synchronize_scene(
     scene: Scene,
     *,
     route: Route = "auto",
-    reference: int = 0,
+    reference: int | Literal["auto"] = 0,
+    method: Method | None = None,
     stages: Stages | None = None,
     cache: Cache | None = None,
     map: MapLike = map,
@@ -77,6 +79,11 @@ def synchronize_scene(
 
     Args:
         route: "auto" decides by what is there; naming one overrides it. ValueError says what a named route lacks.
+        reference: index of the video whose clock is the world's; "auto" takes the one with the surest pairs.
+        method: what stands in the slots of the stage that gives the answer (matcher, aligner, refiner, graph, rematch,
+            rate); what it leaves out is the route's own. On the stereo route the epipolar stage before it keeps its
+            own. ValueError names what does not go with the route.
+        stages: the objects of every stage.
         cache: where stages are kept; a run that was killed continues from what is there, with the same result.
         map: any map-like callable; two threads use two cores.
         tell: receives one line per stage.
@@ -85,6 +92,8 @@ def synchronize_scene(
         check_within_a_frame(video.camera.readout, video.times, f"camera.readout of {video.name!r}")
     stages, cache = with_labels(stages or Stages(), scene), cache or Cache()
     chosen, why = choose_route(scene, route, stages)
+    if method is not None:
+        stages = with_labels(with_method(stages, chosen, method), scene)
     for line in why:
         tell(line)
     progress = Progress(tell)
@@ -206,34 +215,25 @@ def select(video: Video, raw: dict[str, np.ndarray], stages: Stages, frame: str)
 
 
 def pairs_in_pixels(
-    tracks: Sequence[TrackSet], reference: int, stages: Stages, cache: Cache, map: MapLike = map
+    tracks: Sequence[TrackSet],
+    reference: int | Literal["auto"],
+    stages: Stages,
+    cache: Cache,
+    map: MapLike = map,
 ) -> Offsets:
-    """The depth-free answer: epipolar scan of every pair, then the graph."""
-    return synchronize(
-        tracks,
-        reference=reference,
-        matcher=stages.epipolar_matcher,
-        aligner=stages.epipolar_aligner,
-        refiner=stages.epipolar_refiner,
-        graph=stages.graph,
-        rematch=0,
-        map=KeptPairs(cache, map),
-    )
+    """The depth-free answer: transport on features, epipolar scan and fit of every pair, then the graph."""
+    return synchronize(tracks, reference=reference, method=stages.pixels, map=KeptPairs(cache, map))
 
 
 def pairs_in_space(
-    tracks: Sequence[TrackSet], reference: int, stages: Stages, cache: Cache, map: MapLike = map
+    tracks: Sequence[TrackSet],
+    reference: int | Literal["auto"],
+    stages: Stages,
+    cache: Cache,
+    map: MapLike = map,
 ) -> Offsets:
-    """The answer from lifted tracks: curve distance, likelihood scan, spline fit, matched again, then the graph."""
-    return synchronize(
-        tracks,
-        reference=reference,
-        matcher=stages.matcher,
-        aligner=stages.aligner,
-        refiner=stages.refiner,
-        graph=stages.graph,
-        map=KeptPairs(cache, map),
-    )
+    """The answer from lifted tracks: transport, likelihood scan, spline fit, matched again, then the graph."""
+    return synchronize(tracks, reference=reference, method=stages.space, map=KeptPairs(cache, map))
 
 
 def lift_given(

@@ -8,19 +8,20 @@ from typing import Any
 
 from ..align.likelihood import LikelihoodScan
 from ..align.slot import Aligner
+from ..costs.epipolar import EpipolarDistance
 from ..costs.linear import Cosine, Labels
 from ..costs.positions import CurveDistance
 from ..epipolar.refine import EpipolarRefine
 from ..epipolar.scan import EpipolarScan
 from ..io.scene import Scene
-from ..match.candidates import Candidates
 from ..match.slot import Matcher
+from ..match.unbalanced import UnbalancedOT
 from ..plugins import available, made
 from ..priors import DESCRIBERS, MASKERS, TRACKERS
 from ..priors.stereo import HullStereo, TrackDepth
 from ..refine.slot import Refiner
 from ..refine.splines import SplineRefine
-from ..sync.graph import Graph
+from ..sync.method import Method, with_costs
 from .lift import Lift
 from .tracking import Selection, Tracking
 
@@ -31,6 +32,25 @@ LABELS = 3.0
 """Weight of given labels: a track of another thing costs as much as the largest distance in space."""
 
 
+PIXELS = Method(
+    "pixels",
+    matcher=UnbalancedOT(partners=20, top=None, costs=(Cosine(center=False), EpipolarDistance())),
+    aligner=EpipolarScan(),
+    refiner=EpipolarRefine(),
+    rematch=0,
+)
+"""Tracks without depth: transport on features offers every track twenty partners, the epipolar scan weighs them."""
+
+SPACE = Method(
+    "space",
+    matcher=UnbalancedOT(costs=(Cosine(weight=COLOUR, center=False), CurveDistance())),
+    aligner=LikelihoodScan(),
+    refiner=SplineRefine(),
+    rematch=1,
+)
+"""Lifted tracks: transport with relaxed marginals on features and curves, and once more at the synchronised times."""
+
+
 @dataclass(frozen=True)
 class Stages:
     """The objects in the slots of every stage.
@@ -38,24 +58,16 @@ class Stages:
     Args:
         tracking: masks, point tracks and descriptors. selection: which tracks are kept.
         stereo: depth of tracks by a rig; dense maps ask for a :class:`otsync.priors.stereo.HullStereo`.
-        lift: positions from depth. graph: which pairs are compared.
-        epipolar_matcher, epipolar_aligner, epipolar_refiner: of tracks in pixels.
-        matcher, aligner, refiner: of lifted tracks.
+        lift: positions from depth.
+        pixels: how tracks in pixels are synchronised. space: how lifted tracks are.
     """
 
     tracking: Tracking = field(default_factory=Tracking)
     selection: Selection = field(default_factory=Selection)
     stereo: TrackDepth = field(default_factory=HullStereo)
     lift: Lift = field(default_factory=Lift)
-    graph: Graph = field(default_factory=Graph)
-    epipolar_matcher: Matcher = field(default_factory=lambda: Candidates(20, None))
-    epipolar_aligner: Aligner = field(default_factory=EpipolarScan)
-    epipolar_refiner: Refiner = field(default_factory=EpipolarRefine)
-    matcher: Matcher = field(
-        default_factory=lambda: Candidates(2, 200, (Cosine(weight=COLOUR, center=False), CurveDistance()))
-    )
-    aligner: Aligner = field(default_factory=LikelihoodScan)
-    refiner: Refiner = field(default_factory=SplineRefine)
+    pixels: Method = PIXELS
+    space: Method = SPACE
 
 
 PRIORS: dict[str, tuple[str, str, Iterable[Any]]] = {
@@ -90,15 +102,37 @@ def stages_from(
     return replace(stages, tracking=replace(stages.tracking, **chosen))
 
 
+def with_method(stages: Stages, route: str, method: Method) -> Stages:
+    """The stages with other things in the slots of the route's answer: of pixels (epipolar), or of lifted tracks.
+
+    ValueError names a slot and the route when the one cannot be used on the other.
+    """
+    if route != "epipolar":
+        return replace(stages, space=stages.space.but(**method.slots()))
+    slots: dict[str, Any] = {"matcher": Matcher.of, "aligner": Aligner.of, "refiner": Refiner.of}
+    for slot, of in slots.items():
+        thing = getattr(method, slot)
+        # a refiner that leaves the answer as it is reads nothing
+        if thing is not None and of(thing).needs_xyz:
+            raise ValueError(
+                f"{slot}, route: expected one that reads pixels on the route epipolar; found {thing}, which reads "
+                "positions in space. Choose a route with depth (tracks, stereo), or leave it out."
+            )
+    return replace(stages, pixels=stages.pixels.but(**method.slots()))
+
+
 def with_labels(stages: Stages, scene: Scene) -> Stages:
-    """The stages with the cost of labels in both matchers, when every video of the scene has labels."""
+    """The stages with the cost of labels in both matchers, when every video of the scene has labels.
+
+    A matcher without costs of choice (:class:`otsync.GromovWasserstein`, one of somebody else's) stays as it is.
+    """
     if not scene.labels or any(labels is None for labels in scene.labels):
         return stages
 
-    def labelled(matcher: Matcher) -> Matcher:
-        costs = getattr(matcher, "costs", None)
-        if costs is None or any(isinstance(c, Labels) for c in costs):
-            return matcher
-        return replace(matcher, costs=(*costs, Labels(weight=LABELS)))  # type: ignore[type-var]
+    def labelled(method: Method) -> Method:
+        costs = getattr(method.matcher, "costs", None)
+        if not costs or any(isinstance(c, Labels) for c in costs):
+            return method
+        return method.but(matcher=with_costs(method.matcher, (*costs, Labels(weight=LABELS))))
 
-    return replace(stages, epipolar_matcher=labelled(stages.epipolar_matcher), matcher=labelled(stages.matcher))
+    return replace(stages, pixels=labelled(stages.pixels), space=labelled(stages.space))

@@ -99,13 +99,21 @@ class Fit:
 
 
 def fit_clock(
-    a: TrackSplines, b: TrackSplines, start: Clock, window: float, *, fit_rate: bool = False, iterations: int = 25
+    a: TrackSplines,
+    b: TrackSplines,
+    start: Clock,
+    window: float,
+    *,
+    weight: Float[np.ndarray, " M"] | None = None,
+    fit_rate: bool = False,
+    iterations: int = 25,
 ) -> Fit | None:
     """Minimise robustly the detrended differences of matched curves over the offset (and rate).
 
     Args:
         a, b: curves of the matched tracks, m-th to m-th. start: where to begin; its rate stays unless ``fit_rate``.
         window: s; the mean residual within ± this much of time is removed, as drifts of depth are slower.
+        weight: of the matches, mean 1; robust weights multiply it. None: all alike.
 
     Returns None when no match is seen long enough in both.
     """
@@ -115,7 +123,7 @@ def fit_clock(
     n = 0
     while True:
         n += 1
-        system = _linearise(sides, clock, centre, fit_rate)
+        system = _linearise(sides, clock, centre, fit_rate, weight)
         if system is None:
             return None
         step = system.step()
@@ -180,7 +188,9 @@ def _regular(H: np.ndarray) -> np.ndarray:
     return H + np.diag(1e-12 * np.diag(H) + 1e-300)
 
 
-def _linearise(sides: tuple[Side, Side], clock: Clock, centre: float, fit_rate: bool) -> System | None:
+def _linearise(
+    sides: tuple[Side, Side], clock: Clock, centre: float, fit_rate: bool, prior: np.ndarray | None = None
+) -> System | None:
     """Residuals, robust weights and normal equations at ``clock``."""
     from . import kernels
 
@@ -223,6 +233,8 @@ def _linearise(sides: tuple[Side, Side], clock: Clock, centre: float, fit_rate: 
     rms = np.sqrt(sum(p[0].sum(1) for p in parts) / np.maximum(seen, 1))
     typical = float(np.median(rms[seen > 0]))
     weight = np.where(seen > 0, 1 / (1 + (rms / max(OUTLYING * typical, 1e-300)) ** 2) ** 2, 0.0)
+    if prior is not None:
+        weight *= prior
     start = max(sides[0].own.times[0], float(clock.world(sides[1].own.times[0])))
     H_match, g_match = np.zeros((M, P, P)), np.zeros((M, P))
     blocks = []

@@ -9,6 +9,7 @@ import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from jaxtyping import Float
 
 from ..clocks.common import nominal_fps, strongest
 from ..clocks.splines import SMOOTHING, TrackSplines
@@ -44,7 +45,7 @@ class SplineRefine(Refiner):
     Tracks become penalised cubic splines that never answer within a gap. The residual of a match is the difference of
     its two curves minus its mean over ±``windows[0]`` seconds, read at the frames of both videos, so that constant and
     slowly drifting errors drop out and exchanging a and b flips the sign to rounding. Samples and whole matches that
-    fit badly lose weight. Sigma adds the scatter over neighbourhoods of matches or blocks of one second, the ``spread``
+    fit badly lose weight; matches with a ``weight`` of their own begin with it. Sigma adds the scatter over neighbourhoods of matches or blocks of one second, the ``spread``
     of the answers with the other windows (the largest difference, so its square counts half), and what blur predicts:
     errors of the model that no residual shows.
 
@@ -69,12 +70,13 @@ class SplineRefine(Refiner):
         matches = strongest(matches, self.limit)
         curves = self.splines(a, b, matches)
         start = Clock(alignment.offset, alignment.rate)
-        fit = fit_clock(*curves, start, self.windows[0])
+        weight = None if matches.weight is None else matches.shares
+        fit = fit_clock(*curves, start, self.windows[0], weight=weight)
         if fit is None:
             flags = in_order((*alignment.flags, Status.NO_OVERLAP))
             return replace(alignment, flags=flags)
-        fit, rate_flag, rate_stats = self._rate(curves, fit)
-        others = [fit_clock(*curves, fit.clock, w, iterations=10) for w in self.windows[1:]]
+        fit, rate_flag, rate_stats = self._rate(curves, fit, weight)
+        others = [fit_clock(*curves, fit.clock, w, weight=weight, iterations=10) for w in self.windows[1:]]
         spread = max((self._apart(o, fit, curves) for o in others), default=0.0)
         fps = min(nominal_fps(a), nominal_fps(b))
         variance = float(fit.covariance[0, 0])
@@ -130,12 +132,12 @@ class SplineRefine(Refiner):
         return curves[0].frame if other is None else abs(other.clock.offset - fit.clock.offset)
 
     def _rate(
-        self, curves: tuple[TrackSplines, TrackSplines], fit: Fit
+        self, curves: tuple[TrackSplines, TrackSplines], fit: Fit, weight: Float[np.ndarray, " M"] | None
     ) -> tuple[Fit, tuple[Status, ...], dict[str, float]]:
         """The fit with a free rate where that is significant, or a warning that it would be."""
         if overlap_seconds(*curves, fit.clock) < LONG - 1e-9:
             return fit, (), {}
-        free = fit_clock(*curves, fit.clock, self.windows[0], fit_rate=True)
+        free = fit_clock(*curves, fit.clock, self.windows[0], weight=weight, fit_rate=True)
         if free is None:
             return fit, (), {}
         sigma = math.sqrt(float(free.covariance[1, 1]))

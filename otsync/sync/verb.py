@@ -13,13 +13,16 @@ from ..align.likelihood import LikelihoodScan
 from ..align.slot import Aligner, AlignerLike
 from ..clocks.shutter import at_frame_times
 from ..compute.threads import MapLike
+from ..costs.epipolar import EpipolarDistance
 from ..costs.linear import Cosine
 from ..match.slot import Matcher, MatcherLike
 from ..match.synchronous import SynchronousMatching
+from ..match.unbalanced import UnbalancedOT
 from ..refine.slot import Rate, Refiner, RefinerLike
 from ..refine.splines import SplineRefine
 from ..types import Alignment, Clock, Matches, Offsets, TrackSet
 from .graph import Graph, Pair
+from .method import Method
 from .pairs import Job, Refit, run, run_refit, with_rate
 from .verdict import Answer, Verdict, judge
 
@@ -28,12 +31,13 @@ def synchronize(
     tracks: Sequence[TrackSet],
     *,
     reference: int | Literal["auto"] = 0,
+    method: Method | None = None,
     matcher: MatcherLike | None = None,
     aligner: AlignerLike | None = None,
     refiner: RefinerLike | None = None,
     matches: Mapping[Pair, Matches] | None = None,
     graph: Graph | None = None,
-    rematch: int = 1,
+    rematch: int | None = None,
     rate: Rate | None = None,
     map: MapLike = map,
 ) -> Offsets:
@@ -46,33 +50,40 @@ def synchronize(
     Args:
         tracks: one set per video, all in one world frame. Rolling shutters of declared ``readout`` are undone here.
         reference: index of the video whose clock is the world's; "auto" takes the one with the surest pairs.
+        method: what stands in the slots below that are left out, for example :data:`otsync.PAPER`.
         matcher, aligner, refiner: the algorithms of each stage; None takes the default, :class:`Unrefined` as refiner
             leaves the aligner's answers as they are.
         matches: ``{(i, j): Matches}`` of your own; those pairs skip matching and no others are tried.
         graph: which pairs are compared and how they are combined; default :class:`Graph`. ``Graph(extra=0)`` is the
             paper's star.
         rematch: how often pairs whose first answer is trusted are matched again with positions at the synchronised
-            times (more than once adds nothing); matches of your own are left alone.
+            times (more than once adds nothing); None: once. Matches of your own are left alone.
         rate: "fixed" takes frame rates as declared; "fit" frees them for pairs that overlap by 20 s and more, and
             keeps what is significant; None: as the refiner says, by default "fixed".
         map: any map-like callable: the builtin, an executor's, dask's. Results do not depend on it.
 
     A pair that fails gets a status and nan; the others live. Wrong input raises ValueError before any work.
     """
-    if rematch < 0:
-        raise ValueError(f"rematch: expected 0 or more; found {rematch}.")
+    chosen_method = (method or Method()).but(
+        matcher=matcher, aligner=aligner, refiner=refiner, graph=graph, rematch=rematch, rate=rate
+    )
+    times = 1 if chosen_method.rematch is None else chosen_method.rematch
+    if times < 0:
+        raise ValueError(f"rematch: expected 0 or more; found {times}.")
     if matches is not None and matcher is not None:
         raise ValueError("matcher, matches: expected one of them; found both. Matches of your own need no matcher.")
-    matching = None if matcher is None else Matcher.of(matcher)
-    aligning = LikelihoodScan() if aligner is None else Aligner.of(aligner)
-    refining = with_rate(SplineRefine() if refiner is None else Refiner.of(refiner), rate)
-    chosen = check_tracks(tracks, reference, xyz=aligning.needs_xyz)
+    matching = None if chosen_method.matcher is None else Matcher.of(chosen_method.matcher)
+    aligning = LikelihoodScan() if chosen_method.aligner is None else Aligner.of(chosen_method.aligner)
+    chosen_refiner = SplineRefine() if chosen_method.refiner is None else Refiner.of(chosen_method.refiner)
+    refining = with_rate(chosen_refiner, chosen_method.rate)
+    needs_xyz = aligning.needs_xyz or refining.needs_xyz or (matching is not None and matching.needs_xyz)
+    chosen = check_tracks(tracks, reference, xyz=needs_xyz)
     if matches is None and (matching is None or matching.needs_features):
         for v, t in enumerate(tracks):
             t.check(f"tracks[{v}]", xyz=False, features=True)
     started = time.perf_counter()
     tracks = [at_frame_times(t) for t in tracks]
-    graph = graph or Graph()
+    graph = chosen_method.graph or Graph()
     centre = most_seen(tracks) if chosen is None else chosen
     pairs = given_pairs(matches, tracks) if matches is not None else graph.pairs(len(tracks), centre)
     jobs = [
@@ -87,7 +98,7 @@ def synchronize(
         return judge(len(tracks), answers, chosen, centre, graph, refining.trust, refit)
 
     verdict = judged(list(map(run, jobs)))
-    for _ in range(rematch if matches is None else 0):
+    for _ in range(times if matches is None else 0):
         again = rematching(jobs, verdict)
         if not again:
             break
@@ -107,15 +118,23 @@ def rematching(jobs: list[Job], verdict: Verdict) -> list[Job]:
         clock = Clock(
             float((verdict.x[j] - verdict.x[i]) / verdict.rates[i]), float(verdict.rates[j] / verdict.rates[i])
         )
-        again.append(dataclasses.replace(job, matcher=at_known_times(job.matcher, clock)))
+        flat = job.a.xyz is None or job.b.xyz is None
+        again.append(dataclasses.replace(job, matcher=at_known_times(job.matcher, clock, flat)))
     return again
 
 
-def at_known_times(matcher: Matcher | None, clock: Clock) -> Matcher:
-    """What matches a pair once more: as the matcher says, else mutual nearest neighbours at equal times."""
+def at_known_times(matcher: Matcher | None, clock: Clock, flat: bool = False) -> Matcher:
+    """What matches a pair once more: as the matcher says, else mutual nearest neighbours at equal times.
+
+    ``flat``: the tracks are pixels only, which epipolar distances compare.
+    """
     told = None if matcher is None else matcher.at(clock)
+    if told is not None:
+        return told
     costs = (Cosine(),) if matcher is None else matcher.costs
-    return told or SynchronousMatching(clock.offset, clock.rate, costs)
+    if flat:
+        return UnbalancedOT(costs=(*costs, EpipolarDistance(clock=clock)))
+    return SynchronousMatching(clock.offset, clock.rate, costs)
 
 
 def to_offsets(tracks: Sequence[TrackSet], verdict: Verdict, seconds: float) -> Offsets:

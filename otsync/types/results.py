@@ -35,6 +35,7 @@ class Matches:
     Args:
         pairs: (M,2) indices into a's and b's tracks; a track may appear in several pairs.
         score: (M,), larger is better; None: all equal.
+        weight: (M,) >= 0, how much each pair counts in the scan and the fit, in any unit; None: all alike.
         plan: the transport plan, dense (Na,Nb) or scipy.sparse, when the matcher has one.
         flags: what there is to know about the answer, gravest first. ``status`` is the gravest, OK without any.
         stats: objective, iterations, seconds, marginal_error, mass, ...
@@ -45,6 +46,7 @@ class Matches:
     plan: Any = None
     flags: tuple[Status, ...] = ()
     stats: Stats = field(default_factory=dict)
+    weight: Float[np.ndarray, " M"] | None = None
 
     def __post_init__(self) -> None:
         pairs = np.asarray(self.pairs)
@@ -62,6 +64,13 @@ class Matches:
                 f"Matches.score: expected {len(pairs)} numbers without nan; found shape {score.shape}"
                 f"{' with nan' if np.isnan(score).any() else ''}."
             )
+        if self.weight is not None:
+            weight = np.asarray(self.weight, float)
+            if weight.shape != (len(pairs),) or not (np.isfinite(weight).all() and (weight >= 0).all()):
+                raise ValueError(
+                    f"Matches.weight: expected {len(pairs)} finite numbers >= 0; found shape {weight.shape} or others."
+                )
+            object.__setattr__(self, "weight", weight)
         object.__setattr__(self, "pairs", pairs.astype(np.int64))
         object.__setattr__(self, "score", score)
         object.__setattr__(self, "flags", in_order(self.flags))
@@ -86,8 +95,20 @@ class Matches:
     def best(self, n: int) -> Matches:
         """The ``n`` best by score, ties in the given order."""
         assert self.score is not None
-        order = np.argsort(-self.score, kind="stable")[:n]
-        return replace(self, pairs=self.pairs[order], score=self.score[order])
+        return self.take(np.argsort(-self.score, kind="stable")[:n])
+
+    def take(self, index: Any) -> Matches:
+        """The pairs at ``index`` (integers, a slice or a mask), in that order."""
+        assert self.score is not None
+        weight = None if self.weight is None else self.weight[index]
+        return replace(self, pairs=self.pairs[index], score=self.score[index], weight=weight)
+
+    @property
+    def shares(self) -> Float[np.ndarray, " M"]:
+        """Weights with mean 1; ones where there are none, or only zeros."""
+        if self.weight is None or not self.weight.any():
+            return np.ones(len(self))
+        return self.weight / self.weight.mean()
 
     def without_plan(self) -> Matches:
         """The same matches without the plan, which is as large as both videos' tracks multiplied."""

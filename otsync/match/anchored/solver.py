@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 
 from ...costs.linear import Cosine, Cost, memberships, total_cost
 from ...types import Matches, Status, TrackSet
-from ..slot import Matcher
+from ..slot import StructuralMatcher
 from ..vouch import MIRRORED
 from .cells import k_means
 from .clouds import Cloud, clouds, comes_first
@@ -25,7 +25,7 @@ AMBIGUOUS_SHARE = 0.2
 
 
 @dataclass(frozen=True)
-class AnchoredFGW(Matcher):
+class AnchoredFGW(StructuralMatcher):
     """Multi-scale fused Gromov-Wasserstein for many tracks: sparse in memory, and more precise than dense solvers.
 
     Tracks -> cells (k-means, each with a mean trajectory and feature) -> anchors (groups of cells) -> partial FGW of
