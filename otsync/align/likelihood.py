@@ -158,9 +158,7 @@ class Curves:
     motion: Float[np.ndarray, " K"]
 
 
-def evidence(
-    pair: CommonClock, lags: Int[np.ndarray, " K"], weight: Float[np.ndarray, " M"] | None = None
-) -> Curves:
+def evidence(pair: CommonClock, lags: Int[np.ndarray, " K"], weight: Float[np.ndarray, " M"] | None = None) -> Curves:
     """The scan's score and its parts at ``lags``; ``weight``: of the matches, with mean 1."""
     from . import kernels
 

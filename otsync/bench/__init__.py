@@ -3,6 +3,7 @@
 core.py    the paper's ablation and its DTW, import time, the cost of no effect
 match.py   every matcher at every size; match_limits.py: what matching promises
 sync.py    aligners, refiners and graphs; sync_acceptance.py: what synchronisation promises
+chain.py   matchers x aligners x rematching, to frames of the offset; chain_worlds.py: where; chain_plot.py
 hard_cases/  the catalogue of hard cases, and running it
 panoptic.py  the paper's protocol on a truly synchronised recording
 record.py  tables on disk, machine and versions, the gate against a committed baseline
@@ -24,6 +25,7 @@ OWN = {
     "sync": "sync",
     "hard-cases": "hard_cases.run",
     "panoptic": "panoptic",
+    "chain": "chain",
 }
 """Our own suites, and where they are."""
 

@@ -74,5 +74,7 @@ class EpipolarDistance:
             max(2, round(self.min_overlap * fps)),
         )
         unit = 0.5 * (a.camera.width + b.camera.width) / 640
-        cost = 0.5 * (np.log1p(motion / (self.motion_scale * unit) ** 2) + np.log1p(place / (self.position_scale * unit) ** 2))
+        cost = 0.5 * (
+            np.log1p(motion / (self.motion_scale * unit) ** 2) + np.log1p(place / (self.position_scale * unit) ** 2)
+        )
         return np.where(np.isfinite(cost), np.minimum(cost, self.cap), self.cap)

@@ -95,7 +95,9 @@ class EpipolarScan(Aligner):
             lags = lags[np.abs(origin + lags / fps) <= self.max_lag + 1e-9]
         if len(matches) == 0 or len(lags) == 0:
             return _nothing(fps, Status.FEW_MATCHES if len(matches) == 0 else Status.NO_OVERLAP)
-        total = self.evidence(xa, xb, fundamentals(a.camera, b.camera), matches.pairs, lags, fps, unit_of(a, b), matches.weight)
+        total = self.evidence(
+            xa, xb, fundamentals(a.camera, b.camera), matches.pairs, lags, fps, unit_of(a, b), matches.weight
+        )
         if np.ptp(total) == 0:
             return _nothing(fps, Status.NO_OVERLAP)
         return self._answer(lags, total, origin, fps, len(matches))

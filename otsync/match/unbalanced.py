@@ -2,7 +2,7 @@
 
 Balanced transport finds a partner for every track. Two cameras on one scene share a small part of their tracks, so it
 forces the rest onto something: measured on basketball, best 100 of a pair within 15 cm: balanced Sinkhorn .45, relaxed
-.76. Here a track that finds nothing like it gives up its mass; the cost of doing so is ``marginal``.
+.74. Here a track that finds nothing like it gives up its mass; the cost of doing so is ``marginal``.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from .slot import Matcher, StructuralMatcher
 ITERATIONS, TOLERANCE = 2000, 1e-7
 """Of the Sinkhorn iterations; they contract by ρ/(ρ + ε) each, so a few dozen do."""
 
-LEAST_SHARE = 1e-12
-"""A pair with less than this share of the mass of its tracks is none."""
+LEAST_SHARE = 1e-9
+"""A pair with less than this share of the largest mass is none."""
 
 
 @dataclass(frozen=True)
@@ -34,22 +34,26 @@ class UnbalancedOT(Matcher):
     The plan minimises ``<M,γ> + ε KL(γ | p qᵀ) + ρ KL(γ1 | p) + ρ KL(γᵀ1 | q)``. How much mass moves is found from the
     data: costs count in units of what two unrelated tracks cost, the median of M (most pairs are unrelated).
 
-    Pairs are ranked by their share of the mass of both tracks, ``γ_ij / sqrt(row_i col_j)``: a track in a crowd does
-    not lose to a lonely one. Their ``weight``, for the scan and the fit, is what the plan kept of both tracks' mass.
+    Pairs are ranked by the mass that the plan moves between them. (Measured on basketball, 24 pairs of cameras, best 50
+    / 100 / 200 within 15 cm: .80 / .69 / .54; the cheapest pairs .78 / .68 / .54; shares of the tracks' own mass,
+    ``γ_ij / sqrt(row_i col_j)``, .74 / .66 / .52.)
 
     Args:
-        reg: ε, and marginal: ρ, in units of an unrelated pair's cost.
+        reg: ε, and marginal: ρ, in units of an unrelated pair's cost. Both may be halved or doubled without effect.
         partners: best partners of every track that are kept, as seen from both videos. top: pairs kept in all, best
             first; None: all of them.
+        weighted: whether the mass becomes the ``weight`` of the matches in scan and fit. It does not help there: the
+            fit weighs matches by their residuals (36 pairs, mean error .049 frame without, .059 with).
         costs: what is summed, a tuple of cost objects.
 
     References: Chizat et al., Scaling algorithms for unbalanced optimal transport problems, 2018; POT's solver.
     """
 
-    reg: float = 0.1
-    marginal: float = 0.05
+    reg: float = 0.05
+    marginal: float = 0.03
     partners: int = 2
     top: int | None = 200
+    weighted: bool = False
     costs: tuple[Cost, ...] = (Cosine(center=False),)
 
     def __post_init__(self) -> None:
@@ -73,7 +77,8 @@ class UnbalancedOT(Matcher):
         p, q = uniform(len(a)), uniform(len(b))
         plan, iterations, failed = relaxed_plan(p, q, M, self.reg, self.marginal)
         stats = {"objective": float((M * plan).sum()), "iterations": float(iterations)}
-        return partners_of(plan, p, q, self.partners, self.top, stats, failed)
+        with np.errstate(divide="ignore"):
+            return partners_of(plan, np.log(plan), self.partners, self.top, stats, failed, weighted=self.weighted)
 
 
 @dataclass(frozen=True)
@@ -126,7 +131,7 @@ class UnbalancedFGW(StructuralMatcher):
                 log=True,
             )
         stats = {"objective": problem.objective(plan), "iterations": float(len(log["error"]))}
-        return partners_of(plan, problem.p, problem.q, self.partners, self.top, stats, False)
+        return partners_of(plan, -problem.gradient(plan), self.partners, self.top, stats, False)
 
 
 @dataclass(frozen=True)
@@ -164,7 +169,7 @@ class SemirelaxedFGW(StructuralMatcher):
         back, m = self._solve(problem.M.T, problem.Cb, problem.Ca, problem.q, problem.pot_weight)
         plan = 0.5 * (there + back.T)
         stats = {"objective": problem.objective(plan), "iterations": float(n + m)}
-        return partners_of(plan, problem.p, problem.q, self.partners, self.top, stats, False)
+        return partners_of(plan, -problem.gradient(plan), self.partners, self.top, stats, False)
 
     def _solve(
         self, M: np.ndarray, Ca: np.ndarray, Cb: np.ndarray, p: np.ndarray, weight: float
@@ -230,30 +235,23 @@ def relaxed_plan(
 
 def partners_of(
     plan: Float[np.ndarray, "Na Nb"],
-    p: Float[np.ndarray, " Na"],
-    q: Float[np.ndarray, " Nb"],
+    score: Float[np.ndarray, "Na Nb"],
     partners: int,
     top: int | None,
     stats: dict[str, float],
     failed: bool,
+    *,
+    weighted: bool = False,
 ) -> Matches:
-    """Every track's best ``partners`` by the plan normalised with both marginals, as seen from both videos."""
+    """Every track's best ``partners`` by the plan, as seen from both videos, in order of ``score``."""
+    stats = stats | {"mass": float(plan.sum())}
     if failed or not np.isfinite(plan).all():
         return Matches(np.zeros((0, 2), int), flags=(Status.FAILED,), stats=stats)
-    rows, columns = plan.sum(1), plan.sum(0)
-    tiny = np.finfo(float).tiny
-    share = plan / np.sqrt(np.maximum(rows, tiny)[:, None] * np.maximum(columns, tiny)[None])
     chosen = np.zeros(plan.shape, bool)
-    np.put_along_axis(chosen, np.argsort(-share, axis=1, kind="stable")[:, :partners], True, 1)
-    np.put_along_axis(chosen, np.argsort(-share, axis=0, kind="stable")[:partners], True, 0)
-    chosen &= share > LEAST_SHARE
+    np.put_along_axis(chosen, np.argsort(-plan, axis=1, kind="stable")[:, :partners], True, 1)
+    np.put_along_axis(chosen, np.argsort(-plan, axis=0, kind="stable")[:partners], True, 0)
+    chosen &= plan > LEAST_SHARE * plan.max()
     i, j = np.nonzero(chosen)
-    kept = np.sqrt(np.minimum(rows / p, 1)[i] * np.minimum(columns / q, 1)[j])
-    found = by_score(
-        np.stack([i, j], 1),
-        np.log(share[i, j]),
-        weight=kept * share[i, j],
-        plan=plan,
-        stats=stats | {"mass": float(plan.sum())},
-    )
+    weight = plan[i, j] / plan.max() if weighted else None
+    found = by_score(np.stack([i, j], 1), score[i, j], weight=weight, plan=plan, stats=stats)
     return found if top is None else found.best(top)

@@ -1,0 +1,228 @@
+"""``otsync bench chain``: what a matcher is worth at the end of the chain, in frames of the offset.
+
+Every matcher x every way from matches to an offset x matched again or not, each through :func:`otsync.synchronize` as
+a user would call it, in situations that matchers differ in: the simulator's presets, few tracks, tracks of strangers,
+a wide baseline, people who look alike, no depth; and, with a recording, pairs of its cameras. The row "paper" is
+:data:`otsync.sync.method.PAPER`. A missing answer counts as the largest error that there can be.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor
+from contextlib import contextmanager
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..align.likelihood import LikelihoodScan
+from ..align.warping import DTW
+from ..costs.epipolar import EpipolarDistance
+from ..costs.linear import Cosine, Cost
+from ..costs.positions import CurveDistance
+from ..epipolar import EpipolarRefine, EpipolarScan
+from ..match import (
+    AnchoredFGW,
+    Candidates,
+    FusedGromovWasserstein,
+    GromovWasserstein,
+    NearestNeighbor,
+    OptimalTransport,
+    PartialFGW,
+    SemirelaxedFGW,
+    UnbalancedFGW,
+    UnbalancedOT,
+)
+from ..progress import counted, say
+from ..recordings.stages import COLOUR
+from ..refine.splines import SplineRefine
+from ..refine.unrefined import Unrefined
+from ..sync.method import PAPER, Method
+from ..sync.verb import synchronize
+from .chain_plot import plot
+from .chain_worlds import SITUATIONS, Case, real_cases
+from .record import table, write_rows
+
+FRESH = 9400
+"""First seed: nothing was tuned on seeds from here on."""
+
+WRONG = 1.0
+"""Frames of error from which a trusted answer counts as wrong."""
+
+FEATURES: tuple[Cost, ...] = (Cosine(),)
+PLACES: tuple[Cost, ...] = (Cosine(weight=COLOUR, center=False), CurveDistance())
+"""Features and curves in one world frame: the costs of the default on recordings."""
+
+IN_SPACE = {
+    "nearest neighbour": NearestNeighbor(FEATURES),
+    "EMD": OptimalTransport(costs=FEATURES),
+    "GW": GromovWasserstein(),
+    "FGW": FusedGromovWasserstein(costs=FEATURES),
+    "partial FGW": PartialFGW(costs=FEATURES),
+    "unbalanced FGW": UnbalancedFGW(costs=FEATURES),
+    "semi-relaxed FGW": SemirelaxedFGW(costs=FEATURES),
+    "anchored FGW": AnchoredFGW(costs=FEATURES),
+    "EMD + curve": OptimalTransport(costs=PLACES),
+    "cheapest partners + curve": Candidates(2, 200, PLACES),
+    "unbalanced OT + curve": UnbalancedOT(costs=PLACES),
+}
+"""Matchers of tracks in space: on features (and structure), then with places in the common frame."""
+
+PIXELS: tuple[Cost, ...] = (Cosine(center=False), EpipolarDistance())
+
+IN_PIXELS = {
+    "nearest neighbour": NearestNeighbor(PIXELS),
+    "EMD": OptimalTransport(costs=PIXELS),
+    "cheapest partners": Candidates(20, None, PIXELS),
+    "unbalanced OT": UnbalancedOT(partners=20, top=None, costs=PIXELS),
+}
+"""Matchers of tracks in pixels."""
+
+WAYS = {
+    "DTW": (DTW(), Unrefined()),
+    "scan": (LikelihoodScan(), Unrefined()),
+    "scan + spline": (LikelihoodScan(), SplineRefine()),
+}
+PIXEL_WAYS = {"scan": (EpipolarScan(), Unrefined()), "scan + fit": (EpipolarScan(), EpipolarRefine())}
+"""From matches to an offset: the paper's, and ours."""
+
+
+def contenders(flat: bool, only: Sequence[str] = ()) -> dict[tuple[str, str, int], Method]:
+    """Methods by (matcher, way, rematch). ValueError names a matcher that there is not."""
+    matchers, ways = (IN_PIXELS, PIXEL_WAYS) if flat else (IN_SPACE, WAYS)
+    rows = {
+        (name, way, rematch): Method(matcher=matcher, aligner=aligner, refiner=refiner, rematch=rematch)
+        for name, matcher in matchers.items()
+        for way, (aligner, refiner) in ways.items()
+        for rematch in (0, 1)
+        if not only or name in only
+    }
+    return rows if flat else rows | {("paper", "DTW", 0): PAPER}
+
+
+def run(
+    out: Path,
+    *,
+    scene: str | os.PathLike[str] | None = None,
+    cache: Path | None = None,
+    seeds: int = 10,
+    first_seed: int = FRESH,
+    only: tuple[str, ...] = (),
+) -> int:
+    """Measure, print a table for each situation, write CSV, JSON and the plot.
+
+    Args:
+        scene: a truly synchronised recording, whose pairs are measured too. cache: of its tracks and depth.
+        seeds: worlds of each situation, and pairs of cameras of the recording, each with an offset in three bands.
+        only: names of the matchers; default: all.
+    """
+    known = {*IN_SPACE, *IN_PIXELS}
+    if strange := [name for name in only if name not in known]:
+        raise ValueError(f"--only: expected some of {', '.join(sorted(known))}; found {', '.join(strange)}.")
+    chosen = range(first_seed, first_seed + seeds)
+    cases: list[tuple[str, Callable[[], Case]]] = [
+        (name, partial(make, seed)) for name, make in SITUATIONS.items() for seed in chosen
+    ]
+    if scene is not None:
+        cases += real_cases(scene, cache or out / "stages", seeds, first_seed)
+    rows = []
+    with workers(cases) as pool:
+        for found in counted(pool.map(partial(measure, only=only), range(len(cases))), "chains", "case", len(cases)):
+            rows += found
+    summary = summarise(rows)
+    about = {"seeds": seeds, "first_seed": first_seed, "scene": scene is not None}
+    write_rows(out, "chain_answers", rows, about)
+    write_rows(out, "chain", summary, about)
+    for situation in dict.fromkeys(r["situation"] for r in summary):
+        own = [{k: v for k, v in r.items() if k != "situation"} for r in summary if r["situation"] == situation]
+        say(f"{situation}: errors in frames\n{table(own)}\n")
+    plot(summary, out / "chain.svg")
+    return 0
+
+
+_cases: list[tuple[str, Callable[[], Case]]] = []
+"""What the workers choose from: forked with it, since a recording's tracks are too large to send for every pair."""
+
+
+@contextmanager
+def workers(cases: list[tuple[str, Callable[[], Case]]]) -> Iterator[Executor]:
+    """One process a core, each with the cases."""
+    _cases[:] = cases
+    try:
+        cores = len(os.sched_getaffinity(0))
+        with ProcessPoolExecutor(cores, mp_context=get_context("fork"), initializer=warm) as pool:
+            yield pool
+    finally:
+        _cases.clear()
+
+
+def warm() -> None:
+    """Imports and compiled loops are no method's time."""
+    for case in (SITUATIONS["mid"](0), SITUATIONS["no depth"](0)):
+        for method in contenders(case.a.xyz is None).values():
+            synchronize([case.a, case.b], method=method)
+
+
+def measure(index: int, only: tuple[str, ...] = ()) -> list[dict[str, Any]]:
+    """Every contender on one case; CPU-seconds of one thread."""
+    situation, make = _cases[index]
+    case = make()
+    rows = []
+    for (matcher, way, rematch), method in contenders(case.a.xyz is None, only).items():
+        started = time.process_time()
+        offsets = synchronize([case.a, case.b], method=method)
+        seconds = time.process_time() - started
+        error = abs(offsets.seconds[1] - case.offset) * case.fps
+        rows.append(
+            {
+                "situation": situation,
+                "case": case.name,
+                "matcher": matcher,
+                "way": way,
+                "rematch": rematch,
+                "error": float(error) if np.isfinite(error) else case.largest,
+                "missing": not np.isfinite(error),
+                "trusted": bool(offsets.status[1].ok),
+                "cpu_s": seconds,
+            }
+        )
+    return rows
+
+
+def summarise(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """By situation and chain: figures of |error|, share trusted, trusted answers that are wrong, the Pareto front."""
+    groups: dict[tuple[str, str, str, int], list[dict[str, Any]]] = {}
+    for r in rows:
+        groups.setdefault((r["situation"], r["matcher"], r["way"], r["rematch"]), []).append(r)
+    out: list[dict[str, Any]] = []
+    for (situation, matcher, way, rematch), own in groups.items():
+        e = np.array([r["error"] for r in own])
+        trusted = np.array([r["trusted"] for r in own])
+        out.append(
+            {
+                "situation": situation,
+                "matcher": matcher,
+                "way": way,
+                "rematch": rematch,
+                "median": round(float(np.median(e)), 4),
+                "mean": round(float(e.mean()), 4),
+                "p90": round(float(np.quantile(e, 0.9)), 4),
+                "within_1": round(float((e <= WRONG).mean()), 3),
+                "trusted": round(float(trusted.mean()), 3),
+                "trusted_wrong": int((trusted & (e > WRONG)).sum()),
+                "missing": int(sum(r["missing"] for r in own)),
+                "cpu_s": round(float(np.mean([r["cpu_s"] for r in own])), 4),
+            }
+        )
+    for r in out:
+        rivals = [o for o in out if o["situation"] == r["situation"] and o is not r]
+        r["front"] = not any(
+            o["cpu_s"] <= r["cpu_s"] and o["mean"] <= r["mean"] and (o["cpu_s"], o["mean"]) != (r["cpu_s"], r["mean"])
+            for o in rivals
+        )
+    return out
