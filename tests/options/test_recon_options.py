@@ -822,13 +822,13 @@ def rows() -> set[str]:
     """Every option that a test above exercises, refuses, or gives a reason for."""
     plan = {*PLAN, *OF_A_FIT}
     others = {
-        "fit": "scene offsets out held_out tracks truth cache workers json allow_outside",
+        "fit": "scene offsets out held_out tracks truth cache json allow_outside",
         "run": "scene out held_out reference truth json allow_outside recording.route recording.cameras "
-        "recording.cache recording.allow_outside recording.workers recording.masks recording.points recording.features",
+        "recording.cache recording.allow_outside recording.masks recording.points recording.features",
         "bench": "scene truth rows out cache name lpips_weights json allow_outside protocol.held_out "
         "protocol.cameras protocol.amplitudes protocol.seeds protocol.lengths protocol.held_out_tracks",
         "lifting": "scene out cache json allow_outside lifting.cameras lifting.steps lifting.seed lifting.width "
-        "lifting.frames lifting.held_out lifting.channels lifting.repeats",
+        "lifting.frames lifting.held_out lifting.channels",
         "render": "result camera path times frames turns fps width out",
         "eval": "result scene held_out offsets truth views lpips_weights out json allow_outside",
         "export": "result format at fps out",
@@ -837,7 +837,7 @@ def rows() -> set[str]:
     shared = {f"{command} plan.{o}" for command in ("fit", "run") for o in plan} | {
         f"bench protocol.plan.{o}" for o in plan
     }
-    return shared | {f"{command} {o}" for command, names in others.items() for o in names.split()}
+    return shared | set(REASONS) | {f"{command} {o}" for command, names in others.items() for o in names.split()}
 
 
 ROWS = rows()
