@@ -19,6 +19,7 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields, is_dataclass
+from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, TypeVar
@@ -198,7 +199,13 @@ def registered(group: str) -> dict[str, Any]:
 
 def entries(group: str) -> dict[str, EntryPoint]:
     """Entry points of installed packages in a group, not loaded."""
-    return {point.name: point for point in sorted(entry_points(group=f"otsync.{group}"), key=lambda p: p.name)}
+    return {point.name: point for point in _entries(group, tuple(sys.path))}
+
+
+@cache
+def _entries(group: str, path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
+    """Sorted by name. Looked for once a path: a command asks a dozen times, and each time reads every package."""
+    return tuple(sorted(entry_points(group=f"otsync.{group}"), key=lambda p: p.name))
 
 
 def short_name(thing: Any) -> str:

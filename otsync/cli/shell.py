@@ -148,6 +148,7 @@ def shared_options(args: list[str]) -> list[str] | None:
     if wanted["-v"]:
         logging.basicConfig(stream=sys.stderr, format="%(name)s: %(message)s")
     for name in ("otsync", "recon"):
-        logging.getLogger(name).setLevel(logging.DEBUG if wanted["-v"] else logging.NOTSET)
+        level = logging.DEBUG if wanted["-v"] else logging.ERROR if wanted["--quiet"] else logging.NOTSET
+        logging.getLogger(name).setLevel(level)
     plugins.load_files(files)
     return rest

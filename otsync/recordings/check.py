@@ -47,6 +47,9 @@ FEW = 1 / 3
 DEPTH_RATIO = (0.2, 5.0)
 """Median depth over the distance to where the cameras look; units differ by tens and more."""
 
+PARALLEL = np.radians(1.0)
+"""Angle between optical axes below which where they meet is a matter of rounding: 57 times their distance away."""
+
 BEYOND = 0.5
 """Images beside an image where the common target may still lie."""
 
@@ -246,6 +249,15 @@ def _common_volume(cameras: dict[str, Camera]) -> Iterable[Finding]:
     """Whether the cameras look at one place; and if not, which reading of their poses would make them."""
     if len(cameras) < 2:
         return
+    if _parallel(list(cameras.values())):
+        yield Finding(
+            "warning",
+            "",
+            "the cameras look in parallel: their axes meet nowhere, so the poses cannot be checked by where they meet.",
+            "If the cameras stand side by side, this is as it should be. If not, check the poses: w2c maps world to "
+            "camera, OpenCV axes (x right, y down, z forward), one world for all.",
+        )
+        return
     astray = _looking_away(list(cameras.values()))
     if not astray.any():
         return
@@ -271,6 +283,12 @@ def _common_volume(cameras: dict[str, Camera]) -> Iterable[Finding]:
     )
 
 
+def _parallel(cameras: list[Camera]) -> bool:
+    """Whether all optical axes (of the first poses) point the same way, so that no point is nearest to them."""
+    axes = np.array([camera.w2c.reshape(-1, 4, 4)[0, 2, :3] for camera in cameras])
+    return bool((axes @ axes[0] > np.cos(PARALLEL)).all())
+
+
 def _looking_away(cameras: list[Camera]) -> np.ndarray:
     """Which cameras have the point nearest to all optical axes behind them or far outside their image."""
     target = common_target(cameras)
@@ -290,7 +308,7 @@ def _depth_units(
     document: dict[str, Any], root: Path, cameras: dict[str, Camera], allow_outside: bool
 ) -> Iterable[Finding]:
     """Depth in other units than the poses: its median against the distance to where the cameras look."""
-    if len(cameras) < 2:
+    if len(cameras) < 2 or _parallel(list(cameras.values())):
         return
     target = common_target(list(cameras.values()))
     for n, entry in enumerate(document["videos"]):

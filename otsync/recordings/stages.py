@@ -124,7 +124,8 @@ def with_method(stages: Stages, route: str, method: Method) -> Stages:
 def with_labels(stages: Stages, scene: Scene) -> Stages:
     """The stages with the cost of labels in both matchers, when every video of the scene has labels.
 
-    A matcher without costs of choice (:class:`otsync.GromovWasserstein`, one of somebody else's) stays as it is.
+    A matcher that takes no ``costs`` stays as it is: what it compares is its own affair. It finds the labels in the
+    track sets that it is given.
     """
     if not scene.labels or any(labels is None for labels in scene.labels):
         return stages

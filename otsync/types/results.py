@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -12,20 +11,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..files.arrays import read_json, write_json
+from ..files.arrays import write_json
 from . import drawing
 from .camera import Video
 from .clock import Clock
+from .offsets_file import FORMAT, SIGN, VERSION, read_offsets
 from .status import Status, gravest, in_order
 from .tracks import TrackSet
 
 Stats = dict[str, float]
-
-FORMAT, VERSION = "otsync.offsets", 1
-SIGN = (
-    "t_world = rate * t_video + offset_seconds, t_video in seconds on the video's own clock; a positive offset means "
-    "that the video started later than its reference; offset_frames = offset_seconds * fps of the reference"
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -348,133 +342,11 @@ class Offsets:
         A video with an offset has a rate and a frame rate; the reference's clock is the world's: offset 0, rate 1.
         ValueError names file and field.
         """
-        data = read_json(path)
-        if not isinstance(data, dict) or data.get("format") != FORMAT:
-            raise ValueError(f"{path}: expected an offsets file written by otsync (format {FORMAT!r}); found another.")
-        if data.get("version") != VERSION:
-            raise ValueError(
-                f"{path}: expected version {VERSION}; found {data.get('version')!r}. Read it with the otsync release "
-                "that wrote it, or write it anew with this one."
-            )
-        try:
-            return cls._from_dict(data)
-        except (KeyError, TypeError, IndexError, AttributeError, OverflowError) as error:
-            detail = f"{type(error).__name__}: {error}"
-        except ValueError as error:
-            detail = str(error)
-        raise ValueError(f"{path}: not a sound offsets file; {detail}. Write it anew.")
-
-    @classmethod
-    def _from_dict(cls, data: dict[str, Any]) -> Offsets:
-        videos = data["videos"]
-        index = {video["name"]: v for v, video in enumerate(videos)}
-        if len(index) != len(videos) or not videos or not all(isinstance(name, str) and name for name in index):
-            raise ValueError("videos: expected at least one, with unique names")
-
-        def column(key: str, **bounds: float) -> np.ndarray:
-            return np.array([_float(video[key], f"videos, {video['name']}: {key}", **bounds) for video in videos])
-
-        def place(name: Any, what: str) -> int:
-            if name not in index:
-                raise ValueError(f"{what}: expected one of {', '.join(index)}; found {name!r}")
-            return index[name]
-
-        alignments: dict[tuple[int, int], Alignment] = {}
-        for p in data["pairs"]:
-            pair = place(p["a"], "pairs: a"), place(p["b"], "pairs: b")
-            what = f"pairs, {p['a']}-{p['b']}"
-            if pair[0] == pair[1] or pair in alignments:
-                raise ValueError(f"{what}: expected two videos, each pair once; found it again or with itself")
-            alignments[pair] = Alignment(
-                offset=_float(p["offset_seconds"], f"{what}: offset_seconds"),
-                rate=_float(p["rate"], f"{what}: rate", above=0),
-                sigma=_float(p["sigma_seconds"], f"{what}: sigma_seconds", least=0),
-                hypotheses=_rows_of_two(p["hypotheses"], f"{what}: hypotheses"),
-                fps=_float(p["fps"], f"{what}: fps", above=0),
-                flags=_flags(p["flags"], p["status"], what),
-                stats={str(k): _float(x, f"{what}: stats, {k}") for k, x in p["stats"].items()},
-            )
-        reference = place(data["reference"], "reference")
-        component = np.array([place(video["reference"], f"videos, {video['name']}: reference") for video in videos])
-        astray = np.flatnonzero(component[component] != component)
-        if len(astray) or component[reference] != reference:
-            v = int(astray[0]) if len(astray) else reference
-            raise ValueError(
-                f"videos, {videos[v]['name']}: reference: expected a video that is its own reference; found "
-                f"{videos[v]['reference']!r}"
-            )
-        seconds, rates, fps = column("offset_seconds"), column("rate", above=0), column("fps", above=0)
-        for key, values in (("rate", rates), ("fps", fps)):
-            for v in np.flatnonzero(np.isfinite(seconds) & np.isnan(values)).tolist():
-                raise ValueError(
-                    f"videos, {videos[v]['name']}: {key}: expected a number, since it has an offset; found null"
-                )
-        for v in np.flatnonzero(component == np.arange(len(videos))).tolist():
-            # one that hangs together with no other may have no answer; the reference is where the world's clock begins
-            if seconds[v] != 0 and (v == reference or np.isfinite(seconds[v])):
-                none = "" if v == reference else " or null"
-                raise ValueError(
-                    f"videos, {videos[v]['name']}: offset_seconds: expected 0{none} of a video that is its own "
-                    f"reference; found {json.dumps(videos[v]['offset_seconds'])}"
-                )
-        if rates[reference] != 1:
-            raise ValueError(
-                f"videos, {videos[reference]['name']}: rate: expected 1, since the clock of the reference is the "
-                f"world's; found {rates[reference]:g}"
-            )
-        return cls(
-            names=tuple(index),
-            fps=fps,
-            seconds=seconds,
-            rates=rates,
-            sigma=column("sigma_seconds", least=0),
-            reference=reference,
-            component=component,
-            flags=tuple(_flags(video["flags"], video["status"], f"videos, {video['name']}") for video in videos),
-            alignments=alignments,
-            stats={str(k): _float(x, f"stats, {k}") for k, x in data["stats"].items()},
-        )
+        fields, pairs = read_offsets(path)
+        return cls(**fields, alignments={pair: Alignment(**one) for pair, one in pairs.items()})
 
 
 def _number(x: Any) -> float | None:
     """A JSON number, or None for nan and infinities."""
     x = float(x)
     return x if math.isfinite(x) else None
-
-
-def _float(x: Any, what: str, *, above: float = -math.inf, least: float = -math.inf) -> float:
-    """A finite number > above and >= least; nan for null. ValueError begins with ``what``."""
-    if x is None:
-        return math.nan
-    if isinstance(x, bool) or not isinstance(x, int | float):
-        raise ValueError(f"{what}: expected a number or null; found {x!r}")
-    if not math.isfinite(x) or x <= above or x < least:
-        bound = f" above {above:g}" if above > -math.inf else f" of {least:g} or more" if least > -math.inf else ""
-        raise ValueError(f"{what}: expected a finite number{bound}, or null; found {x!r}")
-    return float(x)
-
-
-def _status(code: Any, what: str) -> Status:
-    """The status of this code. ValueError begins with ``what``."""
-    try:
-        return Status.from_code(code)
-    except ValueError as error:
-        raise ValueError(f"{what}: {str(error).removeprefix('status: ').removesuffix('.')}") from None
-
-
-def _flags(codes: Any, status: Any, what: str) -> tuple[Status, ...]:
-    """The flags of these codes, the gravest of which the status must be."""
-    if not isinstance(codes, list):
-        raise ValueError(f"{what}: flags: expected a list of codes; found {str(codes)[:80]!r}")
-    flags = in_order(_status(code, f"{what}: flags") for code in codes)
-    if _status(status, f"{what}: status") is not gravest(flags):
-        raise ValueError(
-            f"{what}: status: expected {gravest(flags).code!r}, the gravest of its flags; found {status!r}"
-        )
-    return flags
-
-
-def _rows_of_two(rows: Any, what: str) -> np.ndarray:
-    if not isinstance(rows, list) or any(not isinstance(row, list) or len(row) != 2 for row in rows):
-        raise ValueError(f"{what}: expected a list of pairs of an offset and a score; found {str(rows)[:80]}")
-    return np.array([[_float(x, what) for x in row] for row in rows]).reshape(-1, 2)

@@ -24,6 +24,7 @@ from recon.backdrop.seeds import seed_discs, surface_of
 from recon.backdrop.stills import Still, stills_of
 from recon.backdrop.surroundings import Floor, Lookup, surroundings
 from recon.fit.optimize import Adam, Decay
+from recon.fit.options import check_length
 from recon.footage.depth import Depths
 from recon.footage.footage import Footage
 from recon.losses.ssim import photometric
@@ -365,10 +366,6 @@ def _unit(image: np.ndarray) -> np.ndarray:
 
 
 def _total(steps: int | None, budget: float | None) -> int | None:
-    if steps is not None and budget is not None:
-        raise ValueError("steps, budget: expected one of them; found both.")
-    if budget is not None and not (math.isfinite(budget) and budget > 0):
-        raise ValueError(f"budget: expected seconds above 0; found {budget}.")
-    if steps is not None and steps < 0:
-        raise ValueError(f"steps: expected 0 or more; found {steps}.")
+    """Steps in all; None when the budget decides."""
+    check_length(steps, budget)
     return None if budget is not None else STEPS if steps is None else steps

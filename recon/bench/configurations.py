@@ -15,11 +15,12 @@ with EFFECT           ours, with an effect that a plugin adds
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 from otsync.plugins import available
+from recon.fit.optimize import chosen_rates
 from recon.fit.options import DEFAULT_LOSSES
 from recon.losses import LOSSES, Loss, Mask, Photometric, ScaleHinge
 from recon.motion import PerGaussian, Sampled, Scaffold
@@ -69,17 +70,47 @@ class Configuration:
     Args:
         start: offsets that everything is built from: those given, or the truth.
         change: what the row does otherwise than the plan of all rows.
-        motion: what becomes of the motion before the fit.
+        motion: what becomes of the motion before the fit. groups: the parameter groups of that motion.
     """
 
     start: Start = "given"
     change: Callable[[Plan], Plan] = lambda plan: plan
     motion: Callable[[Gaussians4D], Gaussians4D] = as_built
+    groups: tuple[str, ...] = ("knots", "knot_quats")
+
+    def plan(self, plan: Plan) -> Plan:
+        """The plan of this row, without what the plan of all rows says of the groups of other motions."""
+        changed = self.change(plan)
+        others, fit = [g for g in OF_MOTIONS if g not in self.groups], changed.fit
+        rates = None if fit.rates is None else {g: rate for g, rate in fit.rates.items() if g not in others}
+        freeze = tuple(g for g in fit.freeze if g not in others)
+        return replace(changed, fit=replace(fit, rates=rates, freeze=freeze))
+
+
+OF_MOTIONS = ("knots", "knot_quats", "own_knots")
+"""Parameter groups that one motion has and another has not."""
+
+
+def check_heeded(rows: Sequence[Configuration], plan: Plan) -> None:
+    """ValueError for rates and groups to freeze of motions that none of the rows has."""
+    fitted = {g for row in rows for g in row.groups}
+    chosen = (("rates", chosen_rates(plan.fit.rates, plan.fit.groups)), ("freeze", plan.fit.freeze))
+    for option, names in chosen:
+        unused = [g for g in names if g in OF_MOTIONS and g not in fitted]
+        if unused:
+            raise ValueError(
+                f"{option}: expected groups that a row fits; found {', '.join(unused)}. Leave them out, or add a row "
+                "of another motion."
+            )
 
 
 def held(plan: Plan) -> Plan:
-    """The offsets stay as they are."""
-    return replace(plan, fit=replace(plan.fit, freeze=(*(g for g in plan.fit.freeze if g != "offsets"), "offsets")))
+    """The offsets stay as they are, whatever rate the plan gives them."""
+    others = tuple(g for g in plan.fit.freeze if g != "offsets")
+    if plan.fit.rates is None:
+        return replace(plan, fit=replace(plan.fit, freeze=(*others, "offsets")))
+    rates = {g: rate for g, rate in plan.fit.rates.items() if g != "offsets"}
+    return replace(plan, fit=replace(plan.fit, rates=rates, freeze=others))
 
 
 def per_video(plan: Plan) -> Plan:
@@ -129,10 +160,10 @@ OWN: Mapping[str, Configuration] = {
     "fixed": Configuration(change=held),
     "true time": Configuration("true", held),
     "w/o spline": Configuration(change=held, motion=sampled),
-    "w/o scaffold": Configuration(motion=per_gaussian),
+    "w/o scaffold": Configuration(motion=per_gaussian, groups=("own_knots",)),
     "scaffold per video": Configuration(change=per_video),
     "Sync-NeRF style": Configuration(change=images_alone),
-    "Dynamic3DGaussians": Configuration("true", held, per_gaussian_sampled),
+    "Dynamic3DGaussians": Configuration("true", held, per_gaussian_sampled, ("own_knots",)),
 }
 
 

@@ -29,7 +29,7 @@ from otsync.progress import Progress
 from otsync.types import Clock, Offsets, TrackSet
 from otsync.types.checks import check_whole
 from recon.backdrop.fit import StaticFit
-from recon.bench.configurations import Configuration, configurations
+from recon.bench.configurations import Configuration, check_heeded, configurations
 from recon.bench.plot import plot
 from recon.bench.rows import KEY, find, measured_before, paper_tables
 from recon.evaluate.figures import acceleration, coherence, following_error
@@ -61,7 +61,9 @@ class Protocol:
     """How rows are measured. ValueError for options that exclude each other, or that no row would heed."""
 
     plan: Annotated[Plan, tyro.conf.arg(name="")] = field(default_factory=lambda: Plan(views=16))
-    """How every row is reconstructed, but for what it is about. Without --steps and --budget: 2500 steps."""
+    """How every row is reconstructed, but for what it is about. Without --steps and --budget: 2500 steps. Knots reach
+    at least a frame beyond the errors, whatever the scaffold's margin.
+    """
     held_out: tuple[str, ...] = ()
     """Names of videos that no fit sees: every row is compared with them."""
     cameras: tuple[str, ...] | None = None
@@ -194,7 +196,7 @@ def measure(
     """One row: build from the believed offsets, fit (``steps`` as of Protocol.steps), and hold against the truth."""
     believed = material.believed(amplitude, seed)
     built_from = believed if configuration.start == "given" else material.truth
-    plan = replace(configuration.change(protocol.plan), frames=None)  # the material is cut already
+    plan = replace(configuration.plan(protocol.plan), frames=None)  # the material is cut already
     margin = max(plan.scaffold.margin, (amplitude + 1) / float(believed.fps[believed.reference]))
     plan = replace(plan, scaffold=replace(plan.scaffold, margin=margin))
     ready = prepare(
@@ -288,16 +290,18 @@ def positions_at(tracks: TrackSet, times: np.ndarray) -> np.ndarray:
     after = np.searchsorted(frame_times, times).clip(1, len(frame_times) - 1)
     gap = frame_times[after] - frame_times[after - 1]
     share = (times - frame_times[after - 1]) / gap
-    on_one = np.minimum(np.abs(share), np.abs(1 - share)) < NEAR
+    on_one = np.minimum(np.abs(share), np.abs(1 - share)) < ON_FRAME
     inside = on_one | (share > 0) & (share < 1) & (gap < 1.5 * np.median(np.diff(frame_times)))
     before, behind, share = positions[:, after - 1], positions[:, after], share[None, :, None]
     # on a frame its neighbour does not matter, which may not have seen the point
-    between = np.where(share < NEAR, before, np.where(share > 1 - NEAR, behind, before + share * (behind - before)))
+    between = np.where(
+        share < ON_FRAME, before, np.where(share > 1 - ON_FRAME, behind, before + share * (behind - before))
+    )
     held[:, inside] = between[:, inside]
     return held
 
 
-NEAR = 1e-4
+ON_FRAME = 1e-4
 """Share of a frame below which a time is the frame's."""
 
 
@@ -330,7 +334,8 @@ def run(
     if unknown:
         raise ValueError(f"rows: expected some of {', '.join(choices)}; found {', '.join(unknown)}.")
     for name_of_row in rows:
-        choices[name_of_row].change(protocol.plan)  # says what is wrong before the work, not after it
+        choices[name_of_row].plan(protocol.plan)  # says what is wrong before the work, not after it
+    check_heeded([choices[row] for row in rows], protocol.plan)
     kept, progress, lpips = Cache(cache or out / "stages"), Progress(tell), lpips or Lpips()
     description = about(protocol, scene, truth)
     known = measured_before(out, description)
@@ -373,9 +378,7 @@ def about(protocol: Protocol, scene: Scene, truth: Offsets) -> Mapping[str, Any]
 
 
 def described(options: Any) -> dict[str, Any]:
-    """Options as JSON takes them, those of parts beside those of the whole; objects as they would be written in
-    Python.
-    """
+    """Options as JSON takes them, those of parts beside those of the whole; objects as Python would spell them."""
     out: dict[str, Any] = {}
     for name, value in vars(options).items():
         if isinstance(value, Plan | FitOptions):

@@ -87,9 +87,7 @@ def run(
     cache: Path | None = None,
     tell: Callable[[str], None] = print,
 ) -> tuple[list[Row], Row]:
-    """Measure, and write ``lifting.csv`` and ``lifting.json`` to ``out``: precision by matching, and the cost of
-    lifting.
-    """
+    """Measure, and write ``lifting.csv`` and ``lifting.json`` to ``out``: precision by matching, cost of lifting."""
     from otsync.files.cache import Cache
     from otsync.progress import Progress
     from recon.pipeline.stages import read_footage

@@ -72,6 +72,8 @@ def reconstructed(
     from recon.pipeline.verb import reconstruct
     from recon.result.folder import metrics_of
 
+    if workers < 0:
+        raise ValueError(f"--workers: expected 0 (one per core) or more; found {workers}.")
     known = None if truth is None else Offsets.load(truth)
     with ThreadPoolExecutor(workers or os.cpu_count() or 1) as pool:
         outcome = reconstruct(

@@ -67,8 +67,7 @@ class Render:
         if self.fps is not None and not self.out.suffix and (self.times or self.frames is not None):
             raise ValueError(
                 "--fps: expected with a video in --out, or to choose the times of images; found a folder of images "
-                "whose "
-                f"times {'--times' if self.times else '--frames'} chooses."
+                f"whose times {'--times' if self.times else '--frames'} chooses."
             )
         if self.fps is not None and not 0 < self.fps <= 1000:
             raise ValueError(f"--fps: expected frames per second above 0, at most 1000; found {self.fps:g}.")
@@ -102,7 +101,7 @@ class Eval:
     held_out: tuple[str, ...] = ()
     """Names of videos to compare with; default: those that were held out. Trained ones are allowed, and marked."""
     offsets: Path | None = None
-    """offsets.json that tells the clocks of held-out videos; default: found on the frozen scene."""
+    """offsets.json with the clocks of these videos; default: the fit's own, or found on the frozen scene."""
     truth: Path | None = None
     """True offsets: adds the offset errors of the reconstruction."""
     views: int = 50
@@ -176,9 +175,7 @@ class Export:
     result: tyro.conf.Positional[Path]
     """Folder that recon fit or otsync run wrote."""
     format: one_of("exporters", EXPORTERS) = "ply"
-    """ply and splat hold a moment, ply-sequence every frame; checkpoint is the whole scene, tracks an otsync track
-    set.
-    """
+    """ply and splat hold a moment, ply-sequence every frame, checkpoint the whole scene, tracks an otsync track set."""
     at: float | None = None
     """World second of the moment; default: the middle."""
     fps: float | None = None

@@ -5,7 +5,7 @@ A group without a rate is frozen.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -75,6 +75,23 @@ def every_group() -> dict[str, Group]:
     return DECLARED | by_name(group for effect in all_effects().values() for group in effect.groups)
 
 
+def chosen_rates(rates: Mapping[str, float] | None, declared: Mapping[str, Group]) -> dict[str, float]:
+    """The rates that somebody chose: those that differ from what the groups begin with."""
+    usual = initial_rates(declared.values())
+    return {name: rate for name, rate in (rates or {}).items() if rate != usual.get(name)}
+
+
+def check_there(option: str, names: Iterable[str], groups: Mapping[str, Tensor]) -> None:
+    """ValueError for names of an option that are no groups of this fit, so that it would not heed them."""
+    there = [name for name, values in groups.items() if values.numel()]
+    absent = [name for name in names if name not in there]
+    if absent:
+        raise ValueError(
+            f"{option}: expected groups of this fit ({', '.join(there)}); found {', '.join(absent)}, which it does not "
+            "have. Leave them out."
+        )
+
+
 def check_rates(rates: Mapping[str, float], groups: Mapping[str, Tensor]) -> dict[str, float]:
     """Rates of the groups that there are. ValueError for names that no model has, and for negative rates."""
     known = set(groups) | set(every_group())
@@ -88,9 +105,7 @@ def check_rates(rates: Mapping[str, float], groups: Mapping[str, Tensor]) -> dic
 
 
 class Adam:
-    """torch's Adam over named groups, whose steps are given in the groups' own units and whose state is plain
-    tensors.
-    """
+    """torch's Adam over named groups; steps are given in the groups' own units, and its state is plain tensors."""
 
     BETAS = (0.9, 0.99)
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 from otsync.plugins import named
 from otsync.types.checks import check_number, check_whole, positive
 from recon.fit.densify import Densify
-from recon.fit.optimize import DECLARED, rates_on, without
+from recon.fit.optimize import DECLARED, chosen_rates, rates_on, without
 from recon.losses import (
     LOSSES,
     Acceleration,
@@ -36,9 +36,8 @@ DEFAULT_LOSSES: tuple[Loss, ...] = (
     Velocity(),
     Acceleration(),
 )
-"""The losses of the study of the paper's scene; depth, tracks and features enter only at initialisation unless
-added.
-"""
+"""The losses of the study of the paper's scene; depth, tracks and features enter only at initialisation, unless they
+are added."""
 
 DEFAULT_STEPS = 2000
 
@@ -75,20 +74,17 @@ class FitOptions:
         _check_kinds("effects", self.effects, (Effect,), "recon.observe.Effect")
         for loss in self.losses:
             check_number(f"losses: weight of {type(loss).__name__}", loss.weight, above=-math.inf)
-        if self.steps is not None and self.budget is not None:
-            raise ValueError("steps, budget: expected one of them; found both.")
-        if self.steps is not None:
-            check_whole("steps", self.steps, 0)
-        if self.budget is not None:
-            check_number("budget", self.budget)
+        check_length(self.steps, self.budget)
         check_whole("batch", self.batch, 1)
         positive("save_every", self.save_every, zero=True)
         if self.densify is not None and any(isinstance(x, ImageLoss) and x.reads == "tracks" for x in self.losses):
             raise ValueError(
                 "losses, densify: expected one of Track and densification; found both. Tracks are tied to Gaussians, "
-                "which "
-                "densification replaces."
+                "which densification replaces."
             )
+        both = [name for name in self.freeze if name in chosen_rates(self.rates, self.groups)]
+        if both:
+            raise ValueError(f"rates, freeze: expected each group in one of them; found {', '.join(both)} in both.")
         self.active_rates()
 
     @property
@@ -105,6 +101,16 @@ class FitOptions:
         """The rate of every group that is fitted. ValueError for a group to freeze that has none."""
         rates = initial_rates(self.groups.values()) if self.rates is None else dict(self.rates)
         return without(rates, *self.freeze)
+
+
+def check_length(steps: int | None, budget: float | None) -> None:
+    """ValueError unless a length is a number of steps, or wall seconds, or left open."""
+    if steps is not None and budget is not None:
+        raise ValueError("steps, budget: expected one of them; found both.")
+    if steps is not None:
+        check_whole("steps", steps, 0)
+    if budget is not None:
+        check_number("budget", budget)
 
 
 def _check_kinds(name: str, items: tuple[Any, ...], kinds: tuple[type, ...], expected: str) -> None:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from otsync.files.digest import content_key
 from otsync.types import Offsets
+from recon.fit.optimize import check_there, chosen_rates
 from recon.fit.options import FitOptions
 from recon.footage.footage import Footage
 from recon.losses import ImageLoss, MotionLoss
@@ -76,8 +77,7 @@ class Problem:
             if loss.reads is not None and not any(getattr(f, loss.reads) for f in footage):
                 raise ValueError(
                     f"losses: {type(loss).__name__} compares with the {loss.reads} of footage; found none in any "
-                    f"video. "
-                    f"Give Footage.{loss.reads}, or leave the loss out."
+                    f"video. Give Footage.{loss.reads}, or leave the loss out."
                 )
             if "features" in loss.needs and scene.features is None:
                 raise ValueError(
@@ -124,11 +124,15 @@ class Problem:
         return self.scene.dynamic.means.device
 
     @property
+    def layered(self) -> bool:
+        """Whether what is static is not drawn: there is none, or every video has a background instead."""
+        return self.scene.static is None or all(clip.background is not None for clip in self.clips)
+
+    @property
     def at_once(self) -> bool:
         """Whether the images of a step are one rendering: on a GPU, where no effect asks for other moments than the
         frames' own and what is static is not drawn."""
-        layered = self.scene.static is None or all(clip.background is not None for clip in self.clips)
-        return self.device.type != "cpu" and layered and all(effect.instant for effect in self.effects)
+        return self.device.type != "cpu" and self.layered and all(effect.instant for effect in self.effects)
 
     def needs(self, what: str) -> bool:
         """Whether a loss asks for "depth" or "features" to be rendered."""
@@ -154,6 +158,13 @@ class Problem:
         out["offsets"] = torch.as_tensor(self.start.copy())
         out["clock_rates"] = torch.as_tensor(self.offsets.rates[self.index].copy())
         return scene_groups(self.scene) | {name: t.to(self.device) for name, t in out.items()}
+
+
+def check_groups(problem: Problem, options: FitOptions) -> None:
+    """ValueError for chosen rates, and groups to freeze, that no image or loss of this problem depends on."""
+    drawn = {n: v for n, v in problem.groups().items() if not (problem.layered and n.startswith("static."))}
+    check_there("rates", chosen_rates(options.rates, problem.declared), drawn)
+    check_there("freeze", options.freeze, drawn)
 
 
 def scene_groups(scene: Gaussians4D) -> dict[str, Tensor]:

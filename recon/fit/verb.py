@@ -27,7 +27,7 @@ from otsync.progress import is_quiet
 from otsync.types import Offsets
 from recon.fit.checkpoint import Checkpoint
 from recon.fit.options import FitOptions
-from recon.fit.problem import Problem, assemble
+from recon.fit.problem import Problem, assemble, check_groups
 from recon.fit.run import Diverged, Run
 from recon.fit.undisturbed import one_thread_each, uninterrupted
 from recon.footage.footage import Footage
@@ -113,6 +113,7 @@ def fit(
         raise TypeError(f"fit: expected fields of FitOptions ({', '.join(known)}); found {', '.join(sorted(unknown))}.")
     options = replace(options or FitOptions(), **changes)
     problem, rates = Problem.of(scene, footage, offsets, options), options.active_rates()
+    check_groups(problem, options)
     o = options
     told = (o.losses, o.effects, sorted(rates.items()), o.steps, o.budget, o.batch, o.densify, o.seed)
     keep = Checkpoint(checkpoint, problem.key(*told) if checkpoint is not None else "", options.save_every)

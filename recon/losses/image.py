@@ -75,9 +75,7 @@ class Seen:
 
 
 class ImageLoss(ABC):
-    """A comparison of one rendered frame with the filmed one: a frozen dataclass with a ``weight`` that inherits from
-    this.
-    """
+    """A comparison of one rendered frame with the filmed one. Inherit from it: a frozen dataclass with a ``weight``."""
 
     weight: float
     """Its share in the sum of losses."""
@@ -105,6 +103,10 @@ class Photometric(ImageLoss):
     weight: float = 1.0
     ssim: float = 0.2
     window: Window = SMALL
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.window, Window):
+            raise ValueError(f"window: expected a recon.losses.window.Window, from Python; found {self.window!r}.")
 
     def __call__(self, seen: Seen) -> Tensor | None:
         return photometric(seen.rendered, seen.image, seen.usable, self.ssim, self.window)

@@ -16,10 +16,13 @@ from recon.motion.nodes import Grid
 from recon.motion.paths import HermiteSpline
 from recon.motion.scaffold import Scaffold
 from recon.motion.solve import FRAME, Coupling, Observations, Smoothness, neighbourhood_rotations, solve_curves
-from recon.motion.warp import LINEAR
+from recon.motion.warp import BLENDS, LINEAR
 from recon.rotations import continuous, quaternions
 
 logger = logging.getLogger("recon.motion")
+
+FEWEST = 300
+"""Nodes below which a scaffold is rather built with a smaller spacing."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +31,7 @@ class ScaffoldOptions:
 
     Args:
         unit: spacing of the nodes; None: 7.5, or less (down to 2) where that gives fewer than `fewest` nodes, or more
-            where it gives more than `most`.
+            where it gives more than `most`. Give `unit` or `fewest`, not both.
         second_pick: spacing of the second pick, on full curves, as a share of `unit`.
         spacing: of the knots in time. margin: seconds of knots beyond both ends: the largest believable offset.
         per_video: one scaffold per video, each on its own clock, as in the paper; else one in world time.
@@ -40,7 +43,7 @@ class ScaffoldOptions:
 
     unit: float | None = None
     second_pick: float = 0.8
-    fewest: int = 300
+    fewest: int = FEWEST
     most: int = 1800
     spacing: float = 4 * FRAME
     margin: float = 4 * FRAME
@@ -57,8 +60,13 @@ class ScaffoldOptions:
             raise ValueError(f"unit: expected footprints > 0, or None to choose; found {self.unit}.")
         if not (0 < self.second_pick <= 1 and self.reach > 0 and self.robust > 0 and self.spacing > 0):
             raise ValueError("second_pick, reach, robust, spacing: expected numbers > 0, second_pick at most 1.")
-        if not (self.margin >= 0 and self.neighbours >= 1 and 1 <= self.fewest <= self.most):
+        if self.unit is not None and self.fewest != FEWEST:
+            raise ValueError("unit, fewest: expected one of them, since fewest chooses the unit; found both.")
+        least = 1 if self.unit is not None else self.fewest
+        if not (self.margin >= 0 and self.neighbours >= 1 and 1 <= least <= self.most):
             raise ValueError("margin, neighbours, fewest, most: expected margin >= 0, 1 neighbour, fewest <= most.")
+        if self.blend not in BLENDS:
+            raise ValueError(f"blend: expected one of {', '.join(BLENDS)}; found {self.blend!r}.")
 
 
 UNIT, LEAST_UNIT, MOST_UNIT, GROWTH = 7.5, 2.0, 750.0, 1.25  # footprints; the last: the factor between two tries

@@ -231,7 +231,7 @@ class Gain(Effect):
         start = torch.as_tensor(self.start, dtype=torch.float32)
         if start.ndim == 1:
             start = start[:, None]
-        if start.shape[0] != n_videos or start.ndim != 2 or start.shape[1] not in (1, 3):
+        if start.ndim != 2 or start.shape[0] != n_videos or start.shape[1] not in (1, 3):
             raise ValueError(f"start: expected gains [{n_videos}] or [{n_videos},3], found {list(start.shape)}")
         if not (start.isfinite() & (start > 0)).all():
             raise ValueError("start: expected gains > 0, found zero, negative or NaN: a gain multiplies colours")

@@ -1,6 +1,4 @@
-"""Effects of a recording: those that it calls for by itself, those that one camera is looked through, and
-run.json's.
-"""
+"""Effects of a recording: those that it calls for, those that one camera is looked through, and those in run.json."""
 
 from __future__ import annotations
 

@@ -18,9 +18,7 @@ from recon.scene.seed import Seeding
 
 @dataclass(frozen=True)
 class Plan:
-    """How a recording is reconstructed. ValueError names an option that makes no sense, and a device that is not
-    there.
-    """
+    """How a recording is reconstructed. ValueError names an option that makes no sense, and a missing device."""
 
     width: int = 320
     """Working pixels of an image's width."""

@@ -1,6 +1,4 @@
-"""What losses compare with beyond images and masks: depth maps and point tracks of a recording, put into its
-footage.
-"""
+"""What losses compare with beyond images and masks: a recording's depth maps and point tracks, in its footage."""
 
 from __future__ import annotations
 
@@ -34,9 +32,8 @@ def read_by(losses: Sequence[Loss]) -> frozenset[str]:
         if isinstance(loss, ImageLoss) and loss.reads is not None and loss.reads not in SUPPLIED:
             raise ValueError(
                 f"losses: {type(loss).__name__} compares with {loss.reads}, which are not made of a recording; "
-                f"expected "
-                f"losses that read {' or '.join(SUPPLIED)}. Call recon.fit.fit with footage of your own, or leave it "
-                f"out."
+                f"expected losses that read {' or '.join(SUPPLIED)}. Call recon.fit.fit with footage of your own, or "
+                "leave it out."
             )
     return frozenset(loss.reads for loss in losses if isinstance(loss, ImageLoss) and loss.reads is not None)
 

@@ -227,9 +227,17 @@ def evaluate(
 
     Clocks: as ``offsets`` say, else those of the result, else found on the frozen scene. A camera of the result is
     looked through the effects that the fit gave it, any other through those that held for all, and the shutter that it
-    declares.
+    declares. ValueError for ``offsets`` that do not tell the clock of each of the named cameras.
     """
     from otsync.files.cache import Cache
+
+    told = {} if offsets is None else given_clocks(offsets)
+    untold = [] if offsets is None else [n for n in names if n not in told]
+    if untold:
+        raise ValueError(
+            f"offsets: expected offsets of all that are compared; found none of {', '.join(untold)}. Compare the "
+            "others alone, or give no offsets."
+        )
 
     progress, cache = progress or Progress(), cache or Cache()
     lpips = Lpips.load(lpips_weights)
@@ -243,8 +251,7 @@ def evaluate(
     for footage in read_footage(part, int(result.options["width"]), cache, map, progress):
         own = known.get(footage.name)
         clock, gain = (None, None) if own is None else (own.clock, own.gain)
-        if offsets is not None and (own is None or own.held_out):
-            clock = given_clocks(offsets).get(footage.name, clock)
+        clock = told.get(footage.name, clock)
         through = optics(result.optics, footage.readout) if own is None else own.optics
         looking = view(result.scene, footage, clock, gain=gain, layered=result.layered, optics=through)
         scores.append(looking.score(most=most, lpips=lpips, held_out=own is None or own.held_out))

@@ -46,9 +46,7 @@ SCENE = (
     Group("features", rows="gaussians"),
     Group("static.means", unit="footprints"),
 )
-"""Of a scene. Rates are the study's metres and colours, expressed so; other groups of static Gaussians are as they
-are.
-"""
+"""Of a scene. Rates are the study's metres and colours, expressed so; other static groups are in their own units."""
 
 CLOCKS = (Group("offsets", 0.02, "frames"), Group("clock_rates"))
 """Of the videos' clocks."""

@@ -15,6 +15,14 @@ ROOT = Path(__file__).parents[2]
 Shell = Callable[..., subprocess.CompletedProcess]
 
 
+def file_with(folder: Path, text: str, kinds: dict[str, str]) -> Path:
+    """A file in ``folder`` that registers the things of ``text``; arguments as of :func:`shell_with`."""
+    lines = {group: f'@register("{group}")' for group in kinds}
+    path = folder / "my_things.py"
+    path.write_text("from otsync.plugins import register\n" + text.format(**lines))
+    return path
+
+
 def shell_with(way: str, folder: Path, text: str, kinds: dict[str, str]) -> Shell:
     """The commands with the things of ``text`` added: ``shell("otsync", "sync", ...)``.
 
@@ -24,10 +32,7 @@ def shell_with(way: str, folder: Path, text: str, kinds: dict[str, str]) -> Shel
     """
     environment, first = dict(os.environ), []
     if way == "file":
-        lines = {group: f'@register("{group}")' for group in kinds}
-        source = "from otsync.plugins import register\n" + text.format(**lines)
-        (folder / "my_things.py").write_text(source)
-        first = ["--plugin", str(folder / "my_things.py")]
+        first = ["--plugin", str(file_with(folder, text, kinds))]
     else:
         (folder / "their_things.py").write_text(text.format(**dict.fromkeys(kinds, "")))
         metadata = folder / "theirs-1.0.dist-info"
@@ -50,3 +55,51 @@ def shell_with(way: str, folder: Path, text: str, kinds: dict[str, str]) -> Shel
         )
 
     return run
+
+
+OF_SCENES = '''
+from dataclasses import dataclass, replace
+
+from recon.losses import ImageLoss
+from recon.observe import Effect
+from recon.result import Exporter
+
+{losses}
+@dataclass(frozen=True)
+class Colourless(ImageLoss):
+    """Grey levels alone."""
+
+    weight: float = 0.5
+
+    def __call__(self, seen):
+        return (seen.rendered.mean(-1) - seen.image.mean(-1)).square().mean()
+
+
+{effects}
+@dataclass(frozen=True)
+class Dimmed(Effect):
+    """Less light than there is."""
+
+    share: float = 0.9
+    instant = True
+
+    def wrap(self, observe, params):
+        def dimmed(shot):
+            seen = observe(shot)
+            return replace(seen, rgb=seen.rgb * self.share)
+
+        return dimmed
+
+
+{exporters}
+class Counted(Exporter):
+    """The number of Gaussians."""
+
+    name, file, holds = "counted", "count.txt", "everything"
+
+    def write(self, scene, out, times, frame):
+        out.write_text(str(len(scene)))
+'''
+
+KINDS_OF_SCENES = {"losses": "Colourless", "effects": "Dimmed", "exporters": "Counted"}
+"""The class of each group in ``OF_SCENES``."""

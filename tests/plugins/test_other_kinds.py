@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from recon.scene.gaussians4d import Gaussians4D
-from tests.plugins.outside import shell_with
+from tests.plugins.outside import KINDS_OF_SCENES, OF_SCENES, shell_with
 from tests.recon.worlds import write_world
 from tests.recording_world import write_recording
 
@@ -89,52 +89,6 @@ KINDS = {
     "describers": "Nothing",
     "benchmarks": "Mine",
 }
-
-OF_SCENES = '''
-from dataclasses import dataclass, replace
-
-from recon.losses import ImageLoss
-from recon.observe import Effect
-from recon.result import Exporter
-
-{losses}
-@dataclass(frozen=True)
-class Colourless(ImageLoss):
-    """Grey levels alone."""
-
-    weight: float = 0.5
-
-    def __call__(self, seen):
-        return (seen.rendered.mean(-1) - seen.image.mean(-1)).square().mean()
-
-
-{effects}
-@dataclass(frozen=True)
-class Dimmed(Effect):
-    """Less light than there is."""
-
-    share: float = 0.9
-    instant = True
-
-    def wrap(self, observe, params):
-        def dimmed(shot):
-            seen = observe(shot)
-            return replace(seen, rgb=seen.rgb * self.share)
-
-        return dimmed
-
-
-{exporters}
-class Counted(Exporter):
-    """The number of Gaussians."""
-
-    name, file, holds = "counted", "count.txt", "everything"
-
-    def write(self, scene, out, times, frame):
-        out.write_text(str(len(scene)))
-'''
-
-KINDS_OF_SCENES = {"losses": "Colourless", "effects": "Dimmed", "exporters": "Counted"}
 
 WAYS = pytest.mark.parametrize("way", ["file", "installed"])
 

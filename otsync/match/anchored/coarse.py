@@ -31,7 +31,7 @@ may look mirrored, so that chirality alone must not decide: there the residual d
 AS_GOOD = 1.1
 """A second answer whose price is within this factor is as good as the first."""
 
-NEAR = 0.3
+SAME_PLACE = 0.3
 """Two partners of a track mean the same place when they are less than this apart (unit: the common median)."""
 
 KEPT = 0.4
@@ -172,8 +172,8 @@ class Start:
         votes = np.zeros(self.problem.M.shape)
         np.add.at(votes, (self.label_a[found.i], self.label_b[found.j]), 1.0)
         placed = votes / np.maximum(votes.sum(1, keepdims=True), 1.0)
-        # how near an anchor of b is to where this anchor's cells went: 1 there, 0 from NEAR on
-        near = placed @ np.maximum(1 - self.problem.Cb / NEAR, 0.0)
+        # how near an anchor of b is to where this anchor's cells went: 1 there, 0 from SAME_PLACE on
+        near = placed @ np.maximum(1 - self.problem.Cb / SAME_PLACE, 0.0)
         moved = AnchorProblem(self.problem.M + near, self.problem.Ca, self.problem.Cb, self.problem.alpha)
         return self._matched(moved.solve(options.mass, moved.features_only(options.mass)))
 
@@ -235,7 +235,7 @@ def disagreement(level: Level, group: Int[np.ndarray, " Na"], one: Solution, oth
         return 0.0
     here, there = (_group_means(level.b, group[i], j, common) for i, j in halves)
     apart = np.linalg.norm(here.columns - there.columns, axis=0) * (here.weight * there.weight)
-    return float((np.median(apart, axis=0) > NEAR * level.scale.median).mean())
+    return float((np.median(apart, axis=0) > SAME_PLACE * level.scale.median).mean())
 
 
 def _group_means(b: Cloud, group: np.ndarray, j: np.ndarray, chosen: np.ndarray) -> Cloud:

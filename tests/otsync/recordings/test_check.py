@@ -119,6 +119,26 @@ def test_one_camera_that_looks_elsewhere_is_a_warning(sound):
     assert any(f.severity == "warning" and f.video == "c2" and "others look" in f.what for f in found), text(found)
 
 
+@pytest.mark.parametrize("turned", [0.0, 0.2, 5.0])
+def test_cameras_that_look_in_parallel_are_a_warning_that_says_so(sound, turned):
+    """Side by side they are sound; where their axes meet says nothing. Turned outwards they do look away."""
+
+    def change(videos):
+        for n, video in enumerate(videos):
+            angle = np.radians(turned) * (n - 1.5)
+            c, s = np.cos(angle), np.sin(angle)
+            m = np.eye(4)
+            m[:3, :3] = [[c, 0, -s], [0, 1, 0], [s, 0, c]]
+            m[:3, 3] = m[:3, :3] @ [-n, 0, 0]
+            video["camera"]["w2c"] = m.tolist()
+
+    found = findings(sound, change)
+    if turned < 5:
+        assert [f.severity for f in found] == ["warning"] and "in parallel" in found[0].what, text(found)
+    else:
+        assert any(f.severity == "error" and "common volume" in f.what for f in found), text(found)
+
+
 def test_truncated_and_missing_files_are_counted(sound):
     folder, _ = sound
     path = folder / "c3" / "07.jpg"

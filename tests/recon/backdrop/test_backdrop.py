@@ -329,8 +329,8 @@ def test_bad_arguments(small):
     for options, message in (
         ({"rates": {"colour": 1.0}}, "rates: expected some of"),
         ({"steps": 5, "budget": 1.0}, "steps, budget: expected one"),
-        ({"steps": None, "budget": 0.0}, "budget: expected seconds above 0"),
-        ({"steps": -1}, "steps: expected 0 or more"),
+        ({"steps": None, "budget": 0.0}, "budget: expected a finite number above 0"),
+        ({"steps": -1}, "steps: expected a whole number, 0 or more"),
     ):
         with pytest.raises(ValueError, match=message):
             short(small, **options)

@@ -27,6 +27,7 @@ from recon.cli import main
 from recon.pipeline.intake import only
 from recon.result.folder import load_result
 from recon.scene.gaussians4d import Gaussians4D
+from tests.plugins.outside import KINDS_OF_SCENES, OF_SCENES, file_with
 from tests.recon.pipeline.test_pipeline import same_files
 from tests.recon.worlds import FRAMES, SIZE, capture, write_world
 
@@ -672,46 +673,11 @@ def test_ctrl_c_exits_with_130_and_says_how_to_go_on(world, tmp_path):
     assert run.returncode == 130 and b"continues from here" in told and b"Traceback" not in told
 
 
-MINE = """
-from dataclasses import dataclass
-from otsync.plugins import register
-from recon.losses import ImageLoss
-from recon.observe import Effect
-from recon.result import Exporter
-
-@register("losses")
-@dataclass(frozen=True)
-class Colourless(ImageLoss):
-    weight: float = 0.5
-    def __call__(self, seen):
-        return (seen.rendered.mean(-1) - seen.image.mean(-1)).square().mean()
-
-@register("effects")
-@dataclass(frozen=True)
-class Dimmed(Effect):
-    share: float = 0.9
-    instant = True
-    def wrap(self, observe, params):
-        from dataclasses import replace
-        def dimmed(shot):
-            seen = observe(shot)
-            return replace(seen, rgb=seen.rgb * self.share)
-        return dimmed
-
-@register("exporters")
-class Counted(Exporter):
-    name, file, holds = "counted", "count.txt", "everything"
-    def write(self, scene, out, times, frame):
-        out.write_text(str(len(scene)))
-"""
-
-
 def test_a_loss_an_effect_and_a_format_of_one_file_are_found_by_every_command(world, tmp_path):
     """In the help, in a fit, in its run.json and in the evaluation that reads it, in an export, and among bench's
     rows.
     """
-    plugin = tmp_path / "my_own_things.py"
-    plugin.write_text(MINE)
+    plugin = file_with(tmp_path, OF_SCENES, KINDS_OF_SCENES)
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OTSYNC_PLUGINS": str(plugin), "COLUMNS": "2000"}
 
     def recon(*args: str) -> str:

@@ -11,9 +11,13 @@ from scipy.ndimage import maximum_filter
 from scipy.spatial import cKDTree
 
 from otsync.clocks.shutter import at_frame_times
+from otsync.io import open_scene
 from otsync.match.candidates import Candidates
 from otsync.priors.features import LabHistogram
 from otsync.priors.working import WorkingFrames
+from otsync.types import Offsets
+from recon.bench.lifting import Lifting
+from recon.bench.lifting import run as measure_lifting
 from recon.cli import main
 from recon.features.maps import DaisyMaps, LabMaps
 from recon.features.tracks import (
@@ -215,19 +219,17 @@ def test_the_lifting_suite_writes_its_table(tmp_path, capsys):
     world = tmp_path / "world"
     write_capture(synthetic(5, cameras=3, held_out=0, frames=FRAMES, size=(96, 64), offsets=[0, 0, 0]), world)
     args = [
-        "bench",
-        str(world),
-        "--suite",
         "lifting",
+        str(world),
         "--width",
         "96",
         "--out",
         str(tmp_path),
-        "--lifting.cameras",
+        "--cameras",
         "2",
-        "--lifting.steps",
+        "--steps",
         "2",
-        "--lifting.repeats",
+        "--repeats",
         "1",
     ]
     assert main(args) == 0
@@ -239,11 +241,11 @@ def test_the_lifting_suite_writes_its_table(tmp_path, capsys):
         and {r["tracks"] for r in rows[1:]} >= {"Gaussians, DAISY lifted"}
     )
     assert all(0 <= r["all"] <= 1 for r in rows) and found["cost"]["channels"] == 64 and found["cost"]["lift_ms"] > 0
-    assert "Precision within" in capsys.readouterr().err
+    assert "Precision within" in capsys.readouterr().out
     other = tmp_path / "other"
     write_capture(synthetic(5, cameras=2, held_out=0, frames=4, size=(40, 24), offsets=[0, 0.5]), other)
-    assert main(["bench", str(other), "--suite", "lifting", "--truth", str(other / "truth.json")]) == 2
-    assert "truly synchronised" in capsys.readouterr().err
+    with pytest.raises(ValueError, match="truly synchronised"):
+        measure_lifting(open_scene(other), Offsets.load(other / "truth.json"), tmp_path, lifting=Lifting())
 
 
 def test_tracks_of_a_rolling_shutter_are_at_the_frames_times_and_say_so(capture, scene):
