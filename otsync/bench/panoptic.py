@@ -21,7 +21,6 @@ from typing import Any
 
 import numpy as np
 
-from ..align.warping import DTW
 from ..compute.threads import MapLike
 from ..costs.linear import Cosine
 from ..costs.positions import CurveDistance, MedianPosition
@@ -33,20 +32,24 @@ from ..io.scene import Scene
 from ..match.anchored import AnchoredFGW
 from ..match.candidates import Candidates
 from ..match.dense import FusedGromovWasserstein, OptimalTransport, PartialFGW
+from ..match.slot import Matcher
+from ..match.unbalanced import SemirelaxedFGW, UnbalancedFGW, UnbalancedOT
 from ..priors.points import ChainedFlow
 from ..priors.stereo import Rig
 from ..progress import counted
 from ..recordings.routes import pairs_in_pixels, pairs_in_space
 from ..recordings.stages import COLOUR, Stages
 from ..recordings.tracking import pixel_tracks
-from ..refine.unrefined import Unrefined
-from ..sync.graph import Graph
+from ..sync.method import PAPER
 from ..sync.verb import synchronize
 from ..types import Clock, Matches, Offsets, TrackSet
 from .record import table, write_rows
 
 BANDS = ((1, 10), (11, 30), (31, 50))
 SHORT = (51, 100)
+LARGEST = 150.0
+"""Frames that a missing answer counts as in means and quantiles: the recording's length."""
+
 MATCH_RADIUS = 0.15
 """m: matched tracks that are nearer to each other at the true time follow the same place."""
 
@@ -237,50 +240,60 @@ def measure(
     return _row(route, details, graph, whole, seconds / len(jobs)), details + graph + whole
 
 
+BEST = (50, 100, 200)
+"""How many of the best matches the table of matchers looks at; angles are those at the middle one."""
+
+
 def matching_table(material: Material, protocol: Protocol, map: MapLike) -> list[dict[str, Any]]:
-    """Share of matches within :data:`MATCH_RADIUS` at the true time (median over common frames), by angle."""
+    """Share of the best matches within :data:`MATCH_RADIUS` at the true time (median over common frames)."""
     V = len(material.scene.videos)
     rng = np.random.default_rng(protocol.seed + 1)
     pairs = list(itertools.combinations(range(V), 2))
     rng.shuffle(pairs)
     target = common_target([v.camera for v in material.scene.videos])
     both = (Cosine(weight=COLOUR, center=False), CurveDistance())
-
-    def best(matcher: Any, n: int | None) -> Callable[[TrackSet, TrackSet], Matches]:
-        return lambda a, b: matcher(a, b) if n is None else matcher(a, b).best(n)
-
     place = (Cosine(weight=COLOUR, center=False), MedianPosition())
-    matchers: dict[str, Callable[[TrackSet, TrackSet], Matches]] = {
-        "EMD on features, best 100": best(OptimalTransport(), 100),
-        "FGW (paper), best 100": best(FusedGromovWasserstein(), 100),
-        "EMD on features + median position, best 100": best(OptimalTransport(costs=place), 100),
-        "EMD on features + curve, best 100": best(OptimalTransport(costs=both), 100),
-        "FGW with curve (alpha 5), best 100": best(FusedGromovWasserstein(alpha=5.0, costs=both), 100),
-        "partial FGW (mass .65) with curve (alpha 5), best 100": best(PartialFGW(alpha=5.0, costs=both), 100),
-        "anchored FGW, best 100": best(AnchoredFGW(), 100),
-        "anchored FGW with curve, best 100": best(AnchoredFGW(costs=both), 100),
-        "two partners, features + curve, best 200": best(Candidates(2, 200, both), None),
-        "the same again at synchronised times": best(Candidates(2, 200, both).at(Clock()), None),
+    matchers: dict[str, Matcher] = {
+        "EMD on features": OptimalTransport(),
+        "FGW (paper)": FusedGromovWasserstein(costs=(Cosine(center=False),)),
+        "anchored FGW": AnchoredFGW(),
+        "EMD, median position": OptimalTransport(costs=place),
+        "EMD, curve": OptimalTransport(costs=both),
+        "FGW, curve (alpha 5)": FusedGromovWasserstein(alpha=5.0, costs=both),
+        "partial FGW (mass .65), curve (alpha 5)": PartialFGW(alpha=5.0, costs=both),
+        "unbalanced FGW, curve (alpha 5)": UnbalancedFGW(alpha=5.0, partners=2, costs=both),
+        "semi-relaxed FGW, curve (alpha 5)": SemirelaxedFGW(alpha=5.0, partners=2, costs=both),
+        "anchored FGW, curve": AnchoredFGW(costs=both),
+        "cheapest partners, curve": Candidates(2, None, both),
+        "unbalanced OT, curve (default)": UnbalancedOT(top=None, costs=both),
+        "the same again at synchronised times": UnbalancedOT(top=None, costs=both).at(Clock()),
     }
-    by_matcher: dict[str, list[tuple[float, float, int]]] = {name: [] for name in matchers}
 
-    def pair(item: tuple[int, int]) -> dict[str, tuple[float, float, int]]:
+    def pair(item: tuple[int, int]) -> dict[str, tuple[float, ...]]:
         a, b = (material.clip(int(v), 0, material.frames, 1, True) for v in item)
         angle = view_angle(a.camera, b.camera, target)  # type: ignore[arg-type]
-        return {name: (angle, *precision_near(a, b, matcher(a, b))) for name, matcher in matchers.items()}
+        found = {}
+        for name, matcher in matchers.items():
+            started = time.process_time()
+            matches = matcher(a, b)
+            seconds = time.process_time() - started
+            found[name] = (angle, len(matches), seconds, *(precision_near(a, b, matches.best(n))[0] for n in BEST))
+        return found
 
     chosen = pairs[: protocol.matching]
+    by_matcher: dict[str, list[tuple[float, ...]]] = {name: [] for name in matchers}
     for answer in counted(map(pair, chosen), "matchers", "pair", len(chosen)):
         for name, value in answer.items():
             by_matcher[name].append(value)
     rows = []
     for name, values in by_matcher.items():
-        angle, precision, count = np.array(values).T
+        angle, count, seconds, *precision = np.array(values).T
         row: dict[str, Any] = {"matching": name, "matches": round(float(count.mean()), 1)}
+        row |= {f"best {n}": round(float(p.mean()), 3) for n, p in zip(BEST, precision, strict=True)}
         for low, high in ((0, 55), (55, 95), (95, 120), (120, 181)):
             inside = (angle >= low) & (angle < high)
-            row[f"<{high}"] = round(float(precision[inside].mean()), 3) if inside.any() else None
-        rows.append(row | {"all": round(float(precision.mean()), 3)})
+            row[f"<{high}"] = round(float(precision[1][inside].mean()), 3) if inside.any() else None
+        rows.append(row | {"cpu_s": round(float(np.median(seconds)), 3)})
     return rows
 
 
@@ -296,14 +309,7 @@ def precision_near(a: TrackSet, b: TrackSet, matches: Matches) -> tuple[float, i
 
 def _solver(route: str, stages: Stages) -> Callable[[list[TrackSet]], Offsets]:
     if route == "paper":
-        return lambda tracks: synchronize(
-            tracks,
-            matcher=FusedGromovWasserstein(),
-            aligner=DTW(),
-            refiner=Unrefined(),
-            graph=Graph(extra=0),
-            rematch=0,
-        )
+        return lambda tracks: synchronize(tracks, method=PAPER)
     if route == "default":
         return lambda tracks: pairs_in_space(tracks, 0, stages, Cache())
     if route == "depth-free":
@@ -346,18 +352,16 @@ def _graph(
 def _row(
     route: str, details: list[dict[str, Any]], graph: list[dict[str, Any]], whole: list[dict[str, Any]], seconds: float
 ) -> dict[str, Any]:
-    """Figures of |error|; a missing answer counts as infinite in shares and is left out of means."""
+    """Figures of |error|; a missing answer counts as :data:`LARGEST`."""
 
     def errors(lines: list[dict[str, Any]], kind: str = "") -> np.ndarray:
-        return np.abs(np.array([d["error"] for d in lines if d["kind"].startswith(kind)], float))
+        return np.array([error_of(d) for d in lines if d["kind"].startswith(kind)], float)
 
     def mean(x: np.ndarray) -> float | None:
-        known = x[np.isfinite(x)]
-        return round(float(known.mean()), 4) if known.size else None
+        return round(float(x.mean()), 4) if x.size else None
 
     def at(x: np.ndarray, q: float) -> float | None:
-        known = x[np.isfinite(x)]
-        return round(float(np.quantile(known, q)), 4) if known.size else None
+        return round(float(np.quantile(x, q)), 4) if x.size else None
 
     long = errors(details, "band")
     below = errors([d for d in details if d["kind"].startswith("band") and d["angle"] < 95])
@@ -376,9 +380,16 @@ def _row(
         "graph_max": at(errors(graph), 1.0),
         "all_cameras_mean": mean(errors(whole)),
         "all_cameras_max": at(errors(whole), 1.0),
+        "missing": int(sum(d["error"] is None for d in (*details, *graph, *whole))),
+        "trusted_wrong": sum(not d["flags"] and error_of(d) > 1 for d in (*details, *graph, *whole)),
         "flagged": round(float(np.mean([bool(d["flags"]) for d in details if d["kind"].startswith("band")])), 4),
         "seconds": round(seconds, 4),
     }
+
+
+def error_of(line: dict[str, Any]) -> float:
+    """|error| of a pair, frames."""
+    return LARGEST if line["error"] is None else abs(line["error"])
 
 
 def _number(x: float) -> float | None:

@@ -5,11 +5,16 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
+from ..costs import COSTS
+from ..costs.linear import Cost
 from ..match import MATCHERS, match
+from ..plugins import named
 from ..progress import tell
+from ..sync.method import with_costs
 from ..types import TrackSet
 from .slots import slot
 from .tables import finite, print_json, refusal
@@ -30,14 +35,17 @@ class Match:
     """Seconds: takes the most accurate matcher that is predicted to fit."""
     json: bool = False
     """Print the pairs (index in a, index in b, score), flags and statistics as JSON."""
+    costs: Annotated[tuple[Cost, ...], named("costs", COSTS, "--costs")] = ()
+    """What the named matcher minimises, for example: --costs cosine:weight=3,center=False curve-distance."""
     matcher: slot("matchers", MATCHERS, optional=True) = None
     """Default: by size, fused Gromov-Wasserstein below 200 tracks and its anchored form above."""
 
     def run(self) -> int:
         a, b = TrackSet.load(self.a), TrackSet.load(self.b)
+        matcher = with_costs(self.matcher, self.costs) if self.costs else self.matcher
         if sys.stderr.isatty():  # one solve has no steps to count
             tell(f"matching {len(a)} x {len(b)} tracks ...")
-        matches = match(a, b, self.matcher, budget=self.budget, throw=False)
+        matches = match(a, b, matcher, budget=self.budget, throw=False)
         assert matches.score is not None
         if self.json:
             pairs = [[*pair, score] for pair, score in zip(matches.pairs.tolist(), matches.score.tolist(), strict=True)]

@@ -34,12 +34,14 @@ LABELS = 3.0
 
 PIXELS = Method(
     "pixels",
-    matcher=UnbalancedOT(partners=20, top=None, costs=(Cosine(center=False), EpipolarDistance())),
+    matcher=UnbalancedOT(partners=12, known=5, top=None, costs=(Cosine(center=False), EpipolarDistance())),
     aligner=EpipolarScan(),
     refiner=EpipolarRefine(),
-    rematch=0,
+    rematch=1,
 )
-"""Tracks without depth: transport on features offers every track twenty partners, the epipolar scan weighs them."""
+"""Tracks without depth: transport on features offers every track twelve partners, the epipolar scan weighs them; then
+transport on features and epipolar distances at the synchronised times, and scan and fit once more. (Basketball, 36
+pairs: mean error .059 frame, largest .155; without the second transport .069 and .232.)"""
 
 SPACE = Method(
     "space",

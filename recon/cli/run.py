@@ -10,6 +10,7 @@ from typing import Annotated
 
 import tyro
 
+from otsync.cli.method import MethodOptions
 from otsync.cli.recordings import RecordingOptions
 from recon.pipeline.plan import Plan
 
@@ -21,6 +22,8 @@ class Run:
     Example: otsync run recording/ --out result --held-out 0 --budget 300
 
     A quick look: otsync run recording/ --out look --width 160 --steps 300
+
+    The paper's method, refined from the images: otsync run recording/ --method paper
 
     Stopped at any moment, the same command continues. Look at the scene with recon render and recon export.
     """
@@ -41,6 +44,7 @@ class Run:
     """Print one JSON document instead of tables."""
     allow_outside: bool = False
     """Let the scene name files outside its folder."""
+    slots: Annotated[MethodOptions, tyro.conf.arg(name="")] = field(default_factory=MethodOptions)
     recording: RecordingOptions = field(default_factory=RecordingOptions)
 
     def run(self) -> int:
@@ -61,7 +65,7 @@ class Run:
                     f"--recording.{name}: expected without it, since the reconstruction tracks by its own; found "
                     f"{getattr(self.recording, name)}. Synchronise with otsync sync, then reconstruct with recon fit."
                 )
-        threads = self.recording.threads()
+        threads, method = self.recording.threads(), self.slots.chosen()
         scene = opened(self.scene, self.allow_outside or self.recording.allow_outside)
         if self.recording.cameras:
             scene = scene.take(
@@ -80,6 +84,7 @@ class Run:
             coarse = synchronize_scene(
                 train,
                 route=self.recording.route,
+                method=method,
                 reference=reference,
                 cache=cache,
                 map=pool.map,

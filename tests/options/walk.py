@@ -21,7 +21,7 @@ def _walk(cls: Any, prefix: str) -> Iterator[str]:
     for field in dataclasses.fields(cls):
         kind, name = _bare(hints[field.name]), prefix + field.name
         if dataclasses.is_dataclass(kind):
-            yield from _walk(kind, f"{name}.")
+            yield from _walk(kind, prefix if field.name == "slots" else f"{name}.")  # the shell shows slots as they are
             continue
         union = typing.get_origin(kind) is typing.Union or isinstance(kind, types.UnionType)
         choices = [c for c in map(_bare, typing.get_args(kind)) if dataclasses.is_dataclass(c)] if union else []
