@@ -17,6 +17,7 @@ from .align.verb import align
 from .align.warping import DTW, ConstantShift
 from .costs.linear import Cosine, Labels, track_distance
 from .match.anchored import AnchoredFGW
+from .match.candidates import Candidates
 from .match.dense import (
     EntropicFGW,
     FusedGromovWasserstein,
@@ -25,11 +26,13 @@ from .match.dense import (
     OptimalTransport,
     PartialFGW,
 )
+from .match.unbalanced import SemirelaxedFGW, UnbalancedFGW, UnbalancedOT
 from .match.verb import match, matcher_for
 from .refine.splines import SplineRefine
 from .refine.unrefined import Unrefined
 from .refine.verb import refine
 from .sync.graph import Graph
+from .sync.method import PAPER, Method
 from .sync.verb import synchronize
 from .types import Alignment, Camera, Matches, Offsets, Refused, Status, TrackSet, Video
 from .types.trust import Trust
@@ -38,9 +41,11 @@ __version__ = "0.1.0"
 
 __all__ = [
     "DTW",
+    "PAPER",
     "Alignment",
     "AnchoredFGW",
     "Camera",
+    "Candidates",
     "ConstantShift",
     "Cosine",
     "EntropicFGW",
@@ -50,15 +55,19 @@ __all__ = [
     "Labels",
     "LikelihoodScan",
     "Matches",
+    "Method",
     "NearestNeighbor",
     "Offsets",
     "OptimalTransport",
     "PartialFGW",
     "Refused",
+    "SemirelaxedFGW",
     "SplineRefine",
     "Status",
     "TrackSet",
     "Trust",
+    "UnbalancedFGW",
+    "UnbalancedOT",
     "Unrefined",
     "Video",
     "align",

@@ -34,7 +34,7 @@ class Match:
     budget: float | None = None
     """Seconds: takes the most accurate matcher that is predicted to fit."""
     json: bool = False
-    """Print the pairs (index in a, index in b, score), flags and statistics as JSON."""
+    """Print the pairs (index in a, index in b, score), flags, statistics and weights, where there are some, as JSON."""
     costs: Annotated[tuple[Cost, ...], named("costs", COSTS, "--costs")] = ()
     """What the named matcher minimises, for example: --costs cosine:weight=3,center=False curve-distance."""
     matcher: slot("matchers", MATCHERS, optional=True) = None
@@ -49,7 +49,10 @@ class Match:
         assert matches.score is not None
         if self.json:
             pairs = [[*pair, score] for pair, score in zip(matches.pairs.tolist(), matches.score.tolist(), strict=True)]
-            print_json({"pairs": pairs, "flags": [f.code for f in matches.flags], "stats": finite(matches.stats)})
+            document = {"pairs": pairs, "flags": [f.code for f in matches.flags], "stats": finite(matches.stats)}
+            if matches.weight is not None:
+                document["weights"] = matches.weight.tolist()
+            print_json(document)
         else:
             print(f"{len(matches)} matches between {len(a)} and {len(b)} tracks")
             print("  ".join(f"{name} {value:.6g}" for name, value in matches.stats.items()))

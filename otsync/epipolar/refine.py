@@ -45,6 +45,9 @@ UNKNOWN_SIGMA = 0.5
 LEAST_SIGMA = 0.03
 """Frames added to sigma in squares: what is left on clean tracks, from splines and calibration."""
 
+UNREAD = ("min_overlap", "max_lag", "weak", "ambiguous")
+"""Parameters of the scan that its likelihoods do not depend on."""
+
 TINY = 1e-9
 """Pixels added to scales of residuals, which may all be 0."""
 
@@ -60,6 +63,7 @@ class EpipolarRefine(Refiner):
 
     Args:
         windows: half windows of detrending, s: the answer's, and those whose answers tell its spread.
+        scan: whose likelihoods weigh the candidates.
         reach: largest step from the start, s; beyond it the start stays, MOVED.
     """
 
@@ -73,6 +77,12 @@ class EpipolarRefine(Refiner):
 
     def __post_init__(self) -> None:
         self.trust.check("EpipolarRefine.trust", JUDGED_BY)
+        for name in UNREAD:
+            if getattr(self.scan, name) != getattr(EpipolarScan, name):
+                raise ValueError(
+                    f"EpipolarRefine.scan.{name}: expected without it, since the fit reads only the scan's likelihoods; "
+                    f"found {getattr(self.scan, name)}. Set it on the aligner."
+                )
 
     def __call__(self, a: TrackSet, b: TrackSet, matches: Matches, alignment: Alignment) -> Alignment:
         if not np.isfinite(alignment.offset) or len(matches) == 0:

@@ -187,6 +187,8 @@ def _cost_map(
     origin = float(tracks[i].times[0] - tracks[j].times[0])
     if pair.cost is not None:
         return pair.cost, pair.path, origin
+    if tracks[i].xyz is None or tracks[j].xyz is None:  # D_geo is of positions
+        return None, None, origin
     from ..align.warping import DTW
 
     paper = DTW()(tracks[i], tracks[j], matches[key])

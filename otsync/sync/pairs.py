@@ -21,6 +21,9 @@ from .verdict import Answer
 
 log = logging.getLogger("otsync")
 
+DOUBTS = frozenset({Status.NO_MATCH, Status.AMBIGUOUS})
+"""Doubts about matches: the pair's answer carries them, so that nobody trusts it, and is there to be looked at."""
+
 
 @dataclass(frozen=True, eq=False)
 class Job:
@@ -41,10 +44,11 @@ def run(job: Job) -> Answer:
     try:
         given = job.matches if job.matches is not None else match(job.a, job.b, job.matcher, throw=False)
         matches = given.without_plan()
-        if not matches.status.ok:
+        if not matches.status.ok and not (len(matches) and set(matches.flags) <= DOUBTS):
             failed = Alignment(float("nan"), flags=matches.flags, stats=matches.stats)
             return Answer(job.pair, matches, failed, failed)
         scanned = align(job.a, job.b, matches, job.aligner, throw=False)
+        scanned = dataclasses.replace(scanned, flags=(*matches.flags, *scanned.flags))
         refined = scanned
         if np.isfinite(scanned.offset):
             refined = refine(job.a, job.b, matches, scanned, job.refiner, throw=False)

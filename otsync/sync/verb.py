@@ -15,6 +15,7 @@ from ..clocks.shutter import at_frame_times
 from ..compute.threads import MapLike
 from ..costs.epipolar import EpipolarDistance
 from ..costs.linear import Cosine
+from ..costs.positions import SynchronousDistance
 from ..match.slot import Matcher, MatcherLike
 from ..match.synchronous import SynchronousMatching
 from ..match.unbalanced import UnbalancedOT
@@ -22,7 +23,7 @@ from ..refine.slot import Rate, Refiner, RefinerLike
 from ..refine.splines import SplineRefine
 from ..types import Alignment, Clock, Matches, Offsets, TrackSet
 from .graph import Graph, Pair
-from .method import Method
+from .method import Method, with_costs
 from .pairs import Job, Refit, run, run_refit, with_rate
 from .verdict import Answer, Verdict, judge
 
@@ -129,6 +130,10 @@ def at_known_times(matcher: Matcher | None, clock: Clock, flat: bool = False) ->
     ``flat``: the tracks are pixels only, which epipolar distances compare.
     """
     told = None if matcher is None else matcher.at(clock)
+    if told is not None and flat and told.needs_xyz:
+        pixels = EpipolarDistance(clock=clock)
+        costs = tuple(pixels if isinstance(c, SynchronousDistance) else c for c in told.costs)
+        told = Matcher.of(with_costs(told, costs))
     if told is not None:
         return told
     costs = (Cosine(),) if matcher is None else matcher.costs

@@ -9,12 +9,13 @@ import contextlib
 import io
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from otsync import TrackSet
+from otsync import PAPER, TrackSet, synchronize
 from otsync.cli import main
 from otsync.cli.commands import OWN
 from otsync.plugins import short_name
@@ -33,7 +34,18 @@ REASONS = {
 }
 """Options that change nothing that can be compared, and why that is right."""
 
-COSTS = ("AnchoredFGW", "FusedGromovWasserstein", "PartialFGW", "EntropicFGW", "OptimalTransport", "NearestNeighbor")
+COSTS = (
+    "AnchoredFGW",
+    "FusedGromovWasserstein",
+    "PartialFGW",
+    "EntropicFGW",
+    "UnbalancedFGW",
+    "SemirelaxedFGW",
+    "OptimalTransport",
+    "UnbalancedOT",
+    "NearestNeighbor",
+    "Candidates",
+)
 
 
 def slot(kind: str, name: str, **values: object) -> dict[str, list[str]]:
@@ -64,6 +76,11 @@ MATCHER_OPTIONS = (
     | slot("matcher", "EntropicFGW", reg=0.09, alpha=3.0, max_iter=2, tol=1.0)
     | slot("matcher", "GromovWasserstein", max_iter=2, tol=0.5)
     | slot("matcher", "OptimalTransport", reg=0.3)
+    | slot("matcher", "UnbalancedOT", reg=0.3, marginal=1.0, partners=1, top=10)
+    | {"matcher:UnbalancedOT.weighted": ["--matcher.weighted"]}
+    | slot("matcher", "UnbalancedFGW", marginal=1.0, reg=0.05, alpha=0.5, partners=2, top=10, max_iter=1)
+    | slot("matcher", "SemirelaxedFGW", alpha=3.0, partners=2, top=10, max_iter=1, tol=0.5)
+    | slot("matcher", "Candidates", k=1, top=10)
 )
 
 SCAN, FIT = "aligner:LikelihoodScan", "refiner:SplineRefine"
@@ -97,7 +114,40 @@ REFINER_OPTIONS = slot("refiner", "SplineRefine", windows="0.3 0.2", smoothing=3
         "matches": "1e9",
     }.items()
 }
+EPIPOLAR, EPIPOLAR_FIT = "aligner:EpipolarScan", "refiner:EpipolarRefine"
+EPIPOLAR_OPTIONS = slot(
+    "aligner",
+    "EpipolarScan",
+    window=0.5,
+    motion_scale=9.0,
+    position_scale=30.0,
+    min_overlap=2.5,
+    min_seen=2.0,
+    max_lag=0.05,
+    weak=1e9,
+    ambiguous=9.0,
+) | slot("refiner", "EpipolarRefine", windows="0.3 0.2", reach=1e-6, iterations=1)
+EPIPOLAR_OPTIONS |= {
+    f"{EPIPOLAR_FIT}.scan.{name}": [f"--refiner.scan.{name.replace('_', '-')}", value]
+    for name, value in {"window": "0.5", "motion_scale": "9", "position_scale": "30", "min_seen": "4"}.items()
+}
 NOT_READ = {
+    **{f"{EPIPOLAR_FIT}.scan.{name}": "refiner" for name in ("min_overlap", "max_lag", "weak", "ambiguous")},
+    **{
+        f"{EPIPOLAR_FIT}.trust.{name}": "refiner"
+        for name in (
+            "moved",
+            "spread",
+            "correlation",
+            "blur",
+            "overlap",
+            "matches",
+            "disagreement",
+            "alias",
+            "motion",
+            "rate_gain",
+        )
+    },
     **{f"{SCAN}.trust.{name}": "aligner" for name in ("moved", "spread", "correlation", "blur", "rate_sigmas")},
     **{f"{FIT}.trust.{name}": "refiner" for name in ("disagreement", "alias", "motion", "rate_gain")},
 }
@@ -163,6 +213,17 @@ def films(tmp_path_factory) -> list[str]:
 
 
 @pytest.fixture(scope="module")
+def flat(tmp_path_factory) -> list[str]:
+    """Two videos of 100 frames in pixels alone, as files."""
+    folder = tmp_path_factory.mktemp("flat")
+    tracks, _ = simulate("softball", preset="clean", videos=2, frames=100, seed=4, max_offset=10)
+    for t in tracks:
+        film = replace(t, xyz=None, sigma=None, visible=t.seen).take(np.arange(0, len(t), 3))
+        film.save(folder / f"{t.name}.npz")
+    return [str(p) for p in sorted(folder.glob("*.npz"))]
+
+
+@pytest.fixture(scope="module")
 def recording(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("recording")
     write_recording(folder, [0.0, 3.0, -2.0], frames=45)
@@ -200,7 +261,38 @@ def test_restarts_of_the_anchored_matcher(tmp_path):
 def test_algorithms_in_the_slot_of_matchers_differ(pair):
     names = sorted({matching(option)[0] for option in MATCHER_OPTIONS} | {"matcher:nearest-neighbor"})
     answers = [answer(["match", *pair, "--json", name]) for name in names]
-    assert len(set(answers)) == len(names) == 7
+    assert len(set(answers)) == len(names) == 11
+
+
+def test_costs_for_the_named_matcher(pair, films, tmp_path):
+    base = ["match", *pair, "--json"]
+    first = answer([*base, "matcher:optimal-transport"])
+    assert first != answer([*base, "--costs", "cosine:center=False", "matcher:optimal-transport"])
+    sync = ["sync", *films[:2], "--json", "--out", str(tmp_path)]
+    assert answer([*sync, "matcher:candidates"]) != answer([*sync, "--costs", "curve-distance", "matcher:candidates"])
+    for refused in ([*base, "--costs", "cosine"], [*sync, "--costs", "cosine"]):
+        code, _, err = run(refused)
+        assert code == 2 and "costs" in err
+    code, _, err = run([*base, "--costs", "nothing", "matcher:optimal-transport"])
+    assert code == 2 and "--costs" in err
+
+
+def test_partners_once_the_clocks_are_known(films, tmp_path):
+    base = ["sync", *films[:2], "--json", "--out", str(tmp_path), "matcher:unbalanced-ot"]
+    assert answer(base) != answer([*base, "--matcher.known", "9"])
+
+
+def test_a_method_by_name(films, tmp_path):
+    base = ["sync", *films[1:4], "--json", "--out", str(tmp_path)]
+    paper = answer([*base, "--method", "paper"])
+    slots = ["--rematch", "0", "--graph.extra", "0", "--costs", "cosine:center=False"]
+    algorithms = ["matcher:fused-gromov-wasserstein", "aligner:dtw", "refiner:unrefined"]
+    assert paper == answer([*base, *slots, *algorithms]) != answer(base)
+    tracks = [TrackSet.load(f) for f in films[1:4]]
+    python = synchronize(tracks, method=PAPER)
+    assert [v["offset_seconds"] for v in json.loads(paper)["videos"]] == python.seconds.tolist()
+    assert paper != answer([*base, "--method", "paper", "aligner:likelihood-scan"])
+    assert paper != answer([*base, "--method", "paper", "--graph.extra", "4"])
 
 
 @pytest.mark.parametrize("name", COSTS)
@@ -231,6 +323,16 @@ def test_options_of_aligners_change_the_offsets(option, films, tmp_path):
     assert answer([*base, *end]) != answer([*base, *ALIGNER_OPTIONS[option], *end])
 
 
+@pytest.mark.parametrize("option", sorted(EPIPOLAR_OPTIONS))
+def test_options_of_what_reads_pixels_change_the_offsets(option, flat, tmp_path):
+    base = ["sync", *flat, "--json", "--rematch", "0", "--out", str(tmp_path)]
+    slots = {"aligner": ["aligner:epipolar-scan"], "refiner": ["refiner:epipolar-refine"]}
+    matcher = ["matcher:candidates", "--matcher.k", "8", "--matcher.top", "None"]
+    first = answer([*base, *matcher, *slots["aligner"], *slots["refiner"]])
+    slots[option.partition(":")[0]] += EPIPOLAR_OPTIONS[option]
+    assert first != answer([*base, *matcher, *slots["aligner"], *slots["refiner"]])
+
+
 @pytest.mark.parametrize("option", sorted(REFINER_OPTIONS))
 def test_options_of_refiners_change_the_offsets(option, films, tmp_path):
     base = ["sync", *films[:2], "--json", "--rematch", "0", "--out", str(tmp_path), *matching(option)]
@@ -239,7 +341,7 @@ def test_options_of_refiners_change_the_offsets(option, films, tmp_path):
 
 @pytest.mark.parametrize(
     "option",
-    [["--refiner.trust.evidence", "1e9"], ["--refiner.trust.margin", "1e9"], ["--graph.no-curves"]],
+    [["--refiner.trust.evidence", "1e9"], ["--refiner.trust.margin", "1e9"], ["--graph.curves", "False"]],
 )
 def test_what_decides_where_some_pairs_do_not_vouch_for_themselves(option, films, tmp_path):
     """The pairs of a short video say less; then the summed curves tell, by the refiner's limits."""
@@ -273,7 +375,8 @@ def test_rates_of_long_clips(tmp_path):
 
 @pytest.mark.parametrize("option", sorted(NOT_READ))
 def test_limits_that_nobody_reads_are_refused(option, films, tmp_path):
-    flag = f"--{NOT_READ[option]}.trust.{option.rpartition('.')[2].replace('_', '-')}"
+    part = option.split(".")[1]
+    flag = f"--{NOT_READ[option]}.{part}.{option.rpartition('.')[2].replace('_', '-')}"
     code, _, err = run(["sync", *films[:2], "--out", str(tmp_path / "o"), *matching(option), flag, "0.777"])
     assert code == 2 and option.rpartition(".")[2] in err and not (tmp_path / "o").exists()
 
@@ -284,7 +387,10 @@ def test_the_graph(films, tmp_path):
     assert answer(base) != answer([*base, "--graph.extra", "0"])
     assert answer([*base, "--graph.extra", "1"]) != answer(ring)
     assert answer(ring) != answer([*ring, "--graph.seed", "4"])
-    for options in (["--graph.extra", "0", "--graph.complete", "3"], ["--graph.no-curves", "--graph.starts", "9"]):
+    for options in (
+        ["--graph.extra", "0", "--graph.complete", "3"],
+        ["--graph.curves", "False", "--graph.starts", "9"],
+    ):
         code, _, err = run([*base, *options])
         assert code == 2 and "Graph." in err
 
@@ -306,22 +412,30 @@ def test_the_other_options_of_sync(films, tmp_path):
         assert code == 2 and "--recording" in err and "track sets" in err
 
 
-@pytest.mark.parametrize(
-    "option",
-    [
+def test_slots_on_a_recording(recording, tmp_path):
+    """Without depth: what reads pixels changes the answer, what reads positions is refused with the route's name."""
+    base = ["sync", str(recording), "--json", "--out", str(tmp_path / "o"), "--recording.route", "epipolar"]
+    first = answer(base)
+    for options in (
         ["matcher:nearest-neighbor"],
-        ["aligner:dtw"],
-        ["refiner:unrefined"],
+        ["aligner:epipolar-scan", "--aligner.window", "0.5"],
+        ["refiner:epipolar-refine", "--refiner.iterations", "1"],
         ["--graph.extra", "0"],
         ["--rematch", "0"],
-        ["--rate", "fit"],
-        ["--workers", "2"],
-    ],
-)
-def test_what_the_route_of_a_recording_decides_is_refused(option, recording, tmp_path):
-    code, _, err = run(["sync", str(recording), "--out", str(tmp_path / "o"), *option])
-    name = option[0].lstrip("-").partition(":")[0].partition(".")[0]
-    assert code == 2 and f"--{name}" in err and "recording" in err and not (tmp_path / "o").exists()
+        ["--reference", "auto"],
+        ["--costs", "cosine:center=True", "matcher:unbalanced-ot"],
+    ):
+        assert first != answer([*base, *options]), options
+    for options, word in (
+        (["aligner:dtw"], "aligner, route"),
+        (["matcher:partial-fgw"], "matcher, route"),
+        (["refiner:spline-refine"], "refiner, route"),
+        (["--method", "paper"], "matcher, route"),
+        (["--rate", "fit"], "rate"),
+        (["--workers", "2"], "--workers"),
+    ):
+        code, _, err = run([*base[:4], str(tmp_path / "new"), *base[5:], *options])
+        assert code == 2 and word in err, (options, err)
 
 
 def test_options_of_recordings(recording, tmp_path):
@@ -450,13 +564,15 @@ def rows() -> set[str]:
     algorithms = {f"match {option}" for option in MATCHER_OPTIONS} | {f"match matcher:{n}.costs" for n in COSTS}
     algorithms |= {f"match {option.partition('.')[0]}" for option in MATCHER_OPTIONS}
     algorithms |= {"match matcher:NearestNeighbor", "match matcher:AnchoredFGW.restarts"}
+    algorithms |= {"match matcher:UnbalancedOT.known"}  # read by synchronize alone
     algorithms |= {name for name in REASONS if name.startswith("match")}
-    pairs = {f"sync {o}" for o in (*ALIGNER_OPTIONS, *REFINER_OPTIONS, *NOT_READ)}
-    pairs |= {f"sync {o.partition('.')[0]}" for o in (*ALIGNER_OPTIONS, *REFINER_OPTIONS)}
+    slots = (*ALIGNER_OPTIONS, *REFINER_OPTIONS, *EPIPOLAR_OPTIONS)
+    pairs = {f"sync {o}" for o in (*slots, *NOT_READ)} | {f"sync {o.partition('.')[0]}" for o in slots}
+    pairs |= {f"sync {EPIPOLAR_FIT}.trust.{n}" for n in ("evidence", "margin", "rate_sigmas")}
     pairs |= {f"sync {FIT}.trust.{n}" for n in ("evidence", "margin", "rate_sigmas")} | {f"sync {FIT}.rate"}
     others = {
-        "match": "a b out budget json",
-        "sync": "tracks out reference truth rate rematch workers json refiner:Unrefined graph.extra graph.complete "
+        "match": "a b out budget json costs",
+        "sync": "tracks out reference truth method rate rematch costs workers json refiner:Unrefined graph.extra graph.complete "
         "graph.curves graph.starts graph.seed recording.route recording.cameras recording.cache "
         "recording.allow_outside recording.workers recording.masks recording.points recording.features",
         "demo": "out motion preset videos seed",

@@ -24,6 +24,9 @@ import pytest
 
 import otsync.cli
 import recon.cli
+from otsync import DTW, PAPER, Graph, Method, UnbalancedOT, Unrefined
+from otsync.cli.commands import OWN as SYNC
+from otsync.costs import CurveDistance
 from otsync.files.arrays import read_npz
 from otsync.files.cache import Cache
 from otsync.files.digest import content_key
@@ -455,7 +458,7 @@ def arriving(world, monkeypatch) -> Callable[..., dict[str, Any]]:
 
     def synchronised(scene, **options):
         seen["sync"] = [(v.name, len(v.frames)) for v in scene.videos], options["route"], options["reference"]
-        seen["cache"] = options["cache"]
+        seen["cache"], seen["method"] = options["cache"], options["method"]
         return SimpleNamespace(offsets=only(start, scene.names), route="tracks", why=(), seconds={})
 
     def reconstructed(scene, offsets, out, **options):
@@ -504,6 +507,7 @@ def test_the_other_options_of_a_run(arriving, world, outside, home):
         return arriving(otsync.cli.main, running(scene, home / "r", *more))
 
     base = asked()
+    assert base["method"] == Method()
     assert base["sync"] == ([(f"cam{c}", FRAMES) for c in range(3)], "auto", 0)
     assert base["fit"]["held_out"] == ("held0",) and base["fit"]["truth"] is None
     assert asked("--reference", "cam1")["sync"][2] == 1
@@ -818,6 +822,30 @@ def test_quiet_tells_nothing_but_results(result, home, monkeypatch):
         run(recon.cli.main, ["--version"])
 
 
+def test_slots_of_a_run_are_those_of_sync(arriving, world, home):
+    """The same options make the same method; that each has an effect is tested with ``otsync sync``."""
+    own, sync = ({o for o in options_of(place) if slotted(o)} for place in (COMMANDS["run"], SYNC["sync"]))
+    assert own == sync
+
+    def asked(*more: str) -> Method:
+        return arriving(otsync.cli.main, running(world, home / "r", *more))["method"]
+
+    assert asked("--method", "paper") == PAPER
+    assert asked("--rate", "fit", "--rematch", "2", "--graph.extra", "0") == Method(
+        rate="fit", rematch=2, graph=Graph(extra=0)
+    )
+    named = asked("--costs", "curve-distance", "matcher:unbalanced-ot", "aligner:dtw", "refiner:unrefined")
+    assert named == Method(matcher=UnbalancedOT(costs=(CurveDistance(),)), aligner=DTW(), refiner=Unrefined())
+
+
+SLOTS = {"method", "rate", "rematch", "costs", "graph", "matcher", "aligner", "refiner"}
+
+
+def slotted(option: str) -> bool:
+    """Whether an option is one of the method's slots, which ``otsync run`` and ``otsync sync`` share."""
+    return option.partition(".")[0].partition(":")[0] in SLOTS
+
+
 def rows() -> set[str]:
     """Every option that a test above exercises, refuses, or gives a reason for."""
     plan = {*PLAN, *OF_A_FIT}
@@ -834,9 +862,12 @@ def rows() -> set[str]:
         "export": "result format at fps out",
         "simulate": "out cameras held_out frames width height max_offset gain noise exposure readout sheen seed",
     }
-    shared = {f"{command} plan.{o}" for command in ("fit", "run") for o in plan} | {
-        f"bench protocol.plan.{o}" for o in plan
-    }
+    slots = {f"run {o}" for o in options_of(SYNC["sync"]) if slotted(o)}
+    shared = (
+        slots
+        | {f"{command} plan.{o}" for command in ("fit", "run") for o in plan}
+        | {f"bench protocol.plan.{o}" for o in plan}
+    )
     return shared | set(REASONS) | {f"{command} {o}" for command, names in others.items() for o in names.split()}
 
 
