@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
+from jaxtyping import Float
 
 from ..types import Alignment, Offsets
 from ..types.drawing import CHOSEN, CURVE, GREY, draw_choice, draw_clock_bars, draw_score, plain
@@ -94,3 +95,47 @@ def residual_bars(labels: Sequence[str], frames: np.ndarray, trusted: Sequence[b
         ax.set_xscale("symlog", linthresh=0.5)
     ax.set_xlabel("pair minus graph, frames (grey: flagged pair)")
     return svg(figure, "graph residuals")
+
+
+def effort(
+    seconds: Mapping[str, float], known: Mapping[str, Offsets], truth: Float[np.ndarray, " V"] | None = None
+) -> str:
+    """What accuracy cost in this run: estimated error of the offsets against wall time, a point for each answer.
+
+    Args:
+        seconds: wall time of every stage, in order. known: the answer that there was after a stage; "" is before all.
+        truth: (V,) true offsets in seconds relative to the reference of each answer, where they are known.
+
+    Empty where no answer says how sure it is.
+    """
+    ends = {"": 0.0} | dict(zip(seconds, np.cumsum(list(seconds.values())).tolist(), strict=True))
+    points = [(name, ends[name], *_errors(known[name], truth)) for name in ends if name in known]
+    points = [p for p in points if p[2] > 0 and np.isfinite(p[2])]
+    if not points:
+        return ""
+    names, at, sigma, error = zip(*points, strict=True)
+    figure, ax = axes_of(7.2, 2.3)
+    ax.plot(at, sigma, "o-", color=CHOSEN, ms=4, lw=1, label="estimated: mean sigma")
+    if np.isfinite(error).any():
+        ax.plot(at, error, "x--", color=CURVE, ms=5, lw=1, label="true: mean |error|")
+    for name, x, y in zip(names, at, sigma, strict=True):
+        ax.annotate(f"{name or 'given'}, {x:.3g} s", (x, y), xytext=(4, 5), textcoords="offset points", fontsize=7)
+    total = max(ends.values()) or 1.0
+    for name, end in ends.items():
+        if name and seconds[name] > 0.03 * total:
+            ax.axvline(end, color=GREY, lw=0.5, zorder=0)
+    ax.set(xlabel="wall seconds since the start", ylabel="frames", yscale="log", xlim=(-0.02 * total, 1.15 * total))
+    ax.legend(fontsize=7, loc="upper right")
+    return svg(figure, "estimated error of the offsets against seconds")
+
+
+def _errors(offsets: Offsets, truth: np.ndarray | None) -> tuple[float, float]:
+    """Mean sigma and mean |error| of all but the reference, in its frames; nan where unknown."""
+    others = np.arange(len(offsets)) != offsets.reference
+    fps = float(offsets.fps[offsets.reference])
+
+    def mean(x: np.ndarray) -> float:
+        known = x[others & np.isfinite(x)]
+        return float(known.mean()) * fps if known.size else float("nan")
+
+    return mean(offsets.sigma), float("nan") if truth is None else mean(np.abs(offsets.seconds - truth))

@@ -11,11 +11,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .figures import effort
 from .page import write_report
 
 if TYPE_CHECKING:
     from ..io.scene import Scene
     from ..recordings.routes import Synchronized
+    from ..types import Offsets
 
 
 THUMB = 120
@@ -36,16 +38,17 @@ def write_recording_report(
         answer.tracks if answer.route != "epipolar" else None,
         truth=truth,
         title="Synchronisation of a recording",
-        extra=sections(scene, answer),
+        extra=sections(scene, answer, truth),
     )
 
 
-def sections(scene: Scene, answer: Synchronized) -> str:
-    """HTML of the route, the contact sheets and the matches."""
+def sections(scene: Scene, answer: Synchronized, truth: Sequence[float] | None = None) -> str:
+    """HTML of the route, what accuracy cost, the contact sheets and the matches."""
     seconds = ", ".join(f"{k} {v:.1f} s" for k, v in answer.seconds.items())
     parts = [
         "<h2>How it was found</h2><p>" + "<br>".join(escape(line) for line in answer.why) + "</p>",
         f"<p class=s>{escape(seconds)}</p>",
+        effort(answer.seconds, answers(answer), None if truth is None else np.asarray(truth, float)),
         "<h2>Before and after</h2><p class=s>One row a video, one column a moment. Before: frames of the same number. "
         "After: frames of the same world time. A blank has no frame then.</p>",
     ]
@@ -58,6 +61,14 @@ def sections(scene: Scene, answer: Synchronized) -> str:
         picture, text = matched
         parts.append(f"<h2>Matches</h2><p class=s>{escape(text)}</p>{inline_image(picture, 'matches on frames')}")
     return "".join(parts)
+
+
+def answers(answer: Synchronized) -> dict[str, Offsets]:
+    """The offsets that there were after a stage."""
+    if answer.route == "epipolar":
+        return {"epipolar": answer.offsets}
+    last = {"synchronise": answer.offsets}
+    return last if answer.first is None else {"epipolar": answer.first} | last
 
 
 def contact_sheet(scene: Scene, offsets: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ from html import escape
 
 import numpy as np
 
-from otsync.report.figures import CHOSEN, GREY, axes_of, svg
+from otsync.report.figures import CHOSEN, GREY, axes_of, effort, svg
 from otsync.report.frames import inline_image
 from otsync.report.page import number, status_words, write_page
 from otsync.types import Offsets
@@ -64,10 +64,19 @@ def write_reconstruction_report(
         _view_rows(views, lpips_reason),
         views_over_time(views) if any(len(v.frames) > 1 for v in views) else "",
         *_pictures(views),
+        "<h2>What accuracy cost</h2><p class=s>Estimated error of the offsets. The fit's own estimate is a lower bound.</p>",
+        effort(seconds or {}, _answers(reconstruction, coarse, seconds or {}), truth),
         "<h2>Numbers</h2>",
         _numbers(reconstruction, seconds or {}),
     ]
     write_page(path, "Reconstruction", parts)
+
+
+def _answers(reconstruction: Reconstruction, coarse: Offsets, seconds: Mapping[str, float]) -> dict[str, Offsets]:
+    """The offsets that there were after a stage: at once where the run began with them."""
+    synchronised = [stage for stage in seconds if stage.startswith("synchronise")]
+    last = synchronised[-1] if synchronised else ""
+    return {last: coarse, "fit": reconstruction.offsets}
 
 
 def _verdict(reconstruction: Reconstruction, views: Sequence[ViewScore]) -> str:
