@@ -27,7 +27,7 @@ class MethodOptions:
     rate: Rate | None = None
     """Frame rates as declared, or fitted on long clips and kept where significant; default: as the refiner says."""
     rematch: int | None = None
-    """How often trusted pairs are matched again at the synchronised times; default: once."""
+    """How often trusted pairs are matched again at the synchronised times; default: once, on pixels never."""
     costs: Annotated[tuple[Cost, ...], named("costs", COSTS, "--costs")] = ()
     """What the named matcher minimises, for example: --costs cosine:weight=3,center=False curve-distance."""
     graph: partial(Graph) = field(default_factory=partial(Graph))

@@ -43,7 +43,6 @@ class UnbalancedOT(Matcher):
         reg: ε, and marginal: ρ, in units of an unrelated pair's cost. Both may be halved or doubled with little effect.
         partners: best partners of every track that are kept, as seen from both videos. top: pairs kept in all, best
             first; None: all of them.
-        known: partners of a track once the clocks are known (:meth:`at`); None: one more than ``partners``.
         weighted: whether the mass becomes the ``weight`` of the matches in scan and fit. It does not help there: the
             fit weighs matches by their residuals (36 pairs, mean error .049 frame without, .059 with).
         costs: what is summed, a tuple of cost objects.
@@ -55,7 +54,6 @@ class UnbalancedOT(Matcher):
     marginal: float = 0.02
     partners: int = 2
     top: int | None = 200
-    known: int | None = None
     weighted: bool = False
     costs: tuple[Cost, ...] = (Cosine(center=False),)
 
@@ -63,8 +61,6 @@ class UnbalancedOT(Matcher):
         positive("UnbalancedOT.reg", self.reg)
         positive("UnbalancedOT.marginal", self.marginal)
         check_partners("UnbalancedOT", self.partners, self.top)
-        if self.known is not None:
-            positive("UnbalancedOT.known", self.known)
 
     def at(self, clock: Clock) -> UnbalancedOT:
         """The same transport with distances at equal times in place of those that need no time.
@@ -72,8 +68,7 @@ class UnbalancedOT(Matcher):
         One partner more, since what is near at equal times is right more often: on basketball three partners leave 200
         matches and a mean error of .07 frame, mutual nearest neighbours 25-33 and .11.
         """
-        partners = self.partners + 1 if self.known is None else self.known
-        return replace(self, partners=partners, costs=at_clock(self.costs, clock))
+        return replace(self, partners=self.partners + 1, costs=at_clock(self.costs, clock))
 
     def __call__(self, a: TrackSet, b: TrackSet) -> Matches:
         M = linear_cost(self.costs, a, b)

@@ -34,14 +34,17 @@ LABELS = 3.0
 
 PIXELS = Method(
     "pixels",
-    matcher=UnbalancedOT(partners=12, known=5, top=None, costs=(Cosine(center=False), EpipolarDistance())),
+    matcher=UnbalancedOT(partners=20, top=None, costs=(Cosine(center=False), EpipolarDistance())),
     aligner=EpipolarScan(),
     refiner=EpipolarRefine(),
-    rematch=1,
+    rematch=0,
 )
-"""Tracks without depth: transport on features offers every track twelve partners, the epipolar scan weighs them; then
-transport on features and epipolar distances at the synchronised times, and scan and fit once more. (Basketball, 36
-pairs: mean error .059 frame, largest .155; without the second transport .069 and .232.)"""
+"""Tracks without depth: transport on features offers every track twenty partners, the epipolar scan weighs them.
+
+Transport once more at the synchronised times, on features and epipolar distances (``rematch=1``), is there and is not
+the default: over 216 pairs of basketball the mean error was .098 frame without it and .101 with it, at 1.4 times the
+time. Partners chosen at a time that is slightly off agree with that time.
+"""
 
 SPACE = Method(
     "space",

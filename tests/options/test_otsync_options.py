@@ -277,11 +277,6 @@ def test_costs_for_the_named_matcher(pair, films, tmp_path):
     assert code == 2 and "--costs" in err
 
 
-def test_partners_once_the_clocks_are_known(films, tmp_path):
-    base = ["sync", *films[:2], "--json", "--out", str(tmp_path), "matcher:unbalanced-ot"]
-    assert answer(base) != answer([*base, "--matcher.known", "9"])
-
-
 def test_a_method_by_name(films, tmp_path):
     base = ["sync", *films[1:4], "--json", "--out", str(tmp_path)]
     paper = answer([*base, "--method", "paper"])
@@ -421,7 +416,7 @@ def test_slots_on_a_recording(recording, tmp_path):
         ["aligner:epipolar-scan", "--aligner.window", "0.5"],
         ["refiner:epipolar-refine", "--refiner.iterations", "1"],
         ["--graph.extra", "0"],
-        ["--rematch", "0"],
+        ["--rematch", "1"],
         ["--reference", "auto"],
         ["--costs", "cosine:center=True", "matcher:unbalanced-ot"],
     ):
@@ -564,7 +559,6 @@ def rows() -> set[str]:
     algorithms = {f"match {option}" for option in MATCHER_OPTIONS} | {f"match matcher:{n}.costs" for n in COSTS}
     algorithms |= {f"match {option.partition('.')[0]}" for option in MATCHER_OPTIONS}
     algorithms |= {"match matcher:NearestNeighbor", "match matcher:AnchoredFGW.restarts"}
-    algorithms |= {"match matcher:UnbalancedOT.known"}  # read by synchronize alone
     algorithms |= {name for name in REASONS if name.startswith("match")}
     slots = (*ALIGNER_OPTIONS, *REFINER_OPTIONS, *EPIPOLAR_OPTIONS)
     pairs = {f"sync {o}" for o in (*slots, *NOT_READ)} | {f"sync {o.partition('.')[0]}" for o in slots}

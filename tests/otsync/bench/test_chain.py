@@ -1,0 +1,63 @@
+"""The benchmark of chains: every row is what its name says, missing answers count, the front is a front."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from otsync import PAPER, synchronize
+from otsync.bench import chain
+from otsync.bench.chain_worlds import SITUATIONS, world
+
+
+def test_rows_on_two_situations(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(chain, "SITUATIONS", {name: SITUATIONS[name] for name in ("mid", "no depth")})
+    monkeypatch.setattr(chain, "warm", lambda: None)
+    assert chain.run(tmp_path, seeds=1, first_seed=31, only=("EMD",)) == 0
+    answers = json.loads((tmp_path / "chain_answers.json").read_text())["rows"]
+    assert {(r["situation"], r["matcher"]) for r in answers} == {("mid", "EMD"), ("mid", "paper"), ("no depth", "EMD")}
+    assert len(answers) == 3 * 2 + 1 + 2 * 2
+    case = world(31, preset="mid")
+    paper = next(r for r in answers if r["matcher"] == "paper")
+    offsets = synchronize([case.a, case.b], method=PAPER)
+    assert paper["error"] == abs(offsets.seconds[1] - case.offset) * case.fps
+    assert (tmp_path / "chain.svg").read_text().startswith("<?xml") and "mid: errors" in capsys.readouterr().out
+
+
+def test_missing_answers_count_as_the_largest_error_and_the_front_is_a_front():
+    def row(matcher: str, error: float, seconds: float, missing: bool = False) -> dict:
+        return {
+            "situation": "s",
+            "matcher": matcher,
+            "way": "scan",
+            "rematch": 0,
+            "error": error,
+            "missing": missing,
+            "trusted": not missing,
+            "cpu_s": seconds,
+        }
+
+    rows = [row("good", 0.1, 1.0), row("good", 150.0, 1.0, True), row("fast", 80.0, 0.1), row("worse", 90.0, 2.0)]
+    summary = {r["matcher"]: r for r in chain.summarise(rows)}
+    assert summary["good"]["mean"] == pytest.approx(75.05) and summary["good"]["missing"] == 1
+    assert summary["good"]["trusted_wrong"] == 0 and summary["worse"]["trusted_wrong"] == 1
+    assert [m for m, r in summary.items() if r["front"]] == ["good", "fast"]
+
+
+def test_situations_are_what_they_say():
+    few, far = SITUATIONS["few tracks"](3), SITUATIONS["wide baseline"](3)
+    assert len(few.a) == 24 < len(far.a)
+    centres = [np.linalg.inv(t.camera.w2c)[:2, 3] for t in (far.a, far.b)]
+    cosine = centres[0] @ centres[1] / np.prod(np.linalg.norm(centres, axis=1))
+    assert np.degrees(np.arccos(cosine)) > 100
+    mixed, plain = SITUATIONS["strangers"](3), world(3, preset="mid")
+    same = sum(any(np.array_equal(x, y, equal_nan=True) for y in plain.a.xyz) for x in mixed.a.xyz)
+    assert same == len(plain.a) - round(0.6 * len(plain.a))
+    assert SITUATIONS["no depth"](3).a.xyz is None
+
+
+def test_an_unknown_matcher_is_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"--only: expected some of .*EMD.*; found nobody"):
+        chain.run(tmp_path, only=("nobody",))
