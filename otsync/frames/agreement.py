@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..costs.linear import Cosine
-from ..match.kernels import synchronous_distances
 from ..types import Similarity
 from .clouds import Cloud, seen_and_filled
 
@@ -20,16 +19,17 @@ LEAST_MOMENTS = 6
 PLACE, MOTION, FEATURE = 0.05, 0.025, 2.0
 """What costs 1 in matching: distance of place and of motion in units of the scene, and distance of features."""
 
-NEAR, ALIKE = 0.06, 0.025
-"""Units at which two tracks are no longer near each other, and no longer move alike, for :func:`agreement`."""
+NEAR = 0.12
+"""Units at which two tracks are no longer near each other, for :meth:`Overlay.agreement`."""
 
 
 @dataclass(frozen=True, eq=False)
 class Overlay:
-    """Distances of all tracks at common moments, in units of the scene, nan where hardly seen together."""
+    """Distances of all tracks at common moments (:func:`otsync.frames.kernels.laid_over`), nan where hardly seen."""
 
     place: Float[np.ndarray, "Na Nb"]
     motion: Float[np.ndarray, "Na Nb"]
+    alike: Float[np.ndarray, "Na Nb"]
 
     def agreement(self) -> float:
         """How many tracks have a counterpart that is near and moves alike: a sum of mutually best pairs, 0 to N.
@@ -37,7 +37,7 @@ class Overlay:
         What a wrong answer cannot reach: bodies laid over other bodies are near, but do not move alike.
         """
         near = np.maximum(0.0, 1 - np.nan_to_num(self.place, nan=np.inf) / NEAR)
-        score = near * np.maximum(0.0, 1 - np.nan_to_num(self.motion, nan=np.inf) / ALIKE)
+        score = near * np.maximum(0.0, np.nan_to_num(self.alike))
         if not score.size:
             return 0.0
         best = score.argmax(1)
@@ -64,16 +64,18 @@ class Overlay:
 
 def overlay(a: Cloud, b: Cloud, offset: float, rate: float, transform: Similarity) -> Overlay:
     """Lay b over a: ``t_a = rate t_b + offset``, ``x_a = transform(x_b)``, both in units."""
+    from . import kernels
+
     first = max(a.curves.times[0], rate * b.curves.times[0] + offset)
     last = min(a.curves.times[-1], rate * b.curves.times[-1] + offset)
-    place, motion = np.full((2, len(a), len(b)), np.nan)
+    place, motion, alike = np.full((3, len(a), len(b)), np.nan)
     if last > first:
         t = np.linspace(first, last, MOMENTS)
         root = np.sqrt(transform.scale)
         xa, wa = seen_and_filled(a.curves.sample(t) / root)
         xb, wb = seen_and_filled(transform(b.curves.sample((t - offset) / rate)) / root)
-        synchronous_distances(xa, wa, xb, wb, np.inf, LEAST_MOMENTS, 0, len(a), place, motion)
-    return Overlay(place, motion)
+        kernels.laid_over(xa, wa, xb, wb, LEAST_MOMENTS, place, motion, alike)
+    return Overlay(place, motion, alike)
 
 
 def feature_distances(a: Cloud, b: Cloud) -> Float[np.ndarray, "Na Nb"] | None:

@@ -26,9 +26,6 @@ LONGEST_STEP = 2.0 / 30
 LONGEST_TURN = 0.2
 """Radians, and relative scale, by which one iteration may change the similarity."""
 
-CONVERGED = 1e-5
-"""Frames, radians and extents: smaller steps end the iteration."""
-
 SHORTEST_CORRELATION = 4 / 30
 """Seconds over which the fast part of a residual is taken as one error: a tracker's jitter is smoothed by the spline."""
 
@@ -61,31 +58,41 @@ class Joint:
 
 
 def fit_jointly(
-    a: TrackSplines, b: TrackSplines, clock: Clock, transform: Similarity, window: float, *, iterations: int = 15
+    a: TrackSplines,
+    b: TrackSplines,
+    clock: Clock,
+    transform: Similarity,
+    window: float,
+    *,
+    iterations: int = 15,
+    tolerance: float = 1e-5,
 ) -> Joint | None:
     """Minimise robustly the differences of matched curves over offset, rotation, scale and translation.
 
     Args:
         a, b: curves of the matched tracks, m-th to m-th, each in its own frame. clock, transform: where to begin; the
             rate of the clock stays. window: s, half the length of the moving mean that splits the residual.
+        tolerance: frames, radians and relative scale; smaller steps end the iteration.
 
     Returns None when no match is seen long enough in both.
     """
     state = State.of(a, b, clock, transform)
+    own = a.value(a.times), b.value(b.times)
     n = 0
     while True:
         n += 1
-        system = linearise(a, b, state, window)
+        system = linearise(a, b, own, state, window)
         if system is None:
             return None
         step = system.step()
         step[0] = np.clip(step[0], -LONGEST_STEP, LONGEST_STEP)
         step[1:5] *= min(1.0, LONGEST_TURN / max(float(np.abs(step[1:5]).max()), 1e-300))
         state = state.stepped(step)
-        small = abs(step[0]) / a.frame < CONVERGED and np.abs(step[1:5]).max() < CONVERGED
-        if n >= iterations or (small and n > 3):
+        if n >= iterations or (abs(step[0]) / a.frame < tolerance and np.abs(step[1:5]).max() < tolerance):
             break
-    final = linearise(a, b, state, window) or system
+    final = linearise(a, b, own, state, window, clusters=True)
+    if final is None:
+        return None
     covariance = final.covariance()
     return Joint(
         state.clock,
@@ -189,33 +196,45 @@ def schur(H: np.ndarray, index: list[int]) -> np.ndarray:
     return H[np.ix_(index, index)] - H[np.ix_(index, rest)] @ inner
 
 
-def linearise(a: TrackSplines, b: TrackSplines, state: State, window: float) -> System | None:
-    """Residuals, robust weights and normal equations."""
+def linearise(
+    a: TrackSplines,
+    b: TrackSplines,
+    own: tuple[np.ndarray, np.ndarray],
+    state: State,
+    window: float,
+    *,
+    clusters: bool = False,
+) -> System | None:
+    """Residuals, robust weights and normal equations.
+
+    Args:
+        own: the curves of a at a's frames, and of b at b's. clusters: whether groups of matches are told apart.
+    """
     from . import kernels_fit as kernels
 
     root, clock = np.sqrt(state.scale), state.clock
     turned = root * state.R.T
     parts = []
-    for own, forward in ((a, True), (b, False)):
-        t = own.times
+    for curves, forward in ((a, True), (b, False)):
+        t = curves.times
         there = clock.own(t) if forward else clock.world(t)
         t_a, t_b = (t, there) if forward else (there, t)
         ok = a.support(t_a) & b.support(t_b)
-        u = (a.value(t_a) - state.middle_a) / root
-        y = (b.value(t_b) - state.middle_b) @ turned
+        u = ((own[0] if forward else a.value(t_a)) - state.middle_a) / root
+        y = ((b.value(t_b) if forward else own[1]) - state.middle_b) @ turned
         # t_b = (t_a - offset) / rate at a's frames; t_a = rate t_b + offset at b's
         v = (b.velocity(t_b) @ turned) / clock.rate if forward else a.velocity(t_a) / root
-        slack = 1e-6 * own.frame
+        slack = 1e-6 * curves.frame
         lo = np.searchsorted(t, t - window - slack)
         hi = np.searchsorted(t, t + window + slack, side="right")
-        least = MIN_FRAMES / own.frame
+        least = MIN_FRAMES / curves.frame
         slow = np.zeros((*ok.shape, 9))
         u, y, v = (np.ascontiguousarray(x) for x in (u, y, v))
         kernels.split(u, y, v, ok, lo, hi, least - 1e-6, slow)
         used = ok & (ok.sum(1) >= least - 1e-6)[:, None]
         squares = np.zeros(ok.shape), np.zeros(ok.shape)
         kernels.residual_squares(u, y, slow, state.tau, used, *squares)
-        parts.append((own, t_a, u, y, v, slow, used, *squares))
+        parts.append((curves.frame, t_a, u, y, v, slow, used, *squares))
     count = sum(p[6].sum(1) for p in parts)
     seen = count > 0
     if seen.sum() < 3:
@@ -229,10 +248,10 @@ def linearise(a: TrackSplines, b: TrackSplines, state: State, window: float) -> 
     blocks = [np.maximum(np.floor((p[1] - start) / CLUSTER + 1e-9), 0).astype(np.int64) for p in parts]
     n = max(int(x.max(initial=0)) for x in blocks) + 1
     H_time, g_time = np.zeros((n, 8, 8)), np.zeros((n, 8))
-    for (own, _, u, y, v, slow, used, rr_quick, rr_slow), block in zip(parts, blocks, strict=True):
+    for (frame, _, u, y, v, slow, used, rr_quick, rr_slow), block in zip(parts, blocks, strict=True):
         # a second of samples holds some seven independent errors of motion, and one of place
-        share_quick = min(1.0, own.frame / SHORTEST_CORRELATION)
-        share_slow = min(1.0, own.frame / (2 * window))
+        share_quick = min(1.0, frame / SHORTEST_CORRELATION)
+        share_slow = min(1.0, frame / (2 * window))
         w_quick = weight[:, None] * share_quick / quick**2 / (1 + rr_quick / (ROBUST * quick) ** 2)
         w_slow = weight[:, None] * share_slow / place**2 / (1 + rr_slow / (ROBUST * place) ** 2)
         kernels.normal_equations(
@@ -240,10 +259,11 @@ def linearise(a: TrackSplines, b: TrackSplines, state: State, window: float) -> 
         )
     for H in (H_match, H_time):
         H += np.tril(H, -1).swapaxes(1, 2)
-    group = neighbours((a.mean - state.middle_a) / root + (b.mean - state.middle_b) @ turned, GROUPS)
     H_group, g_group = np.zeros((GROUPS, 8, 8)), np.zeros((GROUPS, 8))
-    np.add.at(H_group, group, H_match)
-    np.add.at(g_group, group, g_match)
+    if clusters:
+        group = neighbours((a.mean - state.middle_a) / root + (b.mean - state.middle_b) @ turned, GROUPS)
+        np.add.at(H_group, group, H_match)
+        np.add.at(g_group, group, g_match)
     power = sum(float(weight @ p[7].sum(1)) for p in parts)
     speed = sum(float(weight @ (((p[4] - p[5][..., 6:]) ** 2).sum(2) * p[6]).sum(1)) for p in parts)
     return System(

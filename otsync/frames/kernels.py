@@ -312,3 +312,37 @@ def nearness(x, seen_x, y, seen_y, lags, step, least, near, out):
                     best = d / n
             total += 1 - best / near
         out[k] = total
+
+
+@fast
+def laid_over(a, wa, b, wb, least, place, motion, alike):
+    """Distances of all tracks at common moments: a (N,S,3), b (M,S,3) 0 where unseen; wa, wb: seen.
+
+    Fills (N,M), where at least ``least`` moments are common: place, the mean distance; motion, the rms distance about
+    its mean vector; alike, 1 - Var(a - b) / (Var a + Var b): 1 the same motion, 0 and less unrelated or none.
+    """
+    S = a.shape[1]
+    for i in range(len(a)):
+        for j in range(len(b)):
+            n = 0
+            total = square = power = 0.0
+            mx = my = mz = ax = ay = az = bx = by = bz = 0.0
+            for s in range(S):
+                if wa[i, s] and wb[j, s]:
+                    p, q, r = a[i, s, 0], a[i, s, 1], a[i, s, 2]
+                    u, v, w = b[j, s, 0], b[j, s, 1], b[j, s, 2]
+                    ax, ay, az = ax + p, ay + q, az + r
+                    bx, by, bz = bx + u, by + v, bz + w
+                    power += p * p + q * q + r * r + u * u + v * v + w * w
+                    p, q, r = p - u, q - v, r - w
+                    d2 = p * p + q * q + r * r
+                    mx, my, mz = mx + p, my + q, mz + r
+                    total += np.sqrt(d2)
+                    square += d2
+                    n += 1
+            if n >= least:
+                apart = max(square / n - (mx * mx + my * my + mz * mz) / (n * n), 0.0)
+                shared = power / n - (ax * ax + ay * ay + az * az + bx * bx + by * by + bz * bz) / (n * n)
+                place[i, j] = total / n
+                motion[i, j] = np.sqrt(apart)
+                alike[i, j] = 1 - apart / shared if shared > 0 else 0.0

@@ -19,6 +19,9 @@ COARSE = 9 / 30
 LEAST = 5
 """Common samples that a match, or the distance of two, needs to count."""
 
+STRIDE = 4 / 30
+"""Seconds between shifts that are tried: the fits that follow reach a third of a second."""
+
 MIN_OVERLAP = 24 / 30
 """Seconds that two videos must share for an offset to be considered."""
 
@@ -49,9 +52,9 @@ class Shifts:
 
 
 def scan(
-    pair: CommonClock, *, draws: int, near: float, seed: int, max_lag: float | None = None, stride: int = 1
+    pair: CommonClock, *, draws: int, near: float, seed: int, max_lag: float | None = None
 ) -> Shifts:
-    """Robust similarities at every ``stride``-th shift.
+    """Robust similarities at every :data:`STRIDE`-th shift.
 
     Args:
         pair: matched tracks in units of the scene, b's in a frame of its own. draws: triples at each shift.
@@ -65,7 +68,7 @@ def scan(
         return max(1, round(seconds * pair.fps))
 
     lags = pair.lags(frames(MIN_OVERLAP), max_lag)
-    lags = lags[(lags - (lags[0] if len(lags) else 0)) % stride == 0]
+    lags = lags[:: frames(STRIDE)]
     arrays, within = [], []
     for x in (pair.a, pair.b):
         seen = np.isfinite(x[..., 0])

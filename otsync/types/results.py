@@ -16,6 +16,7 @@ from ..files.arrays import read_json, write_json
 from . import drawing
 from .camera import Video
 from .clock import Clock
+from .similarity import Similarity
 from .status import Status, gravest, in_order
 from .tracks import TrackSet
 
@@ -123,6 +124,7 @@ class Alignment:
         fps: frames per second of the common clock: ``offset * fps`` is in frames.
         flags: what there is to know about the answer, gravest first. ``status`` is the gravest, OK without any.
         stats: seconds, matches, evidence, ...
+        transform: from b's frame of reference to a's, where the videos share none (``frames="own"``); else None.
     """
 
     offset: float
@@ -135,6 +137,7 @@ class Alignment:
     fps: float = math.nan
     flags: tuple[Status, ...] = ()
     stats: Stats = field(default_factory=dict)
+    transform: Similarity | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "flags", in_order(self.flags))

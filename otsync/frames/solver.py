@@ -1,0 +1,389 @@
+"""Clock and similarity of one pair of videos from motion alone, from first matches to flags."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..align.likelihood import LikelihoodScan
+from ..clocks.common import CommonClock, common_clock, nominal_fps
+from ..match.anchored import AnchoredFGW
+from ..match.dense import PartialFGW
+from ..match.slot import Matcher, MatcherLike
+from ..match.vouch import chirality_of
+from ..refine.splines import SplineRefine
+from ..types import Alignment, Clock, Matches, Similarity, Status, TrackSet, in_order
+from ..types.checks import positive
+from .agreement import Overlay, feature_distances, overlay
+from .clouds import Cloud, clouds, comes_first, from_units, in_units, seen_and_filled
+from .fit import Joint, fit_jointly
+from .scan import APART, Shifts, scan
+
+WINDOW = 14 / 30
+"""Half window, s, of the moving means that split the residual: as of :class:`otsync.SplineRefine`."""
+
+SAME_TIME, SAME_TURN = 4 / 30, 15.0
+"""Seconds and degrees within which two answers are the same one."""
+
+QUICK_MATCHES, FINAL_MATCHES = 80, 200
+"""Matches of the fits that weigh candidates against each other, and of the final one."""
+
+QUICK_STEPS, QUICK = 5, 2e-3
+"""Steps of those first fits, and the step (frames, radians) that ends them."""
+
+FINAL_STEPS, FINAL, FINAL_ROUNDS = 12, 1e-5, 3
+
+FLIP_NEAR = 0.12
+"""Units within which a track counts as near another when the shift of a turned-over candidate is looked for."""
+
+FLIP_TRACKS, FLIP_SHIFTS, FLIP_SAMPLES = 80, 60, 10
+"""Tracks, shifts and common frames that this looks at."""
+
+POSE_INFLATION = 1.7
+"""Factor on the sigmas of rotation, scale and translation: the tracks of two cameras lie on two sides of the same
+bodies, an error that all matches share. Measured where the truth is known: without it the errors are 1.4 to 1.8 sigma
+(rms), on simulated worlds and on basketball."""
+
+
+@dataclass(frozen=True)
+class PoseTrust:
+    """Limits beyond which an answer without a common frame is flagged, besides those of :class:`otsync.types.Trust`.
+
+    Chosen on simulated seeds below 1000 and the camera pairs of basketball drawn with seeds 4 and 5;
+    ``otsync bench own-frames`` measures from seed 7000 on.
+
+    Args:
+        agreement: WEAK when fewer than this share of the smaller video's tracks, weighted by how well, have a
+            counterpart that is near and moves alike. NO_MATCH below a third of it.
+        rival: AMBIGUOUS when another answer reaches this share of the first one's agreement.
+        blur: WEAK when the residual of the motion is more than this many seconds of it.
+        rotation: LOOSE_POSE when one sigma of the rotation is more than this, degrees.
+        scale: LOOSE_POSE when one sigma of the scale is more than this share of it.
+        chirality: AMBIGUOUS when fewer of the matched quads have the same handedness in both videos.
+    """
+
+    agreement: float = 0.045
+    rival: float = 0.6
+    blur: float = 4.2 / 30
+    rotation: float = 6.0
+    scale: float = 0.08
+    chirality: float = 0.5
+
+
+@dataclass(frozen=True)
+class OwnFrames:
+    """Clock, rotation, translation and scale between two videos that share no frame of reference.
+
+    Positions say nothing across frames; the distances among a video's own tracks do, since no rigid motion changes
+    them. So: matches by Gromov-Wasserstein on these distances, fused with features -> at every shift the similarity
+    that most matches agree on, by consensus of three tracks at a time -> each candidate, and each turned over (people
+    seen from behind stand like people seen from the front), laid over the other video, matched anew in the common
+    frame, fitted, and weighed by how many tracks then lie near each other *and* move alike -> for the best, a joint fit
+    of offset, rotation, translation and scale on continuous curves -> flags.
+
+    Args:
+        matcher: of the first matches; None: :class:`AnchoredFGW` and two :class:`PartialFGW`, pooled. What reads
+            positions across videos has no meaning here.
+        best: matches taken of each. draws: triples at each shift. near: units of the scene within which they agree.
+        candidates: answers of the scan that are weighed. flips: how many of them are turned over as well.
+        limit: of more tracks only so many are read, those seen longest.
+        max_lag: largest |offset| in seconds; None: whatever leaves 0.8 s in common.
+        seed: of the draws. trust: limits behind the flags.
+    """
+
+    matcher: Matcher | None = None
+    best: int = 80
+    draws: int = 120
+    near: float = 0.1
+    candidates: int = 4
+    flips: int = 2
+    limit: int = 300
+    max_lag: float | None = None
+    seed: int = 0
+    trust: PoseTrust = field(default_factory=PoseTrust)
+
+    def __post_init__(self) -> None:
+        for name in ("best", "draws", "candidates", "limit"):
+            if int(getattr(self, name)) < 1:
+                raise ValueError(f"OwnFrames.{name}: expected a whole number >= 1; found {getattr(self, name)}.")
+        for name in ("flips", "seed"):
+            if int(getattr(self, name)) < 0:
+                raise ValueError(f"OwnFrames.{name}: expected a whole number >= 0; found {getattr(self, name)}.")
+        positive("OwnFrames.near", self.near)
+        if self.max_lag is not None:
+            positive("OwnFrames.max_lag", self.max_lag, zero=True)
+
+    def __call__(
+        self, a: TrackSet, b: TrackSet, start: tuple[Clock, Similarity] | None = None
+    ) -> tuple[Matches, Alignment]:
+        """The matches in the common frame, and the alignment with its ``transform`` from b's frame to a's.
+
+        Args:
+            start: clock and similarity to begin from instead of the search, as when the graph predicts them.
+
+        The answer is the same, inverted, when the videos are exchanged, and does not change with their frames.
+        """
+        started = time.process_time()
+        if comes_first(a, b):
+            matches, found = self._solve(a, b, start)
+        else:
+            turned = None if start is None else (_inverse_clock(start[0]), start[1].inverse())
+            matches, found = self._solve(b, a, turned)
+            matches, found = matches.swapped(), _exchanged(found)
+        spent = {"seconds": time.process_time() - started}
+        return matches, replace(found, stats=found.stats | spent)
+
+    def _solve(
+        self, a: TrackSet, b: TrackSet, start: tuple[Clock, Similarity] | None
+    ) -> tuple[Matches, Alignment]:
+        made = clouds(a, b, self.limit)
+        if made is None or min(len(made[0]), len(made[1])) < 4:
+            why = Status.NO_INFORMATION if made is None else Status.FEW_MATCHES
+            return nothing(why), Alignment(math.nan, fps=min(nominal_fps(a), nominal_fps(b)), flags=(why,))
+        pair = Pair.of(*made)
+        stats: dict[str, float] = {}
+        if start is None:
+            tops, stats = self._search(pair)
+        else:
+            tops = [(start[0].offset, in_units(start[1], *made))]
+        weighed = sorted((w for w in (pair.weigh(*t) for t in tops) if w is not None), key=lambda w: -w.agreement)
+        if not weighed:
+            fps = min(nominal_fps(a), nominal_fps(b))
+            return nothing(Status.NO_MATCH), Alignment(math.nan, fps=fps, flags=(Status.NO_MATCH,), stats=stats)
+        first = weighed[0]
+        others = [w for w in weighed[1:] if not first.same(w)]
+        rival = max((w.agreement for w in others), default=0.0) / max(first.agreement, 1e-300)
+        return self._answer(a, b, pair, first, stats | {"rival": rival})
+
+    # --- the search ---------------------------------------------------------------------------------------------
+
+    def _search(self, pair: Pair) -> tuple[list[tuple[float, Similarity]], dict[str, float]]:
+        """Candidates for offset and similarity, most promising first."""
+        proposed = self._propose(pair)
+        if len(proposed) < 4:
+            return [], {"proposed": float(len(proposed))}
+        clock = thinned(common_clock(pair.a.tracks, pair.b.tracks, Matches(proposed)))
+        shifts = scan(clock, draws=self.draws, near=self.near, seed=self.seed, max_lag=self.max_lag)
+        tops = different(shifts, clock, self.candidates)
+        turned = [flip for _, _, S in tops[: self.flips] for flip in turned_over(S, pair)]
+        flips = pair.placed(turned, self.max_lag)[: self.flips]
+        stats = {"proposed": float(len(proposed)), "consensus": tops[0][0] if tops else 0.0}
+        return [(offset, S) for _, offset, S in tops] + flips, stats
+
+    def _propose(self, pair: Pair) -> Int[np.ndarray, "M 2"]:
+        """Matches by structure and features; none of position."""
+        a, b = pair.a.tracks, pair.b.tracks
+        chosen: tuple[MatcherLike, ...] = (AnchoredFGW(restarts=2), PartialFGW(), PartialFGW(alpha=2.0))
+        if self.matcher is not None:
+            chosen = (self.matcher,)
+        found = [m(a, b).best(self.best).pairs for m in chosen]
+        return np.unique(np.concatenate(found), axis=0)
+
+    # --- the answer ---------------------------------------------------------------------------------------------
+
+    def _answer(
+        self, a: TrackSet, b: TrackSet, pair: Pair, first: Weighed, stats: dict[str, float]
+    ) -> tuple[Matches, Alignment]:
+        joint, pairs, cost = first.joint, first.pairs, first.cost
+        for _ in range(FINAL_ROUNDS):
+            laid = pair.overlay(joint)
+            pairs, cost = laid.matches(pair.features, 3, FINAL_MATCHES)
+            again = pair.fit(pairs, joint.clock, joint.transform, FINAL_STEPS, FINAL)
+            if again is None:
+                break
+            joint = again
+        agreement = pair.overlay(joint).agreement() / min(len(pair.a), len(pair.b))
+        covariance = joint.transform.covariance
+        assert covariance is not None
+        transform = from_units(joint.transform.with_covariance(POSE_INFLATION**2 * covariance), pair.a, pair.b)
+        rows = np.stack([pair.a.index[pairs[:, 0]], pair.b.index[pairs[:, 1]]], 1)
+        matches = Matches(rows, -cost, stats={"agreement": agreement})
+        common = "common"
+        here = replace(a, frame=common)
+        there = moved(b, transform, common)
+        scanned = LikelihoodScan(max_lag=self.max_lag)(here, there, matches)
+        begun = replace(scanned, offset=joint.clock.offset, sigma=math.sqrt(joint.offset_variance))
+        fine = SplineRefine()(here, there, matches, begun)
+        stats = fine.stats | stats | {
+            "agreement": agreement,
+            "joint_offset": joint.clock.offset,
+            "rotation_sigma": transform.rotation_sigma,
+            "scale_sigma": transform.scale_sigma,
+            "place": joint.place,
+            "chirality": chirality_of(a, b, rows[:, 0], rows[:, 1]),
+        }
+        flags = in_order((*fine.flags, *self._flags(stats)))
+        return matches, replace(fine, transform=transform, flags=flags, stats=stats)
+
+    def _flags(self, stats: dict[str, float]) -> tuple[Status, ...]:
+        t = self.trust
+        raised = {
+            Status.NO_MATCH: stats["agreement"] < t.agreement / 3,
+            Status.WEAK: stats["agreement"] < t.agreement or stats["blur"] > t.blur,
+            Status.AMBIGUOUS: stats["rival"] > t.rival or stats["chirality"] < t.chirality,
+            Status.LOOSE_POSE: not (stats["rotation_sigma"] < t.rotation and stats["scale_sigma"] < t.scale),
+        }
+        return tuple(flag for flag, yes in raised.items() if yes)
+
+
+@dataclass(frozen=True, eq=False)
+class Weighed:
+    """A candidate after a quick fit, and the sum of tracks that agree with it."""
+
+    joint: Joint
+    pairs: Int[np.ndarray, "M 2"]
+    cost: Float[np.ndarray, " M"]
+    agreement: float
+
+    def same(self, other: Weighed) -> bool:
+        apart = abs(self.joint.clock.offset - other.joint.clock.offset)
+        return apart <= SAME_TIME and self.joint.transform.degrees_from(other.joint.transform) <= SAME_TURN
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """Two clouds, and the distances of their features."""
+
+    a: Cloud
+    b: Cloud
+    features: Float[np.ndarray, "Na Nb"] | None
+
+    @classmethod
+    def of(cls, a: Cloud, b: Cloud) -> Pair:
+        return cls(a, b, feature_distances(a, b))
+
+    def overlay(self, joint: Joint) -> Overlay:
+        return overlay(self.a, self.b, joint.clock.offset, joint.clock.rate, joint.transform)
+
+    def fit(self, pairs: np.ndarray, clock: Clock, start: Similarity, steps: int, small: float) -> Joint | None:
+        if len(pairs) < 4:
+            return None
+        curves = self.a.curves.take(pairs[:, 0]), self.b.curves.take(pairs[:, 1])
+        try:
+            return fit_jointly(*curves, clock, start, WINDOW, iterations=steps, tolerance=small)
+        except np.linalg.LinAlgError:
+            return None
+
+    def weigh(self, offset: float, start: Similarity) -> Weighed | None:
+        """Two rounds of matching in the common frame and fitting; None where nothing is left to fit."""
+        clock, S = Clock(offset), start
+        for _ in range(2):
+            pairs, cost = overlay(self.a, self.b, clock.offset, clock.rate, S).matches(self.features, 2, QUICK_MATCHES)
+            joint = self.fit(pairs, clock, S, QUICK_STEPS, QUICK)
+            if joint is None or not 0.2 < joint.transform.scale < 5:
+                return None
+            clock, S = joint.clock, joint.transform
+        return Weighed(joint, pairs, cost, self.overlay(joint).agreement())
+
+    def placed(self, transforms: list[Similarity], max_lag: float | None) -> list[tuple[float, Similarity]]:
+        """The shift at which each similarity brings most tracks near others, best first."""
+        from . import kernels
+
+        found = []
+        few = [c.tracks.take(slice(None, None, max(1, -(-len(c) // FLIP_TRACKS)))) for c in (self.a, self.b)]
+        fps = min(nominal_fps(t) for t in few)
+        both = [TrackClock.of(t, fps) for t in few]
+        a, seen_a = seen_and_filled(both[0].x)
+        clock = CommonClock(both[0].x, both[1].x, fps, both[0].start - both[1].start)
+        lags = clock.lags(max(1, round(24 / 30 * fps)), max_lag)
+        if not len(lags):
+            return []
+        lags = lags[:: max(1, len(lags) // FLIP_SHIFTS)]
+        step = max(1, a.shape[1] // FLIP_SAMPLES)
+        for S in transforms:
+            b, seen_b = seen_and_filled(S(both[1].x))
+            score = np.zeros(len(lags))
+            kernels.nearness(a, seen_a, b, seen_b, lags, step, 2, FLIP_NEAR, score)
+            best = int(np.argmax(score))
+            found.append((float(score[best]), float(clock.seconds(lags[best])), S))
+        return [(offset, S) for _, offset, S in sorted(found, key=lambda f: -f[0])]
+
+
+@dataclass(frozen=True, eq=False)
+class TrackClock:
+    """All tracks of a video on an even clock. x (N,T,3); start: s."""
+
+    x: Float[np.ndarray, "N T 3"]
+    start: float
+
+    @classmethod
+    def of(cls, tracks: TrackSet, fps: float) -> TrackClock:
+        from ..clocks.common import on_clock
+
+        return cls(on_clock(tracks, tracks.positions(), fps), float(tracks.times[0]))
+
+
+def thinned(clock: CommonClock, longest: int = 600) -> CommonClock:
+    """Long clips at fewer frames per second: the search needs no more, and its time grows with their square."""
+    every = -(-max(clock.a.shape[1], clock.b.shape[1]) // longest)
+    return CommonClock(clock.a[:, ::every], clock.b[:, ::every], clock.fps / every, clock.origin)
+
+
+def different(shifts: Shifts, clock: CommonClock, n: int) -> list[tuple[float, float, Similarity]]:
+    """The ``n`` best answers that are not the same: (score, offset in seconds, similarity)."""
+    found: list[tuple[float, float, Similarity]] = []
+    for q in np.argsort(-shifts.scores, axis=None, kind="stable"):
+        k, h = divmod(int(q), shifts.scores.shape[1])
+        if len(found) == n or shifts.scores[k, h] <= 0:
+            break
+        S, offset = shifts.similarity(k, h), float(clock.seconds(shifts.lags[k]))
+        # the fits that follow reach a third of a second and some 25 degrees: nearer answers are one
+        turn = math.degrees(math.acos(APART))
+        if all(abs(offset - o) > 10 / 30 or S.degrees_from(s) > turn for _, o, s in found):
+            found.append((float(shifts.scores[k, h]), offset, S))
+    return found
+
+
+def turned_over(S: Similarity, pair: Pair) -> list[Similarity]:
+    """The similarity followed by half a turn about each principal axis of a's tracks, through their middle."""
+    places = pair.a.curves.mean
+    middle = pair.a.middle
+    axes = np.linalg.svd(places - middle, full_matrices=False)[2]
+    made = []
+    for axis in axes:
+        R = 2 * np.outer(axis, axis) - np.eye(3)
+        made.append(Similarity(1.0, R, middle - R @ middle).after(S))
+    return made
+
+
+def moved(tracks: TrackSet, by: Similarity, frame: str) -> TrackSet:
+    """The tracks in the frame that ``by`` leads to."""
+    xyz = by(np.where(tracks.seen[..., None], tracks.xyz, 0.0).astype(float))
+    sigma = None if tracks.sigma is None else by.scale * tracks.sigma
+    camera = None if tracks.camera is None else by.camera(tracks.camera)
+    return replace(tracks, xyz=xyz, sigma=sigma, camera=camera, frame=frame)
+
+
+def nothing(why: Status) -> Matches:
+    return Matches(np.zeros((0, 2), int), flags=(why,))
+
+
+def _inverse_clock(clock: Clock) -> Clock:
+    return Clock(-clock.offset / clock.rate, 1 / clock.rate)
+
+
+def _exchanged(found: Alignment) -> Alignment:
+    """The same answer for the exchanged pair."""
+
+    def flip(x: np.ndarray | None) -> np.ndarray | None:
+        return None if x is None else np.stack([-x[:, 0], x[:, 1]], 1)
+
+    curve = flip(found.curve)
+    stats = {k: -v if k == "joint_offset" else v for k, v in found.stats.items()}
+    hypotheses = flip(found.hypotheses)
+    assert hypotheses is not None
+    return replace(
+        found,
+        offset=-found.offset,
+        hypotheses=hypotheses,
+        curve=None if curve is None else curve[::-1].copy(),
+        transform=None if found.transform is None else found.transform.inverse(),
+        stats=stats,
+    )
+
+
+
