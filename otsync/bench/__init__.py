@@ -5,6 +5,7 @@ match.py   every matcher at every size; match_limits.py: what matching promises
 sync.py    aligners, refiners and graphs; sync_acceptance.py: what synchronisation promises
 hard_cases/  the catalogue of hard cases, and running it
 panoptic.py  the paper's protocol on a truly synchronised recording
+own_frames.py  clock and pose without a common frame, on worlds and on a truly synchronised recording
 record.py  tables on disk, machine and versions, the gate against a committed baseline
 """
 
@@ -24,6 +25,7 @@ OWN = {
     "sync": "sync",
     "hard-cases": "hard_cases.run",
     "panoptic": "panoptic",
+    "own-frames": "own_frames",
 }
 """Our own suites, and where they are."""
 

@@ -13,6 +13,7 @@ from ..match import MATCHERS
 from ..refine import REFINERS, SplineRefine
 from ..refine.slot import Rate
 from ..sync.graph import Graph
+from ..sync.own_frames import Frames
 from ..sync.verb import unique_names
 from ..types import TrackSet
 from .recordings import RecordingOptions, sync_recording
@@ -31,6 +32,8 @@ class Sync:
 
     A recording: otsync sync recording/ --out result
 
+    Videos without a common frame of reference: otsync sync world/*.npz --frames own
+
     The paper's method: otsync sync world/*.npz --rematch 0 --graph.extra 0 matcher:fused-gromov-wasserstein aligner:dtw
     refiner:unrefined
 
@@ -48,6 +51,9 @@ class Sync:
     """truth.json of a simulated world: adds errors to the table."""
     rate: Rate | None = None
     """Frame rates as declared, or fitted on long clips and kept where significant; default: as the refiner says."""
+    frames: Frames = "common"
+    """own: every video has a frame of reference and a unit of its own; rotation, translation and scale are found beside
+    the offsets. For track sets, and for recordings with depth whose cameras have no pose."""
     rematch: int = 1
     """How often trusted pairs are matched again at the synchronised times."""
     workers: int = 1
@@ -67,10 +73,23 @@ class Sync:
     def run(self) -> int:
         if len(self.tracks) == 1 and self.tracks[0].suffix != ".npz":
             refuse_unused(self, RECORDING_BRINGS, f"a recording ({self.tracks[0]}), whose route brings its own,")
+            if self.frames == "own":
+                from .own_frames import sync_own_recording
+
+                return sync_own_recording(
+                    self.tracks[0],
+                    self.out,
+                    self.recording,
+                    reference=self.reference,
+                    truth=self.truth,
+                    as_json=self.json,
+                )
             return sync_recording(
                 self.tracks[0], self.out, self.recording, reference=self.reference, truth=self.truth, as_json=self.json
             )
         refuse_unused(self, ("recording",), "synchronising track sets")
+        if self.frames == "own":
+            refuse_unused(self, ("aligner", "refiner", "rate", "rematch"), "--frames own")
         if len(self.tracks) < 2:
             raise ValueError(f"tracks: expected at least two .npz files; found {len(self.tracks)}.")
         words = [str(path) for path in self.tracks if str(path).startswith(("matcher:", "aligner:", "refiner:"))]
@@ -87,17 +106,19 @@ class Sync:
             reference = "auto" if self.reference == "auto" else names.index(self.reference)
         known = None if self.truth is None else true_offsets(self.truth, names)
         self.out.mkdir(parents=True, exist_ok=True)  # before the work, not after it
+        common = self.frames == "common"
         offsets = with_progress(
             tracks,
             "synchronising",
             self.workers,
             reference=reference,
             matcher=self.matcher,
-            aligner=self.aligner,
-            refiner=self.refiner,
-            graph=self.graph,
+            aligner=self.aligner if common else None,
+            refiner=self.refiner if common else None,
+            graph=self.graph if common or self.graph != Graph() else None,
             rematch=self.rematch,
             rate=self.rate,
+            frames=self.frames,
         )
         truth = None if known is None else known - known[offsets.component]
         return report(offsets, tracks, truth, self.out, "Synchronisation report", as_json=self.json)

@@ -172,8 +172,29 @@ def turned(p, q):
 
 
 @kernel()
-def scan_shifts(x, seen_x, y, seen_y, u, v, lags, step, coarse, least, draws, nearest, tolerance, limit, growth, apart,
-                seed, k0, k1, scores, found):
+def scan_shifts(
+    x,
+    seen_x,
+    y,
+    seen_y,
+    u,
+    v,
+    lags,
+    step,
+    coarse,
+    least,
+    draws,
+    nearest,
+    tolerance,
+    limit,
+    growth,
+    apart,
+    seed,
+    k0,
+    k1,
+    scores,
+    found,
+):
     """The best similarities at shifts k0:k1 of ``lags``, by consensus of three matched tracks at a time.
 
     x (M,Ta,3), y (M,Tb,3): matched tracks with seen_x, seen_y; u, v: their distances within each video
@@ -283,35 +304,6 @@ def sort_answers(scores, found):
             scores[j], found[j] = scores[j - 1], found[j - 1]
             scores[j - 1], found[j - 1] = s, f
             j -= 1
-
-
-@fast
-def nearness(x, seen_x, y, seen_y, lags, step, least, near, out):
-    """How many of a's tracks have one of b's nearby, at every shift: out (K,) the sum of max(0, 1 - distance / near).
-
-    x (N,Ta,3), y (M,Tb,3) in one frame; the distance is the mean over every ``step``-th common frame.
-    """
-    Ta, Tb = x.shape[1], y.shape[1]
-    for k in range(len(lags)):
-        lag = lags[k]
-        first, last = max(0, lag), min(Ta, Tb + lag)
-        total = 0.0
-        for i in range(len(x)):
-            best = near
-            for j in range(len(y)):
-                n, d = 0, 0.0
-                for t in range(first, last, step):
-                    if seen_x[i, t] and seen_y[j, t - lag]:
-                        d0, d1 = x[i, t, 0] - y[j, t - lag, 0], x[i, t, 1] - y[j, t - lag, 1]
-                        d2 = x[i, t, 2] - y[j, t - lag, 2]
-                        d += np.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
-                        n += 1
-                        if n == 2 and d > 6 * near:
-                            break
-                if n >= least and d < best * n:
-                    best = d / n
-            total += 1 - best / near
-        out[k] = total
 
 
 @fast

@@ -51,9 +51,7 @@ class Shifts:
         return Similarity(float(f[0]), f[1:10].reshape(3, 3).copy(), f[10:].copy())
 
 
-def scan(
-    pair: CommonClock, *, draws: int, near: float, seed: int, max_lag: float | None = None
-) -> Shifts:
+def scan(pair: CommonClock, *, draws: int, near: float, seed: int, max_lag: float | None = None) -> Shifts:
     """Robust similarities at every :data:`STRIDE`-th shift.
 
     Args:

@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 
 from ..align.likelihood import LikelihoodScan
 from ..clocks.common import CommonClock, common_clock, nominal_fps
+from ..costs.linear import Cosine
 from ..match.anchored import AnchoredFGW
 from ..match.dense import PartialFGW
 from ..match.slot import Matcher, MatcherLike
@@ -19,7 +20,7 @@ from ..refine.splines import SplineRefine
 from ..types import Alignment, Clock, Matches, Similarity, Status, TrackSet, in_order
 from ..types.checks import positive
 from .agreement import Overlay, feature_distances, overlay
-from .clouds import Cloud, clouds, comes_first, from_units, in_units, seen_and_filled
+from .clouds import Cloud, clouds, comes_first, from_units, in_units
 from .fit import Joint, fit_jointly
 from .scan import APART, Shifts, scan
 
@@ -37,11 +38,12 @@ QUICK_STEPS, QUICK = 5, 2e-3
 
 FINAL_STEPS, FINAL, FINAL_ROUNDS = 12, 1e-5, 3
 
-FLIP_NEAR = 0.12
-"""Units within which a track counts as near another when the shift of a turned-over candidate is looked for."""
+SHIFTS_A_TURN = 2
+"""Shifts at which candidates of one rotation are weighed: a scene turned over agrees with itself at many shifts, and
+would take all places."""
 
-FLIP_TRACKS, FLIP_SHIFTS, FLIP_SAMPLES = 80, 60, 10
-"""Tracks, shifts and common frames that this looks at."""
+RIVALS = 3
+"""Rivals that are fitted on before they count: many are the first answer on its way."""
 
 POSE_INFLATION = 1.7
 """Factor on the sigmas of rotation, scale and translation: the tracks of two cameras lie on two sides of the same
@@ -58,7 +60,8 @@ class PoseTrust:
 
     Args:
         agreement: WEAK when fewer than this share of the smaller video's tracks, weighted by how well, have a
-            counterpart that is near and moves alike. NO_MATCH below a third of it.
+            counterpart that is near and moves alike. NO_MATCH below a third of it. Right answers reach .18 to .35,
+            wrong ones .13.
         rival: AMBIGUOUS when another answer reaches this share of the first one's agreement.
         blur: WEAK when the residual of the motion is more than this many seconds of it.
         rotation: LOOSE_POSE when one sigma of the rotation is more than this, degrees.
@@ -66,7 +69,7 @@ class PoseTrust:
         chirality: AMBIGUOUS when fewer of the matched quads have the same handedness in both videos.
     """
 
-    agreement: float = 0.045
+    agreement: float = 0.14
     rival: float = 0.6
     blur: float = 4.2 / 30
     rotation: float = 6.0
@@ -80,27 +83,25 @@ class OwnFrames:
 
     Positions say nothing across frames; the distances among a video's own tracks do, since no rigid motion changes
     them. So: matches by Gromov-Wasserstein on these distances, fused with features -> at every shift the similarity
-    that most matches agree on, by consensus of three tracks at a time -> each candidate, and each turned over (people
-    seen from behind stand like people seen from the front), laid over the other video, matched anew in the common
-    frame, fitted, and weighed by how many tracks then lie near each other *and* move alike -> for the best, a joint fit
-    of offset, rotation, translation and scale on continuous curves -> flags.
+    that most matches agree on, by consensus of three tracks at a time -> each candidate laid over the other video,
+    matched anew in the common frame, fitted, and weighed by how many tracks then lie near each other *and* move alike
+    -> for the best, a joint fit of offset, rotation, translation and scale on continuous curves -> flags.
 
     Args:
-        matcher: of the first matches; None: :class:`AnchoredFGW` and two :class:`PartialFGW`, pooled. What reads
-            positions across videos has no meaning here.
+        matcher: of the first matches; None: :class:`AnchoredFGW` with features that are centred and not, and
+            :class:`PartialFGW`, pooled. What reads positions across videos has no meaning here.
         best: matches taken of each. draws: triples at each shift. near: units of the scene within which they agree.
-        candidates: answers of the scan that are weighed. flips: how many of them are turned over as well.
+        candidates: answers of the scan that are weighed.
         limit: of more tracks only so many are read, those seen longest.
         max_lag: largest |offset| in seconds; None: whatever leaves 0.8 s in common.
         seed: of the draws. trust: limits behind the flags.
     """
 
     matcher: Matcher | None = None
-    best: int = 80
-    draws: int = 120
+    best: int = 70
+    draws: int = 100
     near: float = 0.1
-    candidates: int = 4
-    flips: int = 2
+    candidates: int = 5
     limit: int = 300
     max_lag: float | None = None
     seed: int = 0
@@ -110,9 +111,8 @@ class OwnFrames:
         for name in ("best", "draws", "candidates", "limit"):
             if int(getattr(self, name)) < 1:
                 raise ValueError(f"OwnFrames.{name}: expected a whole number >= 1; found {getattr(self, name)}.")
-        for name in ("flips", "seed"):
-            if int(getattr(self, name)) < 0:
-                raise ValueError(f"OwnFrames.{name}: expected a whole number >= 0; found {getattr(self, name)}.")
+        if int(self.seed) < 0:
+            raise ValueError(f"OwnFrames.seed: expected a whole number >= 0; found {self.seed}.")
         positive("OwnFrames.near", self.near)
         if self.max_lag is not None:
             positive("OwnFrames.max_lag", self.max_lag, zero=True)
@@ -137,9 +137,7 @@ class OwnFrames:
         spent = {"seconds": time.process_time() - started}
         return matches, replace(found, stats=found.stats | spent)
 
-    def _solve(
-        self, a: TrackSet, b: TrackSet, start: tuple[Clock, Similarity] | None
-    ) -> tuple[Matches, Alignment]:
+    def _solve(self, a: TrackSet, b: TrackSet, start: tuple[Clock, Similarity] | None) -> tuple[Matches, Alignment]:
         made = clouds(a, b, self.limit)
         if made is None or min(len(made[0]), len(made[1])) < 4:
             why = Status.NO_INFORMATION if made is None else Status.FEW_MATCHES
@@ -149,19 +147,18 @@ class OwnFrames:
         if start is None:
             tops, stats = self._search(pair)
         else:
-            tops = [(start[0].offset, in_units(start[1], *made))]
-        weighed = sorted((w for w in (pair.weigh(*t) for t in tops) if w is not None), key=lambda w: -w.agreement)
+            tops = [(0.0, start[0].offset, in_units(start[1], *made))]
+        weighed = pair.weigh_all(tops)
         if not weighed:
             fps = min(nominal_fps(a), nominal_fps(b))
             return nothing(Status.NO_MATCH), Alignment(math.nan, fps=fps, flags=(Status.NO_MATCH,), stats=stats)
         first = weighed[0]
-        others = [w for w in weighed[1:] if not first.same(w)]
-        rival = max((w.agreement for w in others), default=0.0) / max(first.agreement, 1e-300)
+        rival = pair.rival(first, weighed[1:]) / max(first.agreement, 1e-300)
         return self._answer(a, b, pair, first, stats | {"rival": rival})
 
     # --- the search ---------------------------------------------------------------------------------------------
 
-    def _search(self, pair: Pair) -> tuple[list[tuple[float, Similarity]], dict[str, float]]:
+    def _search(self, pair: Pair) -> tuple[list[Candidate], dict[str, float]]:
         """Candidates for offset and similarity, most promising first."""
         proposed = self._propose(pair)
         if len(proposed) < 4:
@@ -169,15 +166,18 @@ class OwnFrames:
         clock = thinned(common_clock(pair.a.tracks, pair.b.tracks, Matches(proposed)))
         shifts = scan(clock, draws=self.draws, near=self.near, seed=self.seed, max_lag=self.max_lag)
         tops = different(shifts, clock, self.candidates)
-        turned = [flip for _, _, S in tops[: self.flips] for flip in turned_over(S, pair)]
-        flips = pair.placed(turned, self.max_lag)[: self.flips]
         stats = {"proposed": float(len(proposed)), "consensus": tops[0][0] if tops else 0.0}
-        return [(offset, S) for _, offset, S in tops] + flips, stats
+        return tops, stats
 
     def _propose(self, pair: Pair) -> Int[np.ndarray, "M 2"]:
         """Matches by structure and features; none of position."""
         a, b = pair.a.tracks, pair.b.tracks
-        chosen: tuple[MatcherLike, ...] = (AnchoredFGW(restarts=2), PartialFGW(), PartialFGW(alpha=2.0))
+        plain = (Cosine(center=False),)
+        chosen: tuple[MatcherLike, ...] = (
+            AnchoredFGW(restarts=2),
+            AnchoredFGW(restarts=2, costs=plain),
+            PartialFGW(alpha=5.0),
+        )
         if self.matcher is not None:
             chosen = (self.matcher,)
         found = [m(a, b).best(self.best).pairs for m in chosen]
@@ -189,10 +189,10 @@ class OwnFrames:
         self, a: TrackSet, b: TrackSet, pair: Pair, first: Weighed, stats: dict[str, float]
     ) -> tuple[Matches, Alignment]:
         joint, pairs, cost = first.joint, first.pairs, first.cost
-        for _ in range(FINAL_ROUNDS):
+        for last in range(FINAL_ROUNDS - 1, -1, -1):
             laid = pair.overlay(joint)
             pairs, cost = laid.matches(pair.features, 3, FINAL_MATCHES)
-            again = pair.fit(pairs, joint.clock, joint.transform, FINAL_STEPS, FINAL)
+            again = pair.fit(pairs, joint.clock, joint.transform, FINAL_STEPS, QUICK if last else FINAL)
             if again is None:
                 break
             joint = again
@@ -208,14 +208,18 @@ class OwnFrames:
         scanned = LikelihoodScan(max_lag=self.max_lag)(here, there, matches)
         begun = replace(scanned, offset=joint.clock.offset, sigma=math.sqrt(joint.offset_variance))
         fine = SplineRefine()(here, there, matches, begun)
-        stats = fine.stats | stats | {
-            "agreement": agreement,
-            "joint_offset": joint.clock.offset,
-            "rotation_sigma": transform.rotation_sigma,
-            "scale_sigma": transform.scale_sigma,
-            "place": joint.place,
-            "chirality": chirality_of(a, b, rows[:, 0], rows[:, 1]),
-        }
+        stats = (
+            fine.stats
+            | stats
+            | {
+                "agreement": agreement,
+                "joint_offset": joint.clock.offset,
+                "rotation_sigma": transform.rotation_sigma,
+                "scale_sigma": transform.scale_sigma,
+                "place": joint.place,
+                "chirality": chirality_of(a, b, rows[:, 0], rows[:, 1]),
+            }
+        )
         flags = in_order((*fine.flags, *self._flags(stats)))
         return matches, replace(fine, transform=transform, flags=flags, stats=stats)
 
@@ -268,6 +272,26 @@ class Pair:
         except np.linalg.LinAlgError:
             return None
 
+    def rival(self, first: Weighed, others: list[Weighed]) -> float:
+        """The agreement of the best answer that stays another one when it is fitted on."""
+        strongest, looked = 0.0, 0
+        for w in others:
+            if first.same(w) or w.agreement <= strongest:
+                continue
+            if looked < RIVALS:
+                looked += 1
+                again = self.weigh(w.joint.clock.offset, w.joint.transform)
+                if again is None or first.same(again):
+                    continue
+                w = again
+            strongest = max(strongest, w.agreement)
+        return strongest
+
+    def weigh_all(self, candidates: list[Candidate]) -> list[Weighed]:
+        """The candidates after a quick fit, best first."""
+        found = [self.weigh(offset, S) for _, offset, S in candidates]
+        return sorted((w for w in found if w is not None), key=lambda w: -w.agreement)
+
     def weigh(self, offset: float, start: Similarity) -> Weighed | None:
         """Two rounds of matching in the common frame and fitting; None where nothing is left to fit."""
         clock, S = Clock(offset), start
@@ -279,43 +303,6 @@ class Pair:
             clock, S = joint.clock, joint.transform
         return Weighed(joint, pairs, cost, self.overlay(joint).agreement())
 
-    def placed(self, transforms: list[Similarity], max_lag: float | None) -> list[tuple[float, Similarity]]:
-        """The shift at which each similarity brings most tracks near others, best first."""
-        from . import kernels
-
-        found = []
-        few = [c.tracks.take(slice(None, None, max(1, -(-len(c) // FLIP_TRACKS)))) for c in (self.a, self.b)]
-        fps = min(nominal_fps(t) for t in few)
-        both = [TrackClock.of(t, fps) for t in few]
-        a, seen_a = seen_and_filled(both[0].x)
-        clock = CommonClock(both[0].x, both[1].x, fps, both[0].start - both[1].start)
-        lags = clock.lags(max(1, round(24 / 30 * fps)), max_lag)
-        if not len(lags):
-            return []
-        lags = lags[:: max(1, len(lags) // FLIP_SHIFTS)]
-        step = max(1, a.shape[1] // FLIP_SAMPLES)
-        for S in transforms:
-            b, seen_b = seen_and_filled(S(both[1].x))
-            score = np.zeros(len(lags))
-            kernels.nearness(a, seen_a, b, seen_b, lags, step, 2, FLIP_NEAR, score)
-            best = int(np.argmax(score))
-            found.append((float(score[best]), float(clock.seconds(lags[best])), S))
-        return [(offset, S) for _, offset, S in sorted(found, key=lambda f: -f[0])]
-
-
-@dataclass(frozen=True, eq=False)
-class TrackClock:
-    """All tracks of a video on an even clock. x (N,T,3); start: s."""
-
-    x: Float[np.ndarray, "N T 3"]
-    start: float
-
-    @classmethod
-    def of(cls, tracks: TrackSet, fps: float) -> TrackClock:
-        from ..clocks.common import on_clock
-
-        return cls(on_clock(tracks, tracks.positions(), fps), float(tracks.times[0]))
-
 
 def thinned(clock: CommonClock, longest: int = 600) -> CommonClock:
     """Long clips at fewer frames per second: the search needs no more, and its time grows with their square."""
@@ -323,9 +310,13 @@ def thinned(clock: CommonClock, longest: int = 600) -> CommonClock:
     return CommonClock(clock.a[:, ::every], clock.b[:, ::every], clock.fps / every, clock.origin)
 
 
-def different(shifts: Shifts, clock: CommonClock, n: int) -> list[tuple[float, float, Similarity]]:
+Candidate = tuple[float, float, Similarity]
+"""How many matches agree with it, offset in seconds, similarity between the units."""
+
+
+def different(shifts: Shifts, clock: CommonClock, n: int) -> list[Candidate]:
     """The ``n`` best answers that are not the same: (score, offset in seconds, similarity)."""
-    found: list[tuple[float, float, Similarity]] = []
+    found: list[Candidate] = []
     for q in np.argsort(-shifts.scores, axis=None, kind="stable"):
         k, h = divmod(int(q), shifts.scores.shape[1])
         if len(found) == n or shifts.scores[k, h] <= 0:
@@ -333,21 +324,10 @@ def different(shifts: Shifts, clock: CommonClock, n: int) -> list[tuple[float, f
         S, offset = shifts.similarity(k, h), float(clock.seconds(shifts.lags[k]))
         # the fits that follow reach a third of a second and some 25 degrees: nearer answers are one
         turn = math.degrees(math.acos(APART))
-        if all(abs(offset - o) > 10 / 30 or S.degrees_from(s) > turn for _, o, s in found):
+        near = [abs(offset - o) for _, o, s in found if S.degrees_from(s) <= turn]
+        if len(near) < SHIFTS_A_TURN and all(late > 10 / 30 for late in near):
             found.append((float(shifts.scores[k, h]), offset, S))
     return found
-
-
-def turned_over(S: Similarity, pair: Pair) -> list[Similarity]:
-    """The similarity followed by half a turn about each principal axis of a's tracks, through their middle."""
-    places = pair.a.curves.mean
-    middle = pair.a.middle
-    axes = np.linalg.svd(places - middle, full_matrices=False)[2]
-    made = []
-    for axis in axes:
-        R = 2 * np.outer(axis, axis) - np.eye(3)
-        made.append(Similarity(1.0, R, middle - R @ middle).after(S))
-    return made
 
 
 def moved(tracks: TrackSet, by: Similarity, frame: str) -> TrackSet:
@@ -384,6 +364,3 @@ def _exchanged(found: Alignment) -> Alignment:
         transform=None if found.transform is None else found.transform.inverse(),
         stats=stats,
     )
-
-
-

@@ -28,6 +28,12 @@ SIGN = (
     "that the video started later than its reference; offset_frames = offset_seconds * fps of the reference"
 )
 
+FRAMES = (
+    "every video has a frame of reference of its own; transform: x_reference = scale * R(quaternion w, x, y, z) * x_video "
+    "+ translation, in units of the reference (of pairs: from b's frame to a's); covariance: of a small rotation vector "
+    "(3, radians), relative scale (1) and translation (3) that act after it"
+)
+
 
 @dataclass(frozen=True, eq=False)
 class Matches:
@@ -189,6 +195,8 @@ class Offsets:
             hang together; a disconnected group has a reference of its own.
         alignments: per pair (i, j) the pair's own answer. matches: what it was made from, without plans.
         flags: per video, gravest first; ``status`` has the gravest of each. stats: of the whole.
+        transforms: per video, from its own frame of reference to that of its component's reference, None where it
+            could not be found; empty where all videos share one frame.
     """
 
     names: tuple[str, ...]
@@ -202,9 +210,15 @@ class Offsets:
     alignments: Mapping[tuple[int, int], Alignment] = field(default_factory=dict)
     matches: Mapping[tuple[int, int], Matches] = field(default_factory=dict)
     stats: Stats = field(default_factory=dict)
+    transforms: tuple[Similarity | None, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "flags", tuple(in_order(flags) for flags in self.flags))
+        if self.transforms and len(self.transforms) != len(self.names):
+            raise ValueError(
+                f"Offsets.transforms: expected one for each of {len(self.names)} videos, or none; found "
+                f"{len(self.transforms)}."
+            )
 
     @classmethod
     def known(
@@ -213,6 +227,7 @@ class Offsets:
         seconds: Float[np.ndarray, " V"],
         fps: float,
         rates: Float[np.ndarray, " V"] | None = None,
+        transforms: Sequence[Similarity | None] = (),
     ) -> Offsets:
         """Offsets that are known, not estimated: sigma 0, no flags; the first video is the reference, whatever it has.
 
@@ -228,6 +243,7 @@ class Offsets:
             reference=0,
             component=np.zeros(n, int),
             flags=((),) * n,
+            transforms=tuple(transforms),
         )
 
     def __len__(self) -> int:
@@ -293,6 +309,7 @@ class Offsets:
                 "reference": self.names[self.component[v]],
                 "status": self.status[v].code,
                 "flags": [f.code for f in self.flags[v]],
+                **({"transform": _transform(self.transforms[v])} if self.transforms else {}),
             }
             for v in range(len(self))
         ]
@@ -309,6 +326,7 @@ class Offsets:
                 "flags": [f.code for f in p.flags],
                 "hypotheses": [[_number(x) for x in row] for row in p.hypotheses],
                 "stats": {k: _number(x) for k, x in p.stats.items()},
+                **({"transform": _transform(p.transform)} if self.transforms else {}),
             }
             for (i, j), p in sorted(self.alignments.items())
         ]
@@ -317,6 +335,7 @@ class Offsets:
             "version": VERSION,
             "unit": "seconds",
             "sign": SIGN,
+            **({"frames": FRAMES} if self.transforms else {}),
             "reference": self.names[self.reference],
             "videos": videos,
             "pairs": pairs,
@@ -375,6 +394,7 @@ class Offsets:
                 fps=_float(p["fps"], f"{what}: fps", above=0),
                 flags=_flags(p["flags"], p["status"], what),
                 stats={str(k): _float(x, f"{what}: stats, {k}") for k, x in p["stats"].items()},
+                transform=_transform_from(p.get("transform"), what),
             )
         reference = place(data["reference"], "reference")
         component = np.array([place(video["reference"], f"videos, {video['name']}: reference") for video in videos])
@@ -415,7 +435,24 @@ class Offsets:
             flags=tuple(_flags(video["flags"], video["status"], f"videos, {video['name']}") for video in videos),
             alignments=alignments,
             stats={str(k): _float(x, f"stats, {k}") for k, x in data["stats"].items()},
+            transforms=tuple(_transform_from(video["transform"], f"videos, {video['name']}") for video in videos)
+            if any("transform" in video for video in videos)
+            else (),
         )
+
+
+def _transform(found: Similarity | None) -> dict[str, Any] | None:
+    return None if found is None else found.to_dict()
+
+
+def _transform_from(data: Any, what: str) -> Similarity | None:
+    """A similarity of the file, None for null. ValueError begins with ``what``."""
+    if data is None:
+        return None
+    try:
+        return Similarity.from_dict(data)
+    except (ValueError, TypeError, KeyError) as error:
+        raise ValueError(f"{what}: {error}") from None
 
 
 def _number(x: Any) -> float | None:

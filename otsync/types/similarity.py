@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from .camera import Camera
 
+
 @dataclass(frozen=True, eq=False)
 class Similarity:
     """``x -> scale R x + t``: positions of one frame, in another.
@@ -89,7 +90,9 @@ class Similarity:
     @property
     def rotation_sigma(self) -> float:
         """Degrees: one standard deviation of the rotation, the root of the sum over its three axes; nan if unknown."""
-        return float("nan") if self.covariance is None else float(np.degrees(np.sqrt(np.trace(self.covariance[:3, :3]))))
+        return (
+            float("nan") if self.covariance is None else float(np.degrees(np.sqrt(np.trace(self.covariance[:3, :3]))))
+        )
 
     @property
     def scale_sigma(self) -> float:
