@@ -78,6 +78,8 @@ def run(
         cache: where tracks and depth of the recording are kept; default: stages in ``out``.
     """
     tell: Callable[[str], None] = (lambda text: None) if json else print
+    for pair in worlds(0, 1):
+        judge(pair, MID)  # compiles what is timed
     details = [judge(p, MID) for p in counted(worlds(first_seed, seeds), "simulated pairs", "pair", seeds)]
     rows = [summary("simulated, mid", details)]
     tell(table(rows))
