@@ -13,7 +13,7 @@ from ..align.likelihood import LikelihoodScan
 from ..clocks.common import CommonClock, common_clock, nominal_fps
 from ..costs.linear import Cosine
 from ..match.anchored import AnchoredFGW
-from ..match.dense import PartialFGW
+from ..match.dense import NearestNeighbor, OptimalTransport, PartialFGW
 from ..match.slot import Matcher, MatcherLike
 from ..match.vouch import chirality_of
 from ..refine.splines import SplineRefine
@@ -49,6 +49,21 @@ POSE_INFLATION = 1.7
 """Factor on the sigmas of rotation, scale and translation: the tracks of two cameras lie on two sides of the same
 bodies, an error that all matches share. Measured where the truth is known: without it the errors are 1.4 to 1.8 sigma
 (rms), on simulated worlds and on basketball."""
+
+
+PLAIN = (Cosine(center=False),)
+
+STRUCTURE: tuple[MatcherLike, ...] = (
+    AnchoredFGW(restarts=2),
+    AnchoredFGW(restarts=2, costs=PLAIN),
+    PartialFGW(alpha=5.0),
+)
+"""First matches: two views of what is alike, and of how much structure counts."""
+
+FEATURES_ALONE: tuple[MatcherLike, ...] = (OptimalTransport(), OptimalTransport(costs=PLAIN), NearestNeighbor())
+"""Matches of a second search, where the first one is doubtful. Structure can be wrong as a whole: people turned over
+stand like people. Then its wrong matches agree with each other, and outvote the right ones; those of features do not.
+"""
 
 
 @dataclass(frozen=True)
@@ -149,6 +164,10 @@ class OwnFrames:
         else:
             tops = [(0.0, start[0].offset, in_units(start[1], *made))]
         weighed = pair.weigh_all(tops)
+        if start is None and self.matcher is None and self._doubtful(weighed, pair):
+            tops, _ = self._search(pair, FEATURES_ALONE)
+            weighed = sorted([*weighed, *pair.weigh_all(tops)], key=lambda w: -w.agreement)
+            stats["second_search"] = 1.0
         if not weighed:
             fps = min(nominal_fps(a), nominal_fps(b))
             return nothing(Status.NO_MATCH), Alignment(math.nan, fps=fps, flags=(Status.NO_MATCH,), stats=stats)
@@ -158,9 +177,21 @@ class OwnFrames:
 
     # --- the search ---------------------------------------------------------------------------------------------
 
-    def _search(self, pair: Pair) -> tuple[list[Candidate], dict[str, float]]:
+    def _doubtful(self, weighed: list[Weighed], pair: Pair) -> bool:
+        """Whether the best candidate is so poor, or so nearly reached, that it pays to look elsewhere."""
+        if not weighed:
+            return True
+        first = weighed[0]
+        share = first.agreement / min(len(pair.a), len(pair.b))
+        rival = max((w.agreement for w in weighed[1:] if not first.same(w)), default=0.0)
+        poor = share < self.trust.agreement or first.joint.blur > self.trust.blur
+        return poor or rival > self.trust.rival * first.agreement
+
+    def _search(
+        self, pair: Pair, matchers: tuple[MatcherLike, ...] = STRUCTURE
+    ) -> tuple[list[Candidate], dict[str, float]]:
         """Candidates for offset and similarity, most promising first."""
-        proposed = self._propose(pair)
+        proposed = self._propose(pair, matchers)
         if len(proposed) < 4:
             return [], {"proposed": float(len(proposed))}
         clock = thinned(common_clock(pair.a.tracks, pair.b.tracks, Matches(proposed)))
@@ -169,18 +200,10 @@ class OwnFrames:
         stats = {"proposed": float(len(proposed)), "consensus": tops[0][0] if tops else 0.0}
         return tops, stats
 
-    def _propose(self, pair: Pair) -> Int[np.ndarray, "M 2"]:
-        """Matches by structure and features; none of position."""
-        a, b = pair.a.tracks, pair.b.tracks
-        plain = (Cosine(center=False),)
-        chosen: tuple[MatcherLike, ...] = (
-            AnchoredFGW(restarts=2),
-            AnchoredFGW(restarts=2, costs=plain),
-            PartialFGW(alpha=5.0),
-        )
-        if self.matcher is not None:
-            chosen = (self.matcher,)
-        found = [m(a, b).best(self.best).pairs for m in chosen]
+    def _propose(self, pair: Pair, matchers: tuple[MatcherLike, ...]) -> Int[np.ndarray, "M 2"]:
+        """Matches by structure and features, or by features alone; none of position."""
+        chosen = matchers if self.matcher is None else (self.matcher,)
+        found = [m(pair.a.tracks, pair.b.tracks).best(self.best).pairs for m in chosen]
         return np.unique(np.concatenate(found), axis=0)
 
     # --- the answer ---------------------------------------------------------------------------------------------
