@@ -37,11 +37,6 @@ class Cloud:
     def __len__(self) -> int:
         return len(self.index)
 
-    @property
-    def middle(self) -> Float[np.ndarray, " 3"]:
-        """The median of the tracks' places, units."""
-        return np.median(self.curves.mean, 0)
-
 
 def clouds(a: TrackSet, b: TrackSet, limit: int) -> tuple[Cloud, Cloud] | None:
     """Both videos' tracks, each in the unit of its scene; None where one shows no extent.

@@ -153,9 +153,10 @@ class OwnFrames:
         return matches, replace(found, stats=found.stats | spent)
 
     def _solve(self, a: TrackSet, b: TrackSet, start: tuple[Clock, Similarity] | None) -> tuple[Matches, Alignment]:
-        made = clouds(a, b, self.limit)
-        if made is None or min(len(made[0]), len(made[1])) < 4:
-            why = Status.NO_INFORMATION if made is None else Status.FEW_MATCHES
+        few = min(len(a), len(b)) < 4
+        made = None if few else clouds(a, b, self.limit)
+        if made is None:
+            why = Status.FEW_MATCHES if few else Status.NO_INFORMATION
             return nothing(why), Alignment(math.nan, fps=min(nominal_fps(a), nominal_fps(b)), flags=(why,))
         pair = Pair.of(*made)
         stats: dict[str, float] = {}

