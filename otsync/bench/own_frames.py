@@ -260,7 +260,7 @@ def camera_errors(
     found = {v: offsets.transforms[v].after(changes[v]) for v in known}  # type: ignore[union-attr]
     there = np.array([found[v](centres[v]) for v in known])
     back = _best_similarity(np.array([centres[v] for v in known]), there, [found[v].R for v in known])
-    rows = []
+    rows: list[dict[str, Any]] = []
     for v, place in zip(known, there, strict=True):
         rows.append(
             {

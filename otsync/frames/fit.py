@@ -235,7 +235,7 @@ def linearise(
         squares = np.zeros(ok.shape), np.zeros(ok.shape)
         kernels.residual_squares(u, y, slow, state.tau, used, *squares)
         parts.append((curves.frame, t_a, u, y, v, slow, used, *squares))
-    count = sum(p[6].sum(1) for p in parts)
+    count = np.sum([p[6].sum(1) for p in parts], axis=0)
     seen = count > 0
     if seen.sum() < 3:
         return None

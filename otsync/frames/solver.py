@@ -318,13 +318,14 @@ class Pair:
 
     def weigh(self, offset: float, start: Similarity) -> Weighed | None:
         """Two rounds of matching in the common frame and fitting; None where nothing is left to fit."""
-        clock, S = Clock(offset), start
+        clock, S, joint = Clock(offset), start, None
         for _ in range(2):
             pairs, cost = overlay(self.a, self.b, clock.offset, clock.rate, S).matches(self.features, 2, QUICK_MATCHES)
             joint = self.fit(pairs, clock, S, QUICK_STEPS, QUICK)
             if joint is None or not 0.2 < joint.transform.scale < 5:
                 return None
             clock, S = joint.clock, joint.transform
+        assert joint is not None
         return Weighed(joint, pairs, cost, self.overlay(joint).agreement())
 
 
@@ -356,7 +357,7 @@ def different(shifts: Shifts, clock: CommonClock, n: int) -> list[Candidate]:
 
 def moved(tracks: TrackSet, by: Similarity, frame: str) -> TrackSet:
     """The tracks in the frame that ``by`` leads to."""
-    xyz = by(np.where(tracks.seen[..., None], tracks.xyz, 0.0).astype(float))
+    xyz = by(np.nan_to_num(tracks.positions()))
     sigma = None if tracks.sigma is None else by.scale * tracks.sigma
     camera = None if tracks.camera is None else by.camera(tracks.camera)
     return replace(tracks, xyz=xyz, sigma=sigma, camera=camera, frame=frame)

@@ -83,7 +83,7 @@ def synchronize_own(
 
     def refit(tasks: list[tuple[Answer, float, float]]) -> list[Alignment]:
         jobs = [
-            OwnJob(a.pair, *(tracks[v] for v in a.pair), solver, (Clock(offset, rate), a.refined.transform))
+            OwnJob(a.pair, tracks[a.pair[0]], tracks[a.pair[1]], solver, (Clock(offset, rate), a.refined.transform))
             for a, offset, rate in tasks
             if a.refined.transform is not None
         ]
@@ -184,7 +184,7 @@ def with_pose_flags(verdict: Verdict, poses: Poses, links: Sequence[tuple[Pair, 
         stats = dict(a.refined.stats)
         if a.pair in error and np.isfinite(error[a.pair]):
             stats["pose_error"] = error[a.pair]
-        extra = ()
+        extra: tuple[Status, ...] = ()
         if a.refined.status.ok and (not closed.get(a.pair, True) or stats.get("pose_error", 0.0) > ASTRAY):
             extra = (Status.INCONSISTENT,)
         answers.append(

@@ -179,7 +179,7 @@ def relax(
     free = [v for v in sorted(frames) if v != root]
     column = {v: 7 * i for i, v in enumerate(free)}
     white = [l.whitening for l in links]
-    covariances = {root: np.zeros((7, 7))}
+    covariances: dict[int, np.ndarray] = {root: np.zeros((7, 7))}
     frames = dict(frames)
     H = np.zeros((7 * len(free), 7 * len(free)))
     errors = np.zeros(len(links))
