@@ -235,12 +235,13 @@ def linearise(
         squares = np.zeros(ok.shape), np.zeros(ok.shape)
         kernels.residual_squares(u, y, slow, state.tau, used, *squares)
         parts.append((curves.frame, t_a, u, y, v, slow, used, *squares))
-    count = np.sum([p[6].sum(1) for p in parts], axis=0)
+    count = np.sum([np.sum(p[6], axis=1) for p in parts], axis=0)
     seen = count > 0
     if seen.sum() < 3:
         return None
     quick, place = (_noise(parts, k) for k in (7, 8))
-    rms_quick, rms_slow = (np.sqrt(sum(p[k].sum(1) for p in parts) / np.maximum(count, 1)) for k in (7, 8))
+    often = np.maximum(count, 1)
+    rms_quick, rms_slow = (np.sqrt(np.sum([np.sum(p[k], axis=1) for p in parts], axis=0) / often) for k in (7, 8))
     weight = np.where(seen, _match_weight(rms_quick, seen) * _match_weight(rms_slow, seen), 0.0)
     M = len(weight)
     H_match, g_match = np.zeros((M, 8, 8)), np.zeros((M, 8))
