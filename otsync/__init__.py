@@ -16,6 +16,7 @@ from .align.likelihood import LikelihoodScan
 from .align.verb import align
 from .align.warping import DTW, ConstantShift
 from .costs.linear import Cosine, Labels, track_distance
+from .frames import OwnFrames
 from .match.anchored import AnchoredFGW
 from .match.candidates import Candidates
 from .match.dense import (
@@ -34,7 +35,7 @@ from .refine.verb import refine
 from .sync.graph import Graph
 from .sync.method import PAPER, Method
 from .sync.verb import synchronize
-from .types import Alignment, Camera, Matches, Offsets, Refused, Status, TrackSet, Video
+from .types import Alignment, Camera, Matches, Offsets, Refused, Similarity, Status, TrackSet, Video
 from .types.trust import Trust
 
 __version__ = "0.1.0"
@@ -59,9 +60,11 @@ __all__ = [
     "NearestNeighbor",
     "Offsets",
     "OptimalTransport",
+    "OwnFrames",
     "PartialFGW",
     "Refused",
     "SemirelaxedFGW",
+    "Similarity",
     "SplineRefine",
     "Status",
     "TrackSet",

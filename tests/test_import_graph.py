@@ -17,7 +17,7 @@ compute files progress plugins
 types
 geometry clocks costs io priors simulate metrics
 match align refine
-epipolar
+epipolar frames
 sync
 recordings
 report bench cli

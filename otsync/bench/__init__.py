@@ -6,6 +6,7 @@ sync.py    aligners, refiners and graphs; sync_acceptance.py: what synchronisati
 chain.py   matchers x aligners x rematching, to frames of the offset; chain_worlds.py: where; chain_plot.py
 hard_cases/  the catalogue of hard cases, and running it
 panoptic.py  the paper's protocol on a truly synchronised recording
+own_frames.py  clock and pose without a common frame, on worlds and on a truly synchronised recording
 record.py  tables on disk, machine and versions, the gate against a committed baseline
 """
 
@@ -26,6 +27,7 @@ OWN = {
     "hard-cases": "hard_cases.run",
     "panoptic": "panoptic",
     "chain": "chain",
+    "own-frames": "own_frames",
 }
 """Our own suites, and where they are."""
 

@@ -35,7 +35,7 @@ class Bench:
     suite: tyro.conf.Positional[suite_names()]
     """Which benchmark; "all": every one that needs no recording."""
     scene: tyro.conf.Positional[Path | None] = None
-    """For panoptic, and for chain if you like: a truly synchronised recording (its folder or scene.json)."""
+    """For panoptic, and for chain and own-frames if you like: a truly synchronised recording (its folder or scene.json)."""
     out: Path = Path("bench/out")
     """Folder for CSV, JSON and plots."""
     gate: bool = False
@@ -45,15 +45,15 @@ class Bench:
     promises: bool = False
     """For sync and match: measure what is promised, on fresh seeds, instead of the tables."""
     first_seed: int | None = None
-    """For core, match, sync, panoptic and chain: where the seeds begin; default: the suite's own."""
+    """For core, match, sync, panoptic, chain and own-frames: where the seeds begin; default: the suite's own."""
     seeds: int | None = None
-    """For core, match, sync and chain: how many seeds; default: the suite's own."""
+    """For core, match, sync, chain and own-frames: how many seeds; default: the suite's own."""
     only: tuple[str, ...] = ()
     """For match, hard-cases and chain: names of the solvers to run; default: all."""
     json: bool = False
-    """For panoptic: one line of JSON on standard output instead of tables."""
+    """For panoptic and own-frames: one line of JSON on standard output instead of tables."""
     cache: Path | None = None
-    """For panoptic and chain: where tracks and depth are kept; default: stages in --out."""
+    """For panoptic, chain and own-frames: where tracks and depth are kept; default: stages in --out."""
 
     def run(self) -> int:
         self._check()

@@ -59,6 +59,8 @@ class Simulate:
     fps: float = 30.0
     max_offset: float = 30.0
     """Largest offset, in frames."""
+    own_frames: bool = False
+    """Every video in a rotation, translation and scale of its own, for otsync sync --frames own."""
     seed: int = 0
 
     def run(self) -> int:
@@ -71,6 +73,7 @@ class Simulate:
             frames=self.frames,
             fps=self.fps,
             max_offset=self.max_offset,
+            own_frames=self.own_frames,
             seed=self.seed,
         )
         stale = sorted({p.name for p in self.out.glob("*.npz")} - {f"{t.name}.npz" for t in tracks})
@@ -81,6 +84,8 @@ class Simulate:
             )
         for t in tracks:
             t.save(self.out / f"{t.name}.npz")
-        Offsets.known(unique_names(tracks), truth.offsets, self.fps, truth.rates).save(self.out / "truth.json")
+        transforms = [truth.transform(0, v) for v in range(len(tracks))] if self.own_frames else []
+        known = Offsets.known(unique_names(tracks), truth.offsets, self.fps, truth.rates, transforms)
+        known.save(self.out / "truth.json")
         print(f"{self.out}: {', '.join(t.name + '.npz' for t in tracks)}, truth.json")
         return 0

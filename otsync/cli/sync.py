@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from ..sync.own_frames import Frames
 from ..sync.verb import unique_names
 from ..types import TrackSet
 from .method import MethodOptions
@@ -25,6 +26,8 @@ class Sync:
 
     The paper's method: otsync sync recording/ --method paper
 
+    Videos without a common frame of reference: otsync sync world/*.npz --frames own
+
     An ablation: otsync sync recording/ matcher:optimal-transport aligner:dtw refiner:unrefined
     """
 
@@ -37,6 +40,9 @@ class Sync:
     """Name of the reference video, or "auto" for the one with the surest pairs; default: the first."""
     truth: Path | None = None
     """truth.json of a simulated world: adds errors to the table."""
+    frames: Frames = "common"
+    """own: every video has a frame of reference and a unit of its own; rotation, translation and scale are found beside
+    the offsets. For track sets, and for recordings with depth whose cameras have no pose."""
     workers: int = 1
     """Processes that pairs are spread over; results do not depend on it."""
     slots: Annotated[MethodOptions, tyro.conf.arg(name="")] = field(default_factory=MethodOptions)
@@ -48,6 +54,18 @@ class Sync:
     def run(self) -> int:
         if len(self.tracks) == 1 and self.tracks[0].suffix != ".npz":
             refuse_unused(self, ("workers",), f"a recording ({self.tracks[0]}), which has --recording.workers,")
+            if self.frames == "own":
+                from .own_frames import sync_own_recording
+
+                return sync_own_recording(
+                    self.tracks[0],
+                    self.out,
+                    self.recording,
+                    method=self.slots.chosen(),
+                    reference=self.reference,
+                    truth=self.truth,
+                    as_json=self.json,
+                )
             return sync_recording(
                 self.tracks[0],
                 self.out,
@@ -81,6 +99,7 @@ class Sync:
             self.workers,
             reference=reference,
             method=method,
+            frames=self.frames,
         )
         truth = None if known is None else known - known[offsets.component]
         return report(offsets, tracks, truth, self.out, "Synchronisation report", as_json=self.json)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from ..progress import counted
 from ..sync.verb import synchronize
 from ..types import Offsets, Status, TrackSet
+from ..types.similarity import IDENTITY
 
 if TYPE_CHECKING:
     import numpy as np
@@ -126,7 +127,27 @@ def table(offsets: Offsets, truth: Any = None) -> str:
         cells = [f"{x:{w}.3f}" if np.isfinite(x) else "–".rjust(w) for x, w in zip(values, (9, 8, 9, 8), strict=True)]
         status = "reference" if v == offsets.reference else offsets.status[v].code
         lines.append(f"{name:{width}}  {' '.join(cells)}  {status}")
-    return "\n".join(lines)
+    return "\n".join([*lines, *frame_lines(offsets, width)])
+
+
+def frame_lines(offsets: Offsets, width: int) -> list[str]:
+    """Where each video's frame of reference lies, for videos that have one of their own."""
+    if not offsets.transforms:
+        return []
+    lines = [
+        "",
+        f"{'video':{width}}  {'scale':>8} {'sigma':>7} {'turn':>7} {'sigma':>7}  origin   (in the reference's frame)",
+    ]
+    for name, S in zip(offsets.names, offsets.transforms, strict=True):
+        if S is None:
+            lines.append(f"{name:{width}}  {'–':>8} {'–':>7} {'–':>7} {'–':>7}  –")
+            continue
+        origin = " ".join(f"{x:.3g}" for x in S.t)
+        turn = S.degrees_from(IDENTITY)
+        lines.append(
+            f"{name:{width}}  {S.scale:8.4f} {100 * S.scale_sigma:6.2f}% {turn:6.1f}° {S.rotation_sigma:6.2f}°  {origin}"
+        )
+    return lines
 
 
 def refusal(verb: str, status: Status, flags: tuple[Status, ...]) -> int:

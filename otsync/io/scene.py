@@ -188,7 +188,11 @@ def camera_from(value: Any) -> Camera:
         raise ValueError("camera: expected K, w2c, width and height; found none. Add the calibration.")
     missing = [f for f in ("K", "w2c", "width", "height") if value.get(f) is None]
     if missing:
-        raise ValueError(f"camera: expected K, w2c, width and height; {', '.join(missing)} missing. Add them.")
+        own = " Or, with depth for every video, let the poses be found: otsync sync --frames own."
+        raise ValueError(
+            f"camera: expected K, w2c, width and height; {', '.join(missing)} missing. Add them."
+            + (own if missing == ["w2c"] else "")
+        )
     return Camera(
         np.asarray(value["K"], float),
         np.asarray(value["w2c"], float),

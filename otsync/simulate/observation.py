@@ -10,6 +10,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..types import Camera
+from ..types.similarity import IDENTITY, Similarity
+
+__all__ = ["IDENTITY", "Observation", "Similarity", "Surface", "stream"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,39 +35,6 @@ class Surface:
 
     def __len__(self) -> int:
         return len(self.part)
-
-
-@dataclass(frozen=True, eq=False)
-class Similarity:
-    """``x -> scale R x + t``: from the world to the frame in which a video reports positions."""
-
-    scale: float
-    R: Float[np.ndarray, "3 3"]
-    t: Float[np.ndarray, " 3"]
-
-    def __call__(self, xyz: Float[np.ndarray, "*B 3"]) -> Float[np.ndarray, "*B 3"]:
-        # one long product: numpy's stacked ones are slow for small matrices
-        moved = xyz.reshape(-1, 3) @ (self.scale * self.R.T).astype(xyz.dtype)
-        moved += self.t.astype(xyz.dtype)
-        return moved.reshape(xyz.shape)
-
-    def inverse(self) -> Similarity:
-        return Similarity(1 / self.scale, self.R.T, -self.R.T @ self.t / self.scale)
-
-    def after(self, first: Similarity) -> Similarity:
-        """This one applied to what ``first`` gives."""
-        return Similarity(self.scale * first.scale, self.R @ first.R, self.scale * self.R @ first.t + self.t)
-
-    def camera(self, camera: Camera) -> Camera:
-        """The camera that sees the mapped points at the pixels where ``camera`` sees the originals."""
-        R, t = camera.w2c[:3, :3], camera.w2c[:3, 3]
-        w2c = np.eye(4)
-        w2c[:3, :3] = R @ self.R.T
-        w2c[:3, 3] = self.scale * t - w2c[:3, :3] @ self.t
-        return Camera(camera.K, w2c, camera.width, camera.height, camera.distortion, camera.readout)
-
-
-IDENTITY = Similarity(1.0, np.eye(3), np.zeros(3))
 
 
 @dataclass(frozen=True, eq=False)

@@ -45,6 +45,10 @@ class Truth:
         """Seconds by which video b started after video a: ``offset_b - offset_a``."""
         return float(self.offsets[b] - self.offsets[a])
 
+    def transform(self, a: int, b: int) -> Similarity:
+        """From the frame in which video b reports positions to that of video a: ``x_b -> x_a``."""
+        return self.frames[a].after(self.frames[b].inverse())
+
     def positions(self, video: int, world_times: Float[np.ndarray, " T"]) -> Float[np.ndarray, "N T 3"]:
         """Exact world positions of the points that ``video``'s tracks follow; nan for outliers."""
         s = self.surfaces[video]

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from ..progress import counted
 from ..types import Camera, TrackSet
 from .body import sample_surface
-from .effects import Effect
+from .effects import Effect, OwnFrame
 from .features import FeatureModel
 from .mocap import Mocap
 from .observation import IDENTITY, Observation, Surface, stream
@@ -82,6 +82,7 @@ def simulate(
     rates: Sequence[float] | None = None,
     effects: tuple[Effect, ...] | None = None,
     rig: Rig | None = None,
+    own_frames: bool = False,
     seed: int = 0,
 ) -> tuple[list[TrackSet], Truth]:
     """Draw a world and several videos of it, with exact answers.
@@ -104,11 +105,14 @@ def simulate(
         rates: of the videos' clocks, one a video; None: all 1.
         effects: instead of the preset's; ``()`` gives exact positions.
         rig: where the cameras stand.
+        own_frames: whether every video has a frame of reference of its own, in which it also gives its camera: after
+            all other effects a random rotation, translation and scale (:class:`otsync.simulate.effects.OwnFrame`).
+            Sets declare the frames "video0", "video1", ...; :meth:`Truth.transform` leads from one to another.
         seed: all randomness. A video's draw depends on the seed and its index, not on how many videos there are.
 
     Returns:
         One :class:`TrackSet` a video, with ``xyz`` nan where not visible, ``uv``, unit-norm ``features``, ``camera``
-        and ``frame="world"``; and the :class:`Truth`.
+        and ``frame="world"`` (or their own); and the :class:`Truth`.
 
     >>> from otsync.simulate import simulate
     >>> tracks, truth = simulate("tennis", preset="clean", seed=3)
@@ -124,7 +128,7 @@ def simulate(
     if not all(np.isfinite(r) and r > 0 for r in given_rates):
         raise ValueError(f"rates: expected positive numbers; found {given_rates}. 1 is a clock like the world's.")
     seconds = _offsets(offsets, videos, max_offset / clocks[0][1], seed)
-    used = level.effects if effects is None else tuple(effects)
+    used = (level.effects if effects is None else tuple(effects)) + ((OwnFrame(),) if own_frames else ())
     rig = rig or Rig()
     made = []
     for v in counted(range(videos), "simulating", "video"):
@@ -140,7 +144,9 @@ def simulate(
             video=v,
         )
         made.append(apply(obs, used, seed, v))
-    return [as_tracks(obs, f"video{v}", "world") for v, obs in enumerate(made)], as_truth(scene, made, level, seed)
+    names = [f"video{v}" for v in range(videos)]
+    sets = [as_tracks(obs, name, name if own_frames else "world") for name, obs in zip(names, made, strict=True)]
+    return sets, as_truth(scene, made, level, seed)
 
 
 def observe(

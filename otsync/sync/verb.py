@@ -16,6 +16,7 @@ from ..compute.threads import MapLike
 from ..costs.epipolar import EpipolarDistance
 from ..costs.linear import Cosine
 from ..costs.positions import SynchronousDistance
+from ..frames import OwnFrames
 from ..match.slot import Matcher, MatcherLike
 from ..match.synchronous import SynchronousMatching
 from ..match.unbalanced import UnbalancedOT
@@ -24,6 +25,7 @@ from ..refine.splines import SplineRefine
 from ..types import Alignment, Clock, Matches, Offsets, TrackSet
 from .graph import Graph, Pair
 from .method import Method, with_costs
+from .own_frames import Frames, refuse_common, solver_from, synchronize_own
 from .pairs import Job, Refit, run, run_refit, with_rate
 from .verdict import Answer, Verdict, judge
 
@@ -40,6 +42,7 @@ def synchronize(
     graph: Graph | None = None,
     rematch: int | None = None,
     rate: Rate | None = None,
+    frames: Frames | OwnFrames = "common",
     map: MapLike = map,
 ) -> Offsets:
     """Put every video on the reference's clock.
@@ -49,7 +52,8 @@ def synchronize(
     form components with references of their own.
 
     Args:
-        tracks: one set per video, all in one world frame. Rolling shutters of declared ``readout`` are undone here.
+        tracks: one set per video, all in one world frame unless ``frames`` says otherwise. Rolling shutters of declared
+            ``readout`` are undone here.
         reference: index of the video whose clock is the world's; "auto" takes the one with the surest pairs.
         method: what stands in the slots below that are left out, for example :data:`otsync.PAPER`.
         matcher, aligner, refiner: the algorithms of each stage; None takes the default, :class:`Unrefined` as refiner
@@ -61,6 +65,10 @@ def synchronize(
             times (more than once adds nothing); None: once. Matches of your own are left alone.
         rate: "fixed" takes frame rates as declared; "fit" frees them for pairs that overlap by 20 s and more, and
             keeps what is significant; None: as the refiner says, by default "fixed".
+        frames: "common" where all positions are in one world frame; "own" where every video has a frame and a unit of
+            its own (several depth cameras, phones with depth): then rotation, translation and scale are found beside
+            the offsets, in :attr:`Offsets.transforms`. An :class:`OwnFrames` sets how. ``aligner``, ``refiner``,
+            ``matches``, ``rate`` and ``rematch`` belong to a common frame; ``matcher`` makes the first matches of both.
         map: any map-like callable: the builtin, an executor's, dask's. Results do not depend on it.
 
     A pair that fails gets a status and nan; the others live. Wrong input raises ValueError before any work.
@@ -74,6 +82,8 @@ def synchronize(
     if matches is not None and matcher is not None:
         raise ValueError("matcher, matches: expected one of them; found both. Matches of your own need no matcher.")
     matching = None if chosen_method.matcher is None else Matcher.of(chosen_method.matcher)
+    if frames != "common":
+        return _without_common_frame(tracks, reference, frames, matching, chosen_method, matches, map)
     aligning = LikelihoodScan() if chosen_method.aligner is None else Aligner.of(chosen_method.aligner)
     chosen_refiner = SplineRefine() if chosen_method.refiner is None else Refiner.of(chosen_method.refiner)
     refining = with_rate(chosen_refiner, chosen_method.rate)
@@ -106,6 +116,37 @@ def synchronize(
         fresh = {answer.pair: answer for answer in map(run, again)}
         verdict = judged([fresh.get(a.pair, a) for a in verdict.answers])
     return to_offsets(tracks, verdict, time.perf_counter() - started)
+
+
+def _without_common_frame(
+    tracks: Sequence[TrackSet],
+    reference: int | Literal["auto"],
+    frames: Frames | OwnFrames,
+    matcher: Matcher | None,
+    method: Method,
+    matches: Mapping[Pair, Matches] | None,
+    map: MapLike,
+) -> Offsets:
+    """:func:`synchronize` of videos that each have a frame of their own."""
+    if frames != "own" and not isinstance(frames, OwnFrames):
+        raise ValueError(f"frames: expected 'common', 'own' or an OwnFrames; found {frames!r}.")
+    refuse_common(
+        aligner=method.aligner,
+        refiner=method.refiner,
+        matches=matches,
+        rate=None if method.rate == "fixed" else method.rate,
+        rematch=method.rematch,
+    )
+    chosen = check_tracks(tracks, reference, own=True)
+    if matcher is None or matcher.needs_features:
+        for v, t in enumerate(tracks):
+            t.check(f"tracks[{v}]", xyz=False, features=True)
+    started = time.perf_counter()
+    centre = most_seen(tracks) if chosen is None else chosen
+    solver = solver_from(frames, matcher)
+    verdict, transforms = synchronize_own(tracks, chosen, centre, solver=solver, graph=method.graph, map=map)
+    found = to_offsets(tracks, verdict, time.perf_counter() - started)
+    return dataclasses.replace(found, transforms=transforms)
 
 
 def rematching(jobs: list[Job], verdict: Verdict) -> list[Job]:
@@ -158,7 +199,9 @@ def to_offsets(tracks: Sequence[TrackSet], verdict: Verdict, seconds: float) -> 
     )
 
 
-def check_tracks(tracks: Sequence[TrackSet], reference: int | Literal["auto"], *, xyz: bool = True) -> int | None:
+def check_tracks(
+    tracks: Sequence[TrackSet], reference: int | Literal["auto"], *, xyz: bool = True, own: bool = False
+) -> int | None:
     """ValueError unless there are at least two sound track sets; the reference's index, None when it is to be
     chosen.
     """
@@ -174,8 +217,11 @@ def check_tracks(tracks: Sequence[TrackSet], reference: int | Literal["auto"], *
     for v, t in enumerate(tracks):
         t.check(f"tracks[{v}]", xyz=xyz)
     frames = {t.frame for t in tracks if t.frame is not None}
-    if len(frames) > 1:
-        raise ValueError(f"tracks: expected one world frame; found {sorted(frames)}. Bring the positions into one.")
+    if len(frames) > 1 and not own:
+        raise ValueError(
+            f"tracks: expected one world frame; found {sorted(frames)}. Bring the positions into one, or let the "
+            "frames be found: frames='own' (otsync sync --frames own)."
+        )
     return chosen
 
 

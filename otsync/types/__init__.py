@@ -3,6 +3,7 @@
 from .camera import Camera, Video
 from .clock import Clock
 from .results import Alignment, Matches, Offsets, Stats
+from .similarity import Similarity
 from .status import Refused, Status, gravest, in_order
 from .tracks import TrackSet, check_same_world
 
@@ -13,6 +14,7 @@ __all__ = [
     "Matches",
     "Offsets",
     "Refused",
+    "Similarity",
     "Stats",
     "Status",
     "TrackSet",

@@ -10,12 +10,19 @@ from typing import Any
 import numpy as np
 
 from ..files.arrays import read_json
+from .similarity import Similarity
 from .status import Status, gravest, in_order
 
 FORMAT, VERSION = "otsync.offsets", 1
 SIGN = (
     "t_world = rate * t_video + offset_seconds, t_video in seconds on the video's own clock; a positive offset means "
     "that the video started later than its reference; offset_frames = offset_seconds * fps of the reference"
+)
+
+FRAMES = (
+    "every video has a frame of reference of its own; transform: x_reference = scale * R(quaternion w, x, y, z) * x_video "
+    "+ translation, in units of the reference (of pairs: from b's frame to a's); covariance: of a small rotation vector "
+    "(3, radians), relative scale (1) and translation (3) that act after it"
 )
 
 
@@ -69,6 +76,7 @@ def _fields(data: dict[str, Any]) -> tuple[dict[str, Any], dict[tuple[int, int],
             fps=_float(p["fps"], f"{what}: fps", above=0),
             flags=_flags(p["flags"], p["status"], what),
             stats={str(k): _float(x, f"{what}: stats, {k}") for k, x in p["stats"].items()},
+            transform=_transform_from(p.get("transform"), what),
         )
     reference = place(data["reference"], "reference")
     component = np.array([place(video["reference"], f"videos, {video['name']}: reference") for video in videos])
@@ -108,8 +116,21 @@ def _fields(data: dict[str, Any]) -> tuple[dict[str, Any], dict[tuple[int, int],
         component=component,
         flags=tuple(_flags(video["flags"], video["status"], f"videos, {video['name']}") for video in videos),
         stats={str(k): _float(x, f"stats, {k}") for k, x in data["stats"].items()},
+        transforms=tuple(_transform_from(video.get("transform"), f"videos, {video['name']}") for video in videos)
+        if any("transform" in video for video in videos)
+        else (),
     )
     return fields, alignments
+
+
+def _transform_from(data: Any, what: str) -> Similarity | None:
+    """A similarity of the file, None for null. ValueError begins with ``what``."""
+    if data is None:
+        return None
+    try:
+        return Similarity.from_dict(data)
+    except (ValueError, TypeError, KeyError) as error:
+        raise ValueError(f"{what}: {error}") from None
 
 
 def _float(x: Any, what: str, *, above: float = -math.inf, least: float = -math.inf) -> float:

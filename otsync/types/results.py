@@ -15,7 +15,8 @@ from ..files.arrays import write_json
 from . import drawing
 from .camera import Video
 from .clock import Clock
-from .offsets_file import FORMAT, SIGN, VERSION, read_offsets
+from .offsets_file import FORMAT, FRAMES, SIGN, VERSION, read_offsets
+from .similarity import Similarity
 from .status import Status, gravest, in_order
 from .tracks import TrackSet
 
@@ -138,6 +139,7 @@ class Alignment:
         fps: frames per second of the common clock: ``offset * fps`` is in frames.
         flags: what there is to know about the answer, gravest first. ``status`` is the gravest, OK without any.
         stats: seconds, matches, evidence, ...
+        transform: from b's frame of reference to a's, where the videos share none (``frames="own"``); else None.
     """
 
     offset: float
@@ -150,6 +152,7 @@ class Alignment:
     fps: float = math.nan
     flags: tuple[Status, ...] = ()
     stats: Stats = field(default_factory=dict)
+    transform: Similarity | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "flags", in_order(self.flags))
@@ -201,6 +204,8 @@ class Offsets:
             hang together; a disconnected group has a reference of its own.
         alignments: per pair (i, j) the pair's own answer. matches: what it was made from, without plans.
         flags: per video, gravest first; ``status`` has the gravest of each. stats: of the whole.
+        transforms: per video, from its own frame of reference to that of its component's reference, None where it
+            could not be found; empty where all videos share one frame.
     """
 
     names: tuple[str, ...]
@@ -214,9 +219,15 @@ class Offsets:
     alignments: Mapping[tuple[int, int], Alignment] = field(default_factory=dict)
     matches: Mapping[tuple[int, int], Matches] = field(default_factory=dict)
     stats: Stats = field(default_factory=dict)
+    transforms: tuple[Similarity | None, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "flags", tuple(in_order(flags) for flags in self.flags))
+        if self.transforms and len(self.transforms) != len(self.names):
+            raise ValueError(
+                f"Offsets.transforms: expected one for each of {len(self.names)} videos, or none; found "
+                f"{len(self.transforms)}."
+            )
 
     @classmethod
     def known(
@@ -225,6 +236,7 @@ class Offsets:
         seconds: Float[np.ndarray, " V"],
         fps: float,
         rates: Float[np.ndarray, " V"] | None = None,
+        transforms: Sequence[Similarity | None] = (),
     ) -> Offsets:
         """Offsets that are known, not estimated: sigma 0, no flags; the first video is the reference, whatever it has.
 
@@ -240,6 +252,7 @@ class Offsets:
             reference=0,
             component=np.zeros(n, int),
             flags=((),) * n,
+            transforms=tuple(transforms),
         )
 
     def __len__(self) -> int:
@@ -305,6 +318,7 @@ class Offsets:
                 "reference": self.names[self.component[v]],
                 "status": self.status[v].code,
                 "flags": [f.code for f in self.flags[v]],
+                **({"transform": _transform(self.transforms[v])} if self.transforms else {}),
             }
             for v in range(len(self))
         ]
@@ -321,6 +335,7 @@ class Offsets:
                 "flags": [f.code for f in p.flags],
                 "hypotheses": [[_number(x) for x in row] for row in p.hypotheses],
                 "stats": {k: _number(x) for k, x in p.stats.items()},
+                **({"transform": _transform(p.transform)} if self.transforms else {}),
             }
             for (i, j), p in sorted(self.alignments.items())
         ]
@@ -329,6 +344,7 @@ class Offsets:
             "version": VERSION,
             "unit": "seconds",
             "sign": SIGN,
+            **({"frames": FRAMES} if self.transforms else {}),
             "reference": self.names[self.reference],
             "videos": videos,
             "pairs": pairs,
@@ -344,6 +360,10 @@ class Offsets:
         """
         fields, pairs = read_offsets(path)
         return cls(**fields, alignments={pair: Alignment(**one) for pair, one in pairs.items()})
+
+
+def _transform(found: Similarity | None) -> dict[str, Any] | None:
+    return None if found is None else found.to_dict()
 
 
 def _number(x: Any) -> float | None:

@@ -48,6 +48,10 @@ class Status(StrEnum):
         "drifting depth do this."
     )
     WEAK = "The evidence for this offset is weak. Use more tracks on moving things, or longer clips."
+    LOOSE_POSE = (
+        "The tracks leave the pose between the videos loose: they lie on a line, close together, or agree badly. Track "
+        "more of the scene, or use longer clips."
+    )
     STATIC = "Nothing moves enough to tell the time. Choose a part of the clip with motion, or track the moving parts."
     INCONSISTENT = (
         "The pairs of this video contradict the rest of the graph. Look at its residuals in the report; a wrong "

@@ -26,6 +26,7 @@ def run(script: str, *args: str, cwd: Path) -> str:
         ("02_synchronize.py", ["--videos", "3", "--out", "sync"], "report.html"),
         ("03_ot_versus_fgw.py", ["--n", "120", "--seeds", "0", "--out", "picture.png"], "fused (FGW)"),
         ("04_your_own_matcher.py", ["--videos", "3"], "given matches: errors"),
+        ("09_own_frames.py", ["--videos", "2", "--preset", "clean", "--out", "own"], "camera stands at"),
     ],
 )
 def test_example_runs(script, args, expected, tmp_path):

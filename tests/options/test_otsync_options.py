@@ -352,6 +352,25 @@ def test_what_decides_where_some_pairs_do_not_vouch_for_themselves(option, films
     assert json.loads(trusted)["videos"][4]["status"] == "ok" != json.loads(doubted)["videos"][4]["status"]
 
 
+def test_frames_of_their_own(tmp_path):
+    """--frames own finds transforms, heeds matcher and graph, and refuses what needs a common frame."""
+    tracks, _ = simulate("basketball", preset="clean", videos=3, own_frames=True, frames=90, seed=5, max_offset=8)
+    for t in tracks:
+        t.save(tmp_path / f"{t.name}.npz")
+    files = [str(p) for p in sorted(tmp_path.glob("*.npz"))]
+    base = ["sync", *files, "--frames", "own", "--json", "--out", str(tmp_path / "o")]
+    code, _, err = run(["sync", *files, "--out", str(tmp_path / "o")])
+    assert code == 2 and "--frames own" in err
+    first = answer(base)
+    assert "transform" in json.loads(first)["videos"][1]
+    assert first != answer([*base, "--graph.extra", "0"])
+    assert first != answer([*base, "matcher:partial-fgw"])
+    for option in (["aligner:dtw"], ["refiner:unrefined"], ["--rate", "fit"], ["--rematch", "0"]):
+        code, _, err = run([*base, *option])
+        name = option[0].lstrip("-").partition(":")[0]
+        assert code == 2 and f"{name}: expected none" in err and "own" in err, err
+
+
 def test_rates_of_long_clips(tmp_path):
     tracks, _ = simulate("softball", preset="clean", videos=2, frames=660, rates=[1, 1.002], offsets=[0, 0.3], seed=9)
     for t in tracks:
@@ -498,6 +517,7 @@ def test_options_of_simulate_and_demo(tmp_path):
         ["--fps", "25"],
         ["--max-offset", "5"],
         ["--seed", "8"],
+        ["--own-frames"],
     ):
         assert world(*args) != plain, args
 
@@ -566,11 +586,12 @@ def rows() -> set[str]:
     pairs |= {f"sync {FIT}.trust.{n}" for n in ("evidence", "margin", "rate_sigmas")} | {f"sync {FIT}.rate"}
     others = {
         "match": "a b out budget json costs",
-        "sync": "tracks out reference truth method rate rematch costs workers json refiner:Unrefined graph.extra graph.complete "
+        "sync": "tracks out reference truth method rate rematch costs frames workers json refiner:Unrefined "
+        "graph.extra graph.complete "
         "graph.curves graph.starts graph.seed recording.route recording.cameras recording.cache "
         "recording.allow_outside recording.workers recording.masks recording.points recording.features",
         "demo": "out motion preset videos seed",
-        "simulate": "out motion preset videos frames fps max_offset seed",
+        "simulate": "out motion preset videos frames fps max_offset own_frames seed",
         "init": "folder out reader fps force",
         "check": "scene every_frame allow_outside",
         "bench": "suite scene out gate rebase promises first_seed seeds only json cache",

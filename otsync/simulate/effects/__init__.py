@@ -13,7 +13,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from ..observation import Observation
-from .camera import CameraFrame, ClockDrift, DroppedFrames, RigidFrame, RollingShutter
+from .camera import CameraFrame, ClockDrift, DroppedFrames, OwnFrame, RigidFrame, RollingShutter
 from .noise import (
     CameraDepthDrift,
     DepthBias,
@@ -42,6 +42,7 @@ __all__ = [
     "LimbDrift",
     "Occlusion",
     "Outliers",
+    "OwnFrame",
     "PositionNoise",
     "RayCompression",
     "RigidFrame",

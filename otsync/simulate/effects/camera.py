@@ -40,6 +40,21 @@ class RigidFrame:
         return _reframed(obs, Similarity(1.0, q, rng.uniform(-self.distance, self.distance, 3)))
 
 
+@dataclass(frozen=True)
+class OwnFrame:
+    """The video has a frame and a unit of its own: any rotation, an origin within ``distance`` m, and a scale of up to
+    ``scale`` times more or less. What a phone with depth reports, or a depth camera that nobody calibrated.
+    """
+
+    scale: float = 2.0
+    distance: float = 5.0
+
+    def __call__(self, obs: Observation, rng: np.random.Generator) -> Observation:
+        obs = RigidFrame(self.distance)(obs, rng)
+        grown = float(np.exp(rng.uniform(-1, 1) * np.log(self.scale)))
+        return _reframed(obs, Similarity(grown, np.eye(3), np.zeros(3)))
+
+
 def _reframed(obs: Observation, change: Similarity) -> Observation:
     return replace(obs, xyz=change(obs.xyz), frame=change.after(obs.frame), camera=change.camera(obs.camera))
 

@@ -1,0 +1,118 @@
+"""Recordings whose cameras have intrinsics and depth but no pose: each video's tracks in its camera's own frame.
+
+Several depth cameras, or phones with depth, need neither a clock nor an extrinsic calibration: positions are lifted
+with the camera at the origin, clocks and similarities are found together (:mod:`otsync.frames`), and the cameras that
+follow are written as a scene document that every other command reads.
+"""
+
+from __future__ import annotations
+
+import copy
+import os
+from dataclasses import replace
+from typing import Any, Literal
+
+import numpy as np
+
+from ..clocks.shutter import check_within_a_frame
+from ..compute.threads import MapLike
+from ..files.cache import Cache
+from ..frames import OwnFrames
+from ..io.scene import Scene, camera_from, read_document, scene_from_document
+from ..progress import Progress, Tell
+from ..sync.method import Method
+from ..sync.verb import synchronize
+from ..types import Offsets
+from .routes import Synchronized, lift_given, track_all, without_times
+from .stages import Stages
+
+
+def open_without_poses(path: str | os.PathLike[str], *, allow_outside: bool = False) -> tuple[Scene, dict[str, Any]]:
+    """The scene behind ``path``, cameras without ``w2c`` standing at the origin of a frame of their own; its document.
+
+    Poses that are there are kept: they turn the video's own frame, no more. ValueError for what else is missing.
+    """
+    document, root = read_document(path)
+    filled = copy.deepcopy(document)
+    filled.pop("missing", None)  # what is missing besides poses is named by the field that lacks it
+    for video in filled.get("videos") or ():
+        camera = video.get("camera") if isinstance(video, dict) else None
+        if isinstance(camera, dict) and camera.get("w2c") is None:
+            camera["w2c"] = np.eye(4).tolist()
+    return scene_from_document(filled, root, allow_outside=allow_outside), document
+
+
+def synchronize_own_scene(
+    scene: Scene,
+    *,
+    reference: int | Literal["auto"] = 0,
+    method: Method | None = None,
+    stages: Stages | None = None,
+    solver: OwnFrames | None = None,
+    cache: Cache | None = None,
+    map: MapLike = map,
+    tell: Tell = lambda text: None,
+) -> Synchronized:
+    """Clocks and frames of the videos of a scene, from tracks that are lifted in each camera's own frame.
+
+    ``method``: the matcher of first matches and the graph; ValueError names a slot that own frames have no use for. It
+    also names the videos without depth: pixels alone have no distances that could be compared.
+    """
+    flat = [v.name for v in scene.videos if v.depth is None]
+    if flat:
+        raise ValueError(
+            f"frames own: expected depth for every video; it is missing for {', '.join(flat)}. Add depth maps, or "
+            "calibrate the cameras and leave --frames out."
+        )
+    if len(scene.videos) < 2:
+        raise ValueError(f"scene: expected at least two videos; found {len(scene.videos)}.")
+    for video in scene.videos:
+        check_within_a_frame(video.camera.readout, video.times, f"camera.readout of {video.name!r}")
+    stages, cache = stages or Stages(), cache or Cache()
+    progress = Progress(tell)
+    with progress.stage("tracks"):
+        raw = track_all(scene, stages, cache, map, tell)
+    with progress.stage("lift"):
+        lifted = [replace(t, frame=t.name) for t in lift_given(scene, raw, stages, cache, map)]
+    with progress.stage("synchronise"):
+        offsets = synchronize(lifted, reference=reference, method=method, frames=solver or "own", map=map)
+    why = ("route own frames: as asked; depth is given, poses are not used across videos",)
+    return Synchronized(without_times(offsets), tuple(lifted), "own frames", why, None, progress.seconds)
+
+
+def found_document(document: dict[str, Any], offsets: Offsets) -> dict[str, Any]:
+    """The scene document with the cameras that were found, in the frame and unit of the reference.
+
+    Scales of depth maps are multiplied by the video's scale. Videos without an answer keep what they had and are named
+    under ``missing``.
+    """
+    found = copy.deepcopy(document)
+    found.pop("missing", None)
+    found["frame"] = f"{offsets.names[offsets.reference]} (found by otsync)"
+    lost = []
+    videos = []
+    for n, video in enumerate(found["videos"]):
+        name = str(video.get("name", f"video{n}"))
+        if name not in offsets.names:
+            continue  # not among the cameras that were asked for
+        videos.append(video)
+        v = offsets.names.index(name)
+        S = offsets.transforms[v]
+        if S is None or offsets.component[v] != offsets.reference:
+            lost.append(f"{name}: camera.w2c could not be found (world to camera, OpenCV axes)")
+            video["camera"]["w2c"] = None
+            continue
+        before = dict(video["camera"])
+        if before.get("w2c") is None:
+            before["w2c"] = np.eye(4).tolist()
+        video["camera"]["w2c"] = S.camera(camera_from(before)).w2c.tolist()
+        if isinstance(video.get("depth"), dict):
+            video["depth"]["scale"] = float(video["depth"].get("scale", 1.0)) * S.scale
+    found["videos"] = videos
+    notes = [str(n) for n in found.get("notes", ())]
+    flagged = [n for n, s in zip(offsets.names, offsets.status, strict=True) if not s.ok]
+    notes.append("poses found by otsync sync --frames own" + (f"; doubtful: {', '.join(flagged)}" if flagged else ""))
+    found["notes"] = notes
+    if lost:
+        found["missing"] = lost
+    return found
