@@ -116,20 +116,25 @@ class UnbalancedFGW(StructuralMatcher):
             return no_information(problem.M)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # an inner loop that stops at its limit; the outer one tells
-            plan, _, log = ot.gromov.fused_unbalanced_gromov_wasserstein(
-                problem.Ca,
-                problem.Cb,
-                problem.p,
-                problem.q,
-                reg_marginals=self.marginal,
-                epsilon=self.reg,
-                divergence="kl",
-                unbalanced_solver="sinkhorn_log",
-                alpha=self.alpha / 2,
-                M=problem.M,
-                max_iter=self.max_iter,
-                log=True,
-            )
+            try:
+                plan, _, log = ot.gromov.fused_unbalanced_gromov_wasserstein(
+                    problem.Ca,
+                    problem.Cb,
+                    problem.p,
+                    problem.q,
+                    reg_marginals=self.marginal,
+                    epsilon=self.reg,
+                    divergence="kl",
+                    unbalanced_solver="sinkhorn_log",
+                    alpha=self.alpha / 2,
+                    M=problem.M,
+                    max_iter=self.max_iter,
+                    log=True,
+                )
+            except ValueError as error:  # "There is NaN in coupling": costs of an outlier overflow its kernel
+                if "NaN" not in str(error):
+                    raise
+                return Matches(np.zeros((0, 2), int), flags=(Status.FAILED,))
         stats = {"objective": problem.objective(plan), "iterations": float(len(log["error"]))}
         return partners_of(plan, -problem.gradient(plan), self.partners, self.top, stats, False)
 

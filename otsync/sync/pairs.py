@@ -41,7 +41,7 @@ def run(job: Job) -> Answer:
     try:
         given = job.matches if job.matches is not None else match(job.a, job.b, job.matcher, throw=False)
         matches = given.without_plan()
-        if not matches.status.ok:
+        if set(matches.flags) - {Status.FORCED}:  # aligners bear wrong matches, and judge for themselves
             failed = Alignment(float("nan"), flags=matches.flags, stats=matches.stats)
             return Answer(job.pair, matches, failed, failed)
         scanned = align(job.a, job.b, matches, job.aligner, throw=False)

@@ -86,12 +86,12 @@ def mostly_identity(
 ) -> Callable[[Matches], bool]:
     """At least ``share`` of the best matches join track k to track k, and there are some.
 
-    The best matches: ``n`` of them, by default half as many as tracks of a are matched, so that matchers with several
+    The best matches: ``n`` of them, by default half as many as can be one to one, so that matchers with several
     partners a track are asked no more than the others. ``of``: what a track is an image of.
     """
 
     def check(m: Matches) -> bool:
-        best = m.best((len(np.unique(m.pairs[:, 0])) + 1) // 2 if n is None else n)
+        best = m.best((min(len(np.unique(column)) for column in m.pairs.T) + 1) // 2 if n is None else n)
         i, j = best.pairs.T
         return len(i) >= 5 and float((of(i) == of(j)).mean()) >= share
 
