@@ -91,27 +91,17 @@ def vouch(found: Matches, a: TrackSet, b: TrackSet, costs: tuple[Cost, ...], clo
     flags = set(found.flags)
     if doubt > BY_CHANCE or (structure > NO_STRUCTURE and unlike(a, b, i, j, features)):
         flags.add(Status.NO_MATCH)
-    elif chirality_of(a, b, i, j) < MIRRORED or moves_mirrored(a, b, i, j, clock):
-        flags.add(Status.AMBIGUOUS)
-    elif one_of_several(a, b, i, j, costs, features, structure):
+    elif chirality_of(a, b, i, j) < MIRRORED or moves_mirrored(a, b, i, j, clock) or one_of_several(a, b, i, j, costs, features, structure):
         flags.add(Status.AMBIGUOUS)
     if not flags and forced(a, b, i, j, features):
         flags.add(Status.FORCED)
     return replace(found, flags=tuple(flags))
 
 
-def partners(found: Matches) -> Int[np.ndarray, "M 2"]:
-    """The best pair of every track of a, best first."""
-    assert found.score is not None
-    pairs = found.pairs[np.argsort(-found.score, kind="stable")]
-    return pairs[np.sort(np.unique(pairs[:, 0], return_index=True)[1])]
-
-
 def better_half(found: Matches) -> Int[np.ndarray, "H 2"]:
-    """The better half of what can be matched one to one: matchers with several partners are judged by their best."""
-    best = partners(found)
-    alone = min(len(best), len(np.unique(best[:, 1])))
-    return best[: max((alone + 1) // 2, min(FEW, alone))]
+    """The best matches, half as many as can be one to one: matchers with several partners are judged by their best."""
+    alone = min(len(np.unique(column)) for column in found.pairs.T)
+    return found.best(max((alone + 1) // 2, min(FEW, alone))).pairs
 
 
 def features_of(a: TrackSet, b: TrackSet) -> tuple[Cost, ...]:
@@ -172,9 +162,7 @@ def random_cost(costs: tuple[Cost, ...], a: TrackSet, b: TrackSet) -> float | No
     return float(M.mean())
 
 
-def unlike(
-    a: TrackSet, b: TrackSet, i: Int[np.ndarray, " H"], j: Int[np.ndarray, " H"], features: Likeness
-) -> bool:
+def unlike(a: TrackSet, b: TrackSet, i: Int[np.ndarray, " H"], j: Int[np.ndarray, " H"], features: Likeness) -> bool:
     """Whether matched tracks are hardly liker than the next likest, and distances among them have nothing in common.
 
     Between unrelated videos, too, every track has a likest partner: what tells is by how much it leads. Distances that a
@@ -228,7 +216,9 @@ def one_of_several(
         return False
     if looks is not None and features.pairs is not None:
         here, there = features.pairs[some][can], looks[np.arange(len(i)), other][can]
-        tied = float((np.where(elsewhere, np.abs(looks - features.pairs[some, None]), np.inf).min(1) < TIE).mean()) > 0.5
+        tied = (
+            float((np.where(elsewhere, np.abs(looks - features.pairs[some, None]), np.inf).min(1) < TIE).mean()) > 0.5
+        )
         if tied and structure > NO_STRUCTURE:
             return True
         if np.median(there) > np.median(here) + AS_LIKE:
@@ -249,9 +239,7 @@ def profiles(tracks: TrackSet, index: Int[np.ndarray, " n"]) -> Float[np.ndarray
     return out
 
 
-def forced(
-    a: TrackSet, b: TrackSet, i: Int[np.ndarray, " H"], j: Int[np.ndarray, " H"], features: Likeness
-) -> bool:
+def forced(a: TrackSet, b: TrackSet, i: Int[np.ndarray, " H"], j: Int[np.ndarray, " H"], features: Likeness) -> bool:
     """Whether part of the better half joins strangers while the rest is clearly right.
 
     By the costs, or by each match's disagreement with the distances to the others.

@@ -77,8 +77,6 @@ def rated(rate: float, frames: int) -> Given:
     return filmed(xyz[:, :frames], 1), filmed(b, 2), ALL
 
 
-
-
 def like_in_two_places() -> Given:
     """Two like performers in unison, two metres apart; each video sees the other one."""
     dance = cloud(N, FRAMES + 10, 33, 0.4)
@@ -89,7 +87,8 @@ def half_canon(later: int = 20) -> Given:
     """As :func:`canon`, but half of the matches join the same dancer: those tell the truth."""
     dance = cloud(N // 2, FRAMES + later, 34, 0.4)
     first, second = dance[:, later:], dance[:, :FRAMES] + [2.0, 0, 0]
-    both = np.concatenate([first, first + [0.05, 0, 0]]), np.concatenate([first, second])
+    beside = first + np.array([0.05, 0, 0])
+    both = np.concatenate([first, beside]), np.concatenate([first, second])
     return filmed(both[0], 1), filmed(both[1], 2), ALL
 
 

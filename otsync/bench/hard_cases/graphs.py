@@ -151,8 +151,10 @@ CASES: tuple[Case, ...] = (
         "the star's own pair wrong and sure of it",
         "the reference's pair lies; other ways tell the truth",
         "the graph outvotes it; a star cannot know",
-        lambda: (lying_pair()[0], {((0, 1) if p == (1, 2) else (1, 2) if p == (0, 1) else p): m
-                                   for p, m in lying_pair()[1].items()}),
+        lambda: (
+            lying_pair()[0],
+            {((0, 1) if p == (1, 2) else (1, 2) if p == (0, 1) else p): m for p, m in lying_pair()[1].items()},
+        ),
         SOUND,
         check=placed(LATE),
     ),

@@ -123,7 +123,6 @@ CASES: tuple[Case, ...] = (
         like_objects("world"),
         (RIGHT,),
         check=identity,
-        limits={"Candidates, at equal times": "features of a copy are as near"},
     ),
     Case(
         "two like objects exchanged, no frame declared",
@@ -227,12 +226,9 @@ CASES: tuple[Case, ...] = (
         "every track twice, at equal times",
         "equal rows",
         "twins may be exchanged",
-        lambda: tuple(
-            x.take(np.repeat(np.arange(50), 2)) if isinstance(x, TrackSet) else x for x in pair(50)
-        ),
+        lambda: tuple(x.take(np.repeat(np.arange(50), 2)) if isinstance(x, TrackSet) else x for x in pair(50)),
         (RIGHT,),
         check=mostly_identity(of=lambda k: k // 2),
-        limits={"SynchronousMatching": "a twin is nobody's mutual nearest neighbour"},
     ),
     Case("one track each, at equal times", "no evidence", "flagged", sized(1, 1), SOUND, check=few_right(1)),
     Case("three tracks each, at equal times", "little evidence", "right, or flagged", sized(3, 3), check=few_right(3)),

@@ -24,7 +24,7 @@ from ...match import (
     UnbalancedOT,
     match,
 )
-from ...refine import REFINERS, Unrefined, refine
+from ...refine import REFINERS, refine
 from ...sync import Graph, synchronize
 from ...types import Alignment, Clock, Matches, Offsets
 from .case import FLAGGED, REFUSED, RIGHT, Case
