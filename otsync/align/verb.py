@@ -33,7 +33,7 @@ def align(
     alignment = chosen(a, b, matches)
     seconds = alignment.stats.get("seconds", time.perf_counter() - started)
     alignment = replace(alignment, stats=alignment.stats | {"seconds": seconds})
-    alignment = vouch(alignment, a, b, matches, chosen.flags_itself)
+    alignment = vouch(alignment, a, b, matches, chosen)
     if throw and not alignment.status.ok:
         raise Refused("align", alignment)
     return alignment

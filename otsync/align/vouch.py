@@ -9,6 +9,7 @@ import numpy as np
 from ..costs.places import apart
 from ..types import Alignment, Matches, Status, TrackSet, in_order
 from .likelihood import LikelihoodScan
+from .slot import Aligner
 
 AGREES = 3 / 30
 """Seconds within which an aligner without flags and the likelihood scan are of one opinion (the scan's own limit for
@@ -20,18 +21,20 @@ above which two videos of one world frame do not show the same points. Measured 
 .40, presets mid .36, hard .71, brutal 1.01 at most (36 pairs each); somebody else, later: 2.2 to 2.5."""
 
 
-def vouch(alignment: Alignment, a: TrackSet, b: TrackSet, matches: Matches, own_flags: bool) -> Alignment:
+def vouch(alignment: Alignment, a: TrackSet, b: TrackSet, matches: Matches, aligner: Aligner) -> Alignment:
     """``alignment`` with the flags that its aligner did not raise.
 
     Args:
-        own_flags: whether the aligner flags its answers. Those of one that does not (DTW, a constant shift, somebody
-            else's) are compared with the likelihood scan's: they carry its flags, and DISAGREE where it answers otherwise.
+        aligner: whose answer it is. That of one which raises no flags itself (DTW, a constant shift, somebody else's) is
+            compared with the likelihood scan's over the same shifts: it carries its flags, and DISAGREE where that
+            answers otherwise.
     """
     if not np.isfinite(alignment.offset) or a.xyz is None or b.xyz is None or not len(matches):
         return alignment
     flags = list(alignment.flags)
-    if not own_flags:
-        scan = LikelihoodScan()(a, b, matches)
+    if not aligner.flags_itself:
+        same = {name: getattr(aligner, name) for name in ("max_lag", "min_overlap") if hasattr(aligner, name)}
+        scan = LikelihoodScan(**same)(a, b, matches)
         flags += scan.flags
         if not abs(scan.offset - alignment.offset) <= AGREES + 1e-9:
             flags.append(Status.DISAGREE)

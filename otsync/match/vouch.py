@@ -91,7 +91,11 @@ def vouch(found: Matches, a: TrackSet, b: TrackSet, costs: tuple[Cost, ...], clo
     flags = set(found.flags)
     if doubt > BY_CHANCE or (structure > NO_STRUCTURE and unlike(a, b, i, j, features)):
         flags.add(Status.NO_MATCH)
-    elif chirality_of(a, b, i, j) < MIRRORED or moves_mirrored(a, b, i, j, clock) or one_of_several(a, b, i, j, costs, features, structure):
+    elif (
+        chirality_of(a, b, i, j) < MIRRORED
+        or moves_mirrored(a, b, i, j, clock)
+        or one_of_several(a, b, i, j, costs, features, structure)
+    ):
         flags.add(Status.AMBIGUOUS)
     if not flags and forced(a, b, i, j, features):
         flags.add(Status.FORCED)

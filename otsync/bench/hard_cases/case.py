@@ -40,7 +40,7 @@ class Case:
     make: Callable[[], tuple[Any, ...]]
     expect: tuple[str, ...] = SOUND
     message: str = ""
-    check: Callable[[Any], bool] | None = None
+    check: Callable[[Any], Any] | None = None
     solvers: tuple[str, ...] = ()
     limits: dict[str, str] = field(default_factory=dict)
     open: str = ""
