@@ -188,7 +188,7 @@ CASES: tuple[Case, ...] = (
         "expected indices of b below",
     ),
     Case(
-        "nan in a visible sample",
+        "nan in a visible sample, aligning",
         "it spreads over the cost",
         "ValueError with track and frame",
         edited(xyz=lambda b: np.where(np.arange(120)[None, :, None] == 5, np.nan, b.xyz)),
@@ -289,7 +289,7 @@ CASES: tuple[Case, ...] = (
         SOUND,
         check=near(1 / 3),
     ),
-    Case("unrelated videos", "some shift is always the best", "flagged", strangers, (FLAGGED,)),
+    Case("unrelated videos, aligning", "some shift is always the best", "flagged", strangers, (FLAGGED,)),
     Case(
         "80 % of the matches wrong",
         "four of five vote for other offsets",
@@ -300,7 +300,7 @@ CASES: tuple[Case, ...] = (
     ),
     Case("all matches wrong", "nothing votes for the right offset", "flagged", wrong(1.0), (FLAGGED,)),
     Case(
-        "half of the samples missing",
+        "half of the samples missing, aligning",
         "other tracks in every frame",
         "common samples only",
         gaps(0.5),
@@ -308,7 +308,7 @@ CASES: tuple[Case, ...] = (
         check=near(1 / 3),
     ),
     Case(
-        "90 % of the samples missing",
+        "90 % of the samples missing, aligning",
         "hardly a window without a gap",
         "right, or flagged",
         gaps(0.9),
@@ -334,7 +334,7 @@ CASES: tuple[Case, ...] = (
         check=near(50 / 30),
     ),
     Case(
-        "planar motion",
+        "planar motion, aligning",
         "one coordinate says nothing",
         "two are enough",
         lambda: videos(of=lambda x: x * [1, 1, 0]),
@@ -366,7 +366,7 @@ CASES: tuple[Case, ...] = (
         check=near(1 / 3),
     ),
     Case(
-        "a mirrored scene",
+        "a mirrored scene, aligning",
         "a reader with the wrong handedness: one coordinate moves the other way",
         "right by the others, or flagged",
         edited(xyz=lambda b: b.xyz * [1, 1, -1]),

@@ -283,7 +283,7 @@ CASES: tuple[Case, ...] = (
         (FLAGGED,),
     ),
     Case(
-        "planar motion",
+        "planar motion, pixels",
         "a plane's points are related by a homography at every lag",
         "right, or flagged",
         lambda: videos(lambda x: x * [1, 0, 1]),
@@ -306,7 +306,7 @@ CASES: tuple[Case, ...] = (
         (FLAGGED,),
     ),
     Case(
-        "all tracks at one place",
+        "all tracks at one place, pixels",
         "all candidates are the same curve",
         "right, or flagged",
         lambda: videos(lambda x: np.repeat(x[:1], len(x), 0)),
