@@ -39,7 +39,8 @@ class Matcher:
     @property
     def clock(self) -> Clock | None:
         """The clock of b against a's that it compares by; None: it needs no time."""
-        return next((cost.clock for cost in self.costs if getattr(cost, "clock", None) is not None), None)
+        told = (getattr(cost, "clock", None) for cost in self.costs)
+        return next((clock for clock in told if clock is not None), None)
 
     @property
     def needs_xyz(self) -> bool:

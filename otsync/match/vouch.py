@@ -112,8 +112,8 @@ def features_of(a: TrackSet, b: TrackSet) -> tuple[Cost, ...]:
     """Feature distance, where both sets have features that it can compare: what structure is checked by."""
     if a.features is None or b.features is None or a.features.shape[1] != b.features.shape[1]:
         return ()
-    for tracks in (a, b):
-        if not (np.isfinite(tracks.features).all() and np.any(tracks.features, axis=1).all()):
+    for features in (a.features, b.features):
+        if not (np.isfinite(features).all() and np.any(features, axis=1).all()):
             return ()
     return (Cosine(),)
 
@@ -325,7 +325,8 @@ def distances_among(
     if a.xyz is None or b.xyz is None:
         return None
     some = np.random.default_rng(len(i)).permutation(len(i))[:SAMPLE]
-    d = [track_distance(x.xyz[k], x.seen[k]).astype(float) for x, k in ((a, i[some]), (b, j[some]))]
+    pairs = ((a.xyz, a.seen, i[some]), (b.xyz, b.seen, j[some]))
+    d = [track_distance(xyz[k], seen[k]).astype(float) for xyz, seen, k in pairs]
     known = np.isfinite(d[0]) & np.isfinite(d[1]) & ~np.eye(len(some), dtype=bool)
     unit = max(np.median(d[0][known]), np.median(d[1][known])) if known.any() else 0.0
     return (d[0][known] / unit, d[1][known] / unit) if unit > 0 else None
