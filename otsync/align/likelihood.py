@@ -69,6 +69,8 @@ class LikelihoodScan(Aligner):
     limit: int = 500
     trust: Trust = field(default_factory=Trust)
 
+    flags_itself = True
+
     def __post_init__(self) -> None:
         if self.max_lag is not None:
             positive("LikelihoodScan.max_lag", self.max_lag, zero=True)

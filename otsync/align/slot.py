@@ -16,9 +16,12 @@ class Aligner:
 
     Attributes:
         needs_xyz: whether it reads positions in space; one that reads pixels alone says False.
+        flags_itself: whether it says itself when its answer is not to be trusted; the answers of others are compared
+            with the likelihood scan's (:mod:`otsync.align.vouch`).
     """
 
     needs_xyz: bool = True
+    flags_itself: bool = False
 
     def __call__(self, a: TrackSet, b: TrackSet, matches: Matches) -> Alignment:
         raise TypeError(f"{type(self).__name__}: an aligner is called with (a, b, matches); it defines no such call.")
@@ -38,6 +41,10 @@ class Foreign(Aligner):
     @property
     def needs_xyz(self) -> bool:  # type: ignore[override]
         return getattr(self.call, "needs_xyz", True)
+
+    @property
+    def flags_itself(self) -> bool:  # type: ignore[override]
+        return getattr(self.call, "flags_itself", False)
 
     def __call__(self, a: TrackSet, b: TrackSet, matches: Matches) -> Alignment:
         return self.call(a, b, matches)

@@ -9,6 +9,7 @@ from ..clocks.shutter import at_frame_times
 from ..types import Alignment, Matches, Refused, TrackSet, check_same_world
 from .likelihood import LikelihoodScan
 from .slot import Aligner, AlignerLike
+from .vouch import vouch
 
 
 def align(
@@ -32,6 +33,7 @@ def align(
     alignment = chosen(a, b, matches)
     seconds = alignment.stats.get("seconds", time.perf_counter() - started)
     alignment = replace(alignment, stats=alignment.stats | {"seconds": seconds})
+    alignment = vouch(alignment, a, b, matches, chosen)
     if throw and not alignment.status.ok:
         raise Refused("align", alignment)
     return alignment

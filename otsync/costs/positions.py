@@ -99,6 +99,11 @@ class SynchronousDistance:
 
     needs_xyz = True
 
+    @property
+    def clock(self) -> Clock:
+        """Of b against a."""
+        return Clock(self.offset, self.rate)
+
     def at(self, clock: Clock) -> SynchronousDistance:
         """The same at another clock."""
         return replace(self, offset=clock.offset, rate=clock.rate)

@@ -32,6 +32,16 @@ class Matcher:
         """
         return None
 
+    def checked_by(self, a: TrackSet, b: TrackSet) -> tuple[Cost, ...]:
+        """The costs by which its answer is checked."""
+        return self.costs
+
+    @property
+    def clock(self) -> Clock | None:
+        """The clock of b against a's that it compares by; None: it needs no time."""
+        told = (getattr(cost, "clock", None) for cost in self.costs)
+        return next((clock for clock in told if clock is not None), None)
+
     @property
     def needs_xyz(self) -> bool:
         """Whether it reads positions in space; one that reads pixels and features alone says False."""

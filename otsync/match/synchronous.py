@@ -9,7 +9,8 @@ from jaxtyping import Float, Int
 
 from ..clocks.splines import TrackSplines
 from ..costs.linear import Cosine, Cost, binary_scale, total_cost
-from ..types import Matches, Status, TrackSet
+from ..costs.positions import SynchronousDistance
+from ..types import Clock, Matches, Status, TrackSet
 from .slot import Matcher
 
 MOMENTS = 48
@@ -45,6 +46,16 @@ class SynchronousMatching(Matcher):
     rate: float = 1.0
     costs: tuple[Cost, ...] = (Cosine(),)
     limit: int = 2000
+
+    @property
+    def clock(self) -> Clock:
+        return Clock(self.offset, self.rate)
+
+    def checked_by(self, a: TrackSet, b: TrackSet) -> tuple[Cost, ...]:
+        """Features, and places at equal times in a common world frame."""
+        if a.frame is None or a.frame != b.frame:
+            return self.costs
+        return (*self.costs, SynchronousDistance(self.offset, rate=self.rate))
 
     def __call__(self, a: TrackSet, b: TrackSet) -> Matches:
         own_a, own_b = longest_seen(a, self.limit), longest_seen(b, self.limit)

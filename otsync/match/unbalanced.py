@@ -115,9 +115,9 @@ class UnbalancedFGW(StructuralMatcher):
         problem = Problem.of(a, b, self.costs, self.alpha)
         if problem.flat:
             return no_information(problem.M)
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # an inner loop that stops at its limit; the outer one tells
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # an inner loop that stops at its limit; the outer one tells
+            try:
                 plan, _, log = ot.gromov.fused_unbalanced_gromov_wasserstein(
                     problem.Ca,
                     problem.Cb,
@@ -132,8 +132,10 @@ class UnbalancedFGW(StructuralMatcher):
                     max_iter=self.max_iter,
                     log=True,
                 )
-        except ValueError:  # POT's word for a plan that has vanished
-            return Matches(np.zeros((0, 2), int), flags=(Status.FAILED,), stats={"mass": 0.0})
+            except ValueError as error:  # "There is NaN in coupling": costs of an outlier overflow its kernel
+                if "NaN" not in str(error):
+                    raise
+                return Matches(np.zeros((0, 2), int), flags=(Status.FAILED,))
         stats = {"objective": problem.objective(plan), "iterations": float(len(log["error"]))}
         return partners_of(plan, -problem.gradient(plan), self.partners, self.top, stats, False)
 

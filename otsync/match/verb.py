@@ -43,7 +43,7 @@ def match(
     started = time.perf_counter()
     matches = chosen(a, b)
     matches.check("matcher", len(a), len(b))
-    matches = vouch(matches, a, b, chosen.costs)
+    matches = vouch(matches, a, b, chosen.checked_by(a, b), chosen.clock)
     seconds = matches.stats.get("seconds", time.perf_counter() - started)
     matches = replace(matches, stats=matches.stats | {"seconds": seconds})
     if throw and not matches.status.ok:

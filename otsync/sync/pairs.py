@@ -44,11 +44,12 @@ def run(job: Job) -> Answer:
     try:
         given = job.matches if job.matches is not None else match(job.a, job.b, job.matcher, throw=False)
         matches = given.without_plan()
-        if not matches.status.ok and not (len(matches) and set(matches.flags) <= DOUBTS):
+        told = set(matches.flags) - {Status.FORCED}  # aligners bear wrong matches, and judge for themselves
+        if told and not (len(matches) and told <= DOUBTS):
             failed = Alignment(float("nan"), flags=matches.flags, stats=matches.stats)
             return Answer(job.pair, matches, failed, failed)
         scanned = align(job.a, job.b, matches, job.aligner, throw=False)
-        scanned = dataclasses.replace(scanned, flags=(*matches.flags, *scanned.flags))
+        scanned = dataclasses.replace(scanned, flags=(*(f for f in matches.flags if f in DOUBTS), *scanned.flags))
         refined = scanned
         if np.isfinite(scanned.offset):
             refined = refine(job.a, job.b, matches, scanned, job.refiner, throw=False)

@@ -15,6 +15,10 @@ class Status(StrEnum):
     """
 
     OK = "To be trusted."
+    FORCED = (
+        "Part of the matches join tracks that are nothing alike: what only one video sees was forced onto something. "
+        "Use only the best of them, or a matcher of partial or relaxed mass (PartialFGW, UnbalancedFGW, AnchoredFGW)."
+    )
     RATE_MISMATCH = (
         "The motion contradicts the declared frame rates. Check fps (29.97 against 30, 25 against 30) or the "
         "container's timestamps, or call with rate='fit' on a long clip."

@@ -8,14 +8,24 @@ import numpy as np
 
 from ...costs.linear import Labels
 from ...types import TrackSet
-from .case import FLAGGED, REFUSED, RIGHT, SOUND, Case, changed, cloud, mostly_identity, pair
+from .case import FLAGGED, REFUSED, RIGHT, SOUND, Case, changed, cloud, few_right, mostly_identity, pair
 
-DENSE = ("FusedGromovWasserstein", "EntropicFGW", "PartialFGW", "GromovWasserstein")
+DENSE = ("FusedGromovWasserstein", "EntropicFGW", "PartialFGW", "GromovWasserstein", "UnbalancedFGW", "SemirelaxedFGW")
 FEATURES_ONLY = ("NearestNeighbor", "OptimalTransport", "Sinkhorn")
+BY_FEATURES = (
+    *FEATURES_ONLY,
+    "Candidates",
+    "UnbalancedOT",
+    "FusedGromovWasserstein",
+    "EntropicFGW",
+    "PartialFGW",
+    "UnbalancedFGW",
+    "SemirelaxedFGW",
+    "AnchoredFGW",
+)
 BLIND = {name: "looks at features alone" for name in FEATURES_ONLY} | {
     "GromovWasserstein": "no features: what structure cannot tell it cannot know"
 }
-SYMMETRY = {name: "takes one of several equal answers" for name in (*DENSE, *FEATURES_ONLY)}
 identity = mostly_identity()
 
 
@@ -100,10 +110,8 @@ def never_together() -> tuple[TrackSet, TrackSet]:
     return tuple(replace(x, visible=np.eye(40, dtype=bool)) for x in pair(40))
 
 
-def refused(name: str, why: str, plain: str, message: str, make) -> Case:
-    return Case(
-        name, why, plain, "ValueError that names the argument, the tracks and the remedy", make, (REFUSED,), message
-    )
+def refused(name: str, why: str, message: str, make) -> Case:
+    return Case(name, why, "ValueError that names the argument, the tracks and the remedy", make, (REFUSED,), message)
 
 
 CASES: tuple[Case, ...] = (
@@ -112,7 +120,6 @@ CASES: tuple[Case, ...] = (
         Case(
             f"unit of length x {u:g}",
             "alpha weighs structure against features in that unit",
-            "structure ignored or alone; below 1e-4 CG stops early (tol_abs)",
             "one common median normalises; same matches",
             changed(pair, xyz=lambda x, u=u: x * u),
             (RIGHT,),
@@ -124,19 +131,16 @@ CASES: tuple[Case, ...] = (
         Case(
             f"features x {u:g}",
             "their squares leave the range of floats",
-            "nan, zeros, or the product plan",
             "rows are scaled before they are normalised; same matches",
             changed(pair, features=lambda f, u=u: f * u),
             (RIGHT,),
             check=identity,
-            limits={"GromovWasserstein": "no features"},
         )
         for u in (1e-310, 1e-200, 1e-30, 1e30, 1e200)
     ),
     Case(
         "origin 1e6 sizes away",
         "distances of large numbers cancel in single precision",
-        "Gram matrices lose all digits",
         "differences, in double precision before centring",
         changed(pair, xyz=lambda x: x + 1e6),
         (RIGHT,),
@@ -145,34 +149,29 @@ CASES: tuple[Case, ...] = (
     Case(
         "one track 50 x away",
         "dividing by the maximum wipes the structure out",
-        "recall falls by a third",
         "the median normalises",
         far_track(50.0),
         (RIGHT,),
         check=identity,
-        limits={"GromovWasserstein": "the outlier's squared distances are the objective"},
+        limits={
+            "GromovWasserstein": "the outlier's squared distances are the objective",
+            "SemirelaxedFGW": "the outlier's squared distances are the objective",
+            "UnbalancedFGW": "the outlier overflows POT's kernel",
+        },
     ),
     Case(
         "one track 1e6 x away",
         "its squared distances dwarf all others",
-        "its pairs decide the plan",
         "partial mass or truncation leaves it out, or the answer is flagged",
         far_track(1e6),
         SOUND,
         check=identity,
-        limits={
-            "GromovWasserstein": "the outlier's squared distances are the objective",
-            "FusedGromovWasserstein": "the outlier's squared distances are the objective",
-            "EntropicFGW": "ε is relative to a spread that the outlier sets",
-            "PartialFGW": "the outlier's squared distances steer the line search",
-        },
     ),
     # array types
     *(
         Case(
             f"{'big-endian ' if d == '>f4' else ''}{np.dtype(d).name} arrays",
             "solvers compute in the input's type",
-            "float32 entropic: a plan of zeros; integers: truncated plans",
             "positions become float32 or float64, plans are float64",
             changed(
                 lambda: pair(noise=0.1),
@@ -187,7 +186,6 @@ CASES: tuple[Case, ...] = (
     Case(
         "Fortran order and strides",
         "kernels assume contiguous rows",
-        "slow, or wrong",
         "copied where needed",
         changed(pair, xyz=np.asfortranarray, features=lambda f: np.repeat(f, 2, 1)[:, ::2]),
         (RIGHT,),
@@ -196,7 +194,6 @@ CASES: tuple[Case, ...] = (
     Case(
         "read-only arrays",
         "in-place work on the caller's data",
-        "an error, or data changed",
         "inputs are never written",
         changed(pair, xyz=lambda x: np.broadcast_to(x, x.shape), features=lambda f: np.broadcast_to(f, f.shape)),
         (RIGHT,),
@@ -206,51 +203,45 @@ CASES: tuple[Case, ...] = (
     refused(
         "nan in a visible sample",
         "comparisons with nan are false",
-        "product plan, mass 1, a warning",
         "finite values in visible",
         lambda: (replace(pair()[0], xyz=put(pair()[0].xyz, (3, 4, 0), np.nan)), pair()[1]),
     ),
     refused(
         "infinity in a visible sample",
         "inf - inf is nan",
-        "product plan, mass 1, a warning",
         "finite values in visible",
         lambda: (pair()[0], replace(pair()[1], xyz=put(pair()[1].xyz, (3, 4, 0), np.inf))),
     ),
     Case(
         "nan features",
         "they spread to every cost",
-        "product plan, a warning",
         "ValueError that names the tracks",
         changed(pair, features=lambda f: put(f, (2, 1), np.nan)),
         (REFUSED,),
         "expected finite values; tracks 2",
-        solvers=(*FEATURES_ONLY, "FusedGromovWasserstein", "EntropicFGW", "PartialFGW", "AnchoredFGW"),
+        solvers=BY_FEATURES,
     ),
     Case(
         "infinite features",
         "normalising gives nan",
-        "product plan, a warning",
         "ValueError that names the tracks",
         changed(pair, features=lambda f: put(f, (2, 1), np.inf)),
         (REFUSED,),
         "expected finite values; tracks 2",
-        solvers=(*FEATURES_ONLY, "FusedGromovWasserstein", "EntropicFGW", "PartialFGW", "AnchoredFGW"),
+        solvers=BY_FEATURES,
     ),
     Case(
         "a feature of zeros",
         "it has no direction",
-        "nan in the cost: product plan",
         "ValueError that names the tracks",
         changed(pair, features=lambda f: put(f, 5, 0)),
         (REFUSED,),
         "tracks 5 are all zero",
-        solvers=(*FEATURES_ONLY, "FusedGromovWasserstein", "EntropicFGW", "PartialFGW", "AnchoredFGW"),
+        solvers=BY_FEATURES,
     ),
     Case(
         "no features",
         "nothing for the linear term",
-        "TypeError",
         "ValueError with the remedy",
         changed(pair, features=lambda f: None),
         (REFUSED, RIGHT),
@@ -260,7 +251,6 @@ CASES: tuple[Case, ...] = (
     Case(
         "other feature dimensions",
         "the product does not exist",
-        "a shape error from inside",
         "ValueError that names both",
         lambda: (pair()[0], replace(pair()[1], features=np.ones((80, 5)))),
         (REFUSED, RIGHT),
@@ -270,7 +260,6 @@ CASES: tuple[Case, ...] = (
     Case(
         "pixels only",
         "D_track needs 3D",
-        "TypeError",
         "ValueError with the remedy, or features alone",
         lambda: tuple(TrackSet(None, features=x.features, uv=x.xyz[..., :2], fps=30) for x in pair()),
         (REFUSED, RIGHT),
@@ -280,21 +269,18 @@ CASES: tuple[Case, ...] = (
     refused(
         "no tracks",
         "empty sums",
-        "an assertion",
         "expected at least one track",
         lambda: (pair()[0].take(slice(0, 0)), pair()[1]),
     ),
     refused(
         "no frames",
         "empty maxima",
-        "an assertion",
         "expected at least one track and one frame",
         lambda: (TrackSet(np.zeros((5, 0, 3)), features=np.ones((5, 2)), fps=30), pair()[1]),
     ),
     Case(
         "300,000 tracks",
         "a dense matrix has 720 GB",
-        "MemoryError, or the machine swaps",
         "ValueError with the size, before anything is allocated",
         huge,
         (REFUSED, FLAGGED),
@@ -304,7 +290,6 @@ CASES: tuple[Case, ...] = (
     Case(
         "labels of other classes",
         "memberships do not meet",
-        "-",
         "ValueError that names the argument",
         lambda: tuple(replace(x, labels=np.ones((80, k))) for x, k in zip(pair(), (2, 3), strict=True)),
         (REFUSED,),
@@ -312,75 +297,56 @@ CASES: tuple[Case, ...] = (
         solvers=("AnchoredFGW, labels",),
     ),
     # sizes
-    Case(
-        "one track each", "one answer, no evidence", "runs, score 0", "flagged: no information", sized(1, 1), (FLAGGED,)
-    ),
+    Case("one track each", "one answer, no evidence", "flagged: no information", sized(1, 1), (FLAGGED,)),
     Case(
         "two tracks each",
         "one distance: exchanging them costs nothing",
-        "either",
         "features decide, or flagged",
         sized(2, 2),
-        check=lambda m: True,
+        check=few_right(2),
     ),
     Case(
         "three tracks each",
         "no handedness, hardly any structure",
-        "runs",
         "features decide",
         sized(3, 3),
-        check=lambda m: True,
+        check=few_right(3),
     ),
     Case(
         "one track against 80",
         "a plan must spread over all",
-        "matches forced",
         "one match at most",
         sized(1, 80),
-        check=lambda m: len(m) <= 1,
+        check=few_right(1),
     ),
     Case(
         "a is a subset of b",
         "balanced marginals force the rest of b onto something",
-        "matches forced",
         "one-to-one; the better half is right",
         sized(60, 120),
         (RIGHT,),
         check=mostly_identity(0.85),
-        limits={
-            "GromovWasserstein": "structure of a part differs from that of the whole",
-            "FusedGromovWasserstein": "marginals of the whole",
-            "EntropicFGW": "marginals of the whole",
-            "PartialFGW": "mass is a share of both",
-        },
+        limits={"GromovWasserstein": "structure of a part differs from that of the whole"},
     ),
     Case(
         "b is a subset of a",
         "as before, the other way",
-        "matches forced",
         "one-to-one; the better half is right",
         sized(120, 60),
         (RIGHT,),
         check=mostly_identity(0.85),
-        limits={
-            "GromovWasserstein": "structure of a part differs from that of the whole",
-            "FusedGromovWasserstein": "marginals of the whole",
-            "EntropicFGW": "marginals of the whole",
-            "PartialFGW": "mass is a share of both",
-        },
+        limits={"GromovWasserstein": "structure of a part differs from that of the whole"},
     ),
     Case(
         "400 against 20",
         "20 times as much mass on one side",
-        "matches forced",
         "at most 20 matches",
         sized(400, 20),
-        check=lambda m: len(m) <= 20,
+        check=identity,
     ),
     Case(
         "600 tracks, partial mass",
         "POT hands its outer iteration limit on as LP pivots",
-        "ValueError: increase dummy points",
         "LP limit raised",
         lambda: pair(600, 20),
         (RIGHT,),
@@ -390,7 +356,6 @@ CASES: tuple[Case, ...] = (
     Case(
         "grouped cells in another order",
         "quantised solvers answer in the order of their partition",
-        "plan in partition order",
         "indices of the caller",
         lambda: pair(400, 20),
         (RIGHT,),
@@ -400,7 +365,6 @@ CASES: tuple[Case, ...] = (
     Case(
         "T_a much larger than T_b",
         "maxima over 12 frames and over 400 differ",
-        "structure of different meaning",
         "normalised by one median; truncation",
         lambda: (pair(frames=400)[0], replace(pair(frames=400)[1], xyz=pair(frames=400)[1].xyz[:, :100], visible=None)),
         (RIGHT, FLAGGED),
@@ -409,7 +373,6 @@ CASES: tuple[Case, ...] = (
     Case(
         "one frame",
         "no motion, one pose",
-        "runs",
         "a pose is structure enough",
         lambda: pair(frames=1),
         (RIGHT,),
@@ -419,45 +382,36 @@ CASES: tuple[Case, ...] = (
     Case(
         "every track seen in one frame only",
         "hardly any pair is ever seen together",
-        "1e10 as distance becomes the strongest structure",
         "unknown distances get the median; features decide, or flagged",
         changed(pair, visible=lambda v: np.arange(40)[None] == np.random.default_rng(1).integers(0, 40, (80, 1))),
         check=identity,
-        limits={"GromovWasserstein": "no features"},
     ),
     Case(
         "tracks that never co-occur",
         "no distance is known",
-        "nan: product plan",
         "features decide, or flagged",
         never_together,
         check=identity,
-        limits={},
     ),
     Case(
         "half of the samples missing",
         "maxima over other frames",
-        "zeros or nan as positions",
         "co-visible frames only",
         gaps(0.5),
         (RIGHT,),
         check=identity,
-        limits={"GromovWasserstein": "few frames in common blur the structure"},
     ),
     Case(
         "90 % of the samples missing",
         "four frames a track",
-        "zeros or nan as positions",
         "co-visible frames only; features decide",
         gaps(0.9),
         (RIGHT, FLAGGED),
         check=mostly_identity(0.8),
-        limits={"GromovWasserstein": "few frames in common blur the structure"},
     ),
     Case(
         "a track that is never seen",
         "no position at all",
-        "nan spreads",
         "never matched by position",
         lambda: (replace(pair()[0], visible=put(pair()[0].seen, 7, False)), pair()[1]),
         (RIGHT,),
@@ -466,7 +420,6 @@ CASES: tuple[Case, ...] = (
     Case(
         "nothing is seen at all",
         "no structure, features alone",
-        "nan: product plan",
         "flagged by structure; features alone may answer",
         changed(pair, visible=lambda v: np.zeros_like(v)),
         (RIGHT, FLAGGED),
@@ -476,17 +429,14 @@ CASES: tuple[Case, ...] = (
     Case(
         "collinear tracks",
         "no plane, no handedness",
-        "runs",
         "structure of a line; features tell its ends apart",
         with_positions(lambda x: x[..., :1] * [1.0, 2, 3]),
         (RIGHT, FLAGGED),
         check=identity,
-        limits={"GromovWasserstein": "a line and its reverse"},
     ),
     Case(
         "coplanar tracks",
         "handedness is undefined",
-        "runs",
         "chirality abstains",
         with_positions(lambda x: x * [1.0, 1, 0]),
         (RIGHT,),
@@ -495,7 +445,6 @@ CASES: tuple[Case, ...] = (
     Case(
         "static scene",
         "no motion to compare",
-        "runs",
         "shape is structure",
         with_positions(lambda x: x[:, :1].repeat(40, 1)),
         (RIGHT,),
@@ -504,17 +453,14 @@ CASES: tuple[Case, ...] = (
     Case(
         "all tracks at one place",
         "no structure: features decide",
-        "division by a median of zero",
         "unit 1; features decide",
         changed(pair, xyz=lambda x: np.zeros_like(x)),
         (RIGHT, FLAGGED),
         check=identity,
-        limits={},
     ),
     Case(
         "all features equal",
         "structure decides",
-        "an arbitrary isometry where there are several",
         "structure decides; chirality looks for mirrors",
         changed(pair, features=lambda f: np.ones_like(f)),
         (RIGHT, FLAGGED),
@@ -523,7 +469,6 @@ CASES: tuple[Case, ...] = (
     Case(
         "features and places all equal",
         "C = M = 0: every plan is optimal",
-        "product plan, not a word",
         "flagged: no information",
         changed(pair, features=lambda f: np.ones_like(f), xyz=lambda x: np.zeros_like(x)),
         (FLAGGED,),
@@ -531,26 +476,21 @@ CASES: tuple[Case, ...] = (
     Case(
         "every track twice",
         "equal rows",
-        "arbitrary split",
         "deterministic; twins may be exchanged",
         lambda: tuple(x.take(np.repeat(np.arange(60), 2)) for x in pair(60)),
         (RIGHT,),
-        check=lambda m: float((m.pairs[:, 0] // 2 == m.pairs[:, 1] // 2).mean()) > 0.9,
+        check=mostly_identity(0.9, of=lambda k: k // 2),
     ),
     Case(
         "one-dimensional features",
         "a cosine of ±1",
-        "ties everywhere",
         "structure decides, or flagged",
         changed(pair, features=lambda f: np.sign(f[:, :1])),
         check=identity,
-        limits=BLIND
-        | {"FusedGromovWasserstein": "signs of features mislead", "EntropicFGW": "signs of features mislead"},
     ),
     Case(
         "features that cancel",
         "their mean, or a cell's, is zero",
-        "division by zero",
         "a cell takes a member's feature",
         lambda: tuple(replace(x, features=np.concatenate([x.features[:40], -x.features[:40]])) for x in pair()),
         (RIGHT,),
@@ -559,16 +499,18 @@ CASES: tuple[Case, ...] = (
     Case(
         "features that a camera shifts",
         "a common offset hides the differences",
-        "cosines near 1",
         "each video's mean is subtracted",
         lambda: (pair()[0], replace(pair()[1], features=pair()[1].features + 30)),
         (RIGHT,),
         check=identity,
+        limits={
+            "UnbalancedOT": "features as given, not centred, by default",
+            "Candidates": "features as given, not centred, by default",
+        },
     ),
     Case(
         "a mirrored scene",
         "distances cannot see it",
-        "confident",
         "chirality: flagged ambiguous",
         lambda: (pair()[0], replace(pair()[1], xyz=pair()[1].xyz * [1, 1, -1])),
         (FLAGGED,),
@@ -576,7 +518,6 @@ CASES: tuple[Case, ...] = (
     Case(
         "mirror image, features equal",
         "any isometry will do",
-        "any isometry",
         "chirality: flagged",
         lambda: tuple(
             replace(x, features=np.ones_like(x.features), xyz=x.xyz * [1, 1, s])
@@ -587,17 +528,14 @@ CASES: tuple[Case, ...] = (
     Case(
         "two identical objects exchanged",
         "the swap costs the same",
-        "one of the two, confident",
         "AnchoredFGW: a challenger finds the other answer: ambiguous",
         two_copies,
         (FLAGGED, RIGHT),
         check=lambda m: False,
-        limits=SYMMETRY,
     ),
     Case(
         "two identical objects, labelled",
         "labels break the symmetry",
-        "-",
         "the Labels cost settles it",
         lambda: tuple(replace(x, labels=np.repeat([0, 1], 60)) for x in two_copies()),
         (RIGHT,),
@@ -608,16 +546,13 @@ CASES: tuple[Case, ...] = (
     Case(
         "unrelated videos",
         "there is always a cheapest plan",
-        "as confident as ever",
         "features of the better half hardly beat chance: no match",
         unrelated,
         (FLAGGED,),
-        limits={"GromovWasserstein": "structure alone cannot tell"},
     ),
     Case(
         "noise for features",
         "only structure can tell",
-        "EMD: random matches",
         "features that do not beat chance: flagged, or structure decides",
         lambda: tuple(
             replace(x, features=np.random.default_rng(k).normal(size=(120, 128))) for k, x in enumerate(pair(120))
@@ -628,38 +563,30 @@ CASES: tuple[Case, ...] = (
     Case(
         "a third outliers in b",
         "marginals force them onto something",
-        "a third of the matches wrong",
         "scores rank them last",
         outliers(0.33),
         (RIGHT,),
         check=identity,
         limits={
+            "GromovWasserstein": "no features",
             "FusedGromovWasserstein": "balanced: outliers are forced onto something",
             "EntropicFGW": "balanced: outliers are forced onto something",
-            "GromovWasserstein": "no features",
+            "SemirelaxedFGW": "one marginal is balanced",
         },
     ),
     Case(
         "two thirds outliers in b",
         "most of the mass is wrong",
-        "most matches wrong",
         "the better half is right, or flagged",
         outliers(0.66),
         (RIGHT, FLAGGED),
-        check=lambda m: float((m.best(25).pairs[:, 0] == m.best(25).pairs[:, 1]).mean()) > 0.8,
-        limits={
-            "GromovWasserstein": "no features",
-            "FusedGromovWasserstein": "balanced",
-            "EntropicFGW": "balanced",
-            "PartialFGW": "mass .65 is more than there is",
-        },
+        check=mostly_identity(0.8, 25),
     ),
     # solver parameters
     *(
         Case(
             f"{solver}, ε = {reg:g}",
             "exp(-C/ε) underflows",
-            "all-zero plan and a warning, or nan",
             "stabilised; the plan is rounded to its marginals",
             pair,
             (RIGHT, FLAGGED),
@@ -671,7 +598,6 @@ CASES: tuple[Case, ...] = (
     Case(
         "POT's torch back end",
         "tensors in, tensors out",
-        "-",
         "same plan as numpy",
         pair,
         (RIGHT,),

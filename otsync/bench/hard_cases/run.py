@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ...progress import counted
 from ..record import table, write_rows
-from . import aligning, matching
+from . import adversaries, aligning, epipolar, graphs, matching, rematching
 from .case import Case
 from .solvers import (
     SPECIAL,
@@ -17,27 +18,70 @@ from .solvers import (
     accepted,
     aligners,
     aligning_solver,
+    flattening_solver,
+    graph_solver,
     matchers,
     matching_solver,
     outcome,
     refiners,
     refining_solver,
+    rematchers,
+    rematching_solver,
+    scanning_solver,
     watchdog,
 )
+from .solvers import graphs as combinations
 
 LONGEST = 600
 """Seconds that a solver may take on a row: more is a hang, even on a slow and busy machine (usual: below one)."""
 
 
-def rows() -> Iterator[tuple[Case, str, Solver]]:
-    """(case, name of the solver, solver) for every row of the catalogue and every solver that it is for."""
+@dataclass(frozen=True)
+class Section:
+    """The rows of one slot and who runs them."""
+
+    title: str
+    cases: tuple[Case, ...]
+    solvers: dict[str, Solver]
+
+    def rows(self) -> Iterator[tuple[Case, str, Solver]]:
+        """Every row with every solver that it is for."""
+        for case in self.cases:
+            for name in case.solvers or [n for n in self.solvers if n not in SPECIAL]:
+                yield case, name, self.solvers[name]
+
+
+def sections() -> tuple[Section, ...]:
+    """The catalogue: every slot, its rows, and every algorithm that goes in it."""
     to_match = {name: matching_solver(m) for name, m in (matchers() | SPECIAL).items()}
     to_align = {name: aligning_solver(a) for name, a in aligners().items()}
     to_align |= {name: refining_solver(r) for name, r in refiners().items()}
-    for cases, solvers in ((matching.CASES, to_match), (aligning.CASES, to_align)):
-        for case in cases:
-            for name in case.solvers or [n for n in solvers if n not in SPECIAL]:
-                yield case, name, solvers[name]
+    return (
+        Section("Matching", matching.CASES, to_match),
+        Section(
+            "Matching once more at known times",
+            rematching.CASES,
+            {name: rematching_solver(at) for name, at in rematchers().items()},
+        ),
+        Section("Aligning and refining", aligning.CASES, to_align),
+        Section("Confident and wrong: the classes of the issue Trust", adversaries.CASES, to_align),
+        Section(
+            "Aligning and refining without depth",
+            epipolar.CASES,
+            {"EpipolarScan": scanning_solver, "EpipolarRefine": flattening_solver},
+        ),
+        Section(
+            "Many videos: the graph of pairs",
+            graphs.CASES,
+            {name: graph_solver(graph) for name, graph in combinations().items()},
+        ),
+    )
+
+
+def rows() -> Iterator[tuple[Case, str, Solver]]:
+    """(case, name of the solver, solver) for every row of the catalogue and every solver that it is for."""
+    for section in sections():
+        yield from section.rows()
 
 
 def run(out: Path, *, only: Sequence[str] = ()) -> int:

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tslearn.metrics import dtw_path_from_metric
 
-from otsync import DTW, ConstantShift, Matches, Refused, Status, TrackSet, align
+from otsync import DTW, Alignment, ConstantShift, Matches, Refused, Status, TrackSet, align
 from otsync.align.kernels import open_end_path
 from otsync.align.peaks import most_frequent, peak
 
@@ -102,7 +102,7 @@ def test_corner_to_corner_pays_for_large_offsets_and_open_ends_do_not():
         a, b, matches = films(seed, 1.5)
         biased = replace(b, xyz=b.xyz + np.random.default_rng(seed).normal(size=(12, 1, 3)))
         for errors, aligner in ((paper, DTW()), (open_ends, DTW(open_ends=True))):
-            errors.append(abs(align(a, biased, matches, aligner).frames - 45))
+            errors.append(abs(align(a, biased, matches, aligner, throw=False).frames - 45))
     assert np.mean(paper) > 3 * np.mean(open_ends)
 
 
@@ -137,7 +137,8 @@ def test_nothing_to_compare_is_said(aligner):
 def test_too_short_for_the_required_overlap_is_said():
     a, b, matches = films(7, 0.0, frames=20)
     assert align(a, b, matches, ConstantShift(), throw=False).status is Status.NO_OVERLAP
-    assert align(a, b, matches, ConstantShift(min_overlap=0.5)).frames == pytest.approx(0, abs=0.3)
+    found = align(a, b, matches, ConstantShift(min_overlap=0.5), throw=False)
+    assert found.frames == pytest.approx(0, abs=0.3) and not found.status.ok  # 20 frames vouch for nothing
 
 
 @pytest.mark.parametrize("aligner", ALIGNERS, ids=str)
@@ -162,7 +163,8 @@ def test_different_declared_worlds_are_refused():
 
 def test_max_lag_bounds_the_search():
     a, b, matches = films(8, 1.0)
-    found = align(a, b, matches, ConstantShift(max_lag=0.5))
+    found = align(a, b, matches, ConstantShift(max_lag=0.5), throw=False)
+    assert not found.status.ok  # the best shift lies beyond
     assert abs(found.offset) <= 0.5 + 1 / 60 and np.abs(found.curve[:, 0]).max() <= 0.5 + 1e-9
 
 
@@ -177,3 +179,25 @@ def test_bad_arguments_are_refused_by_name():
         align(a, b, matches, DTW(cost="acceleration"))  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"b\.xyz: expected 3D positions"):
         align(a, TrackSet(None, uv=np.zeros((12, 5, 2)), fps=30), matches)
+
+
+def test_answers_without_flags_of_their_own_get_a_second_opinion():
+    """DTW says nothing of its doubts: its answer carries the likelihood scan's, and DISAGREE where that answers else."""
+    a, b, matches = films(3, 0.5)
+    right = align(a, b, matches, ConstantShift())
+    assert right.status is Status.OK and right.frames == pytest.approx(15, abs=0.3)
+    elsewhere = align(a, b, matches, lambda a, b, m: Alignment(-0.7, fps=30.0), throw=False)
+    assert elsewhere.offset == -0.7 and elsewhere.flags == (Status.DISAGREE,)
+    still = [replace(t, xyz=t.xyz[:, :1] + 1e-4 * np.random.default_rng(1).normal(size=t.xyz.shape)) for t in (a, b)]
+    assert not align(*still, matches, DTW(), throw=False).status.ok
+
+
+def test_somebody_else_who_does_the_same_later_is_flagged_in_one_world_frame():
+    """Velocities do not see where things are. Without a declared frame nothing says that places should agree."""
+    a, b, matches = films(4, 0.5)
+    here, there = (replace(t, xyz=t.xyz + np.array([x, 0, 0]), frame="world") for t, x in ((a, 0.0), (b, 8.0)))
+    found = align(here, there, matches, throw=False)
+    assert Status.AMBIGUOUS in found.flags and found.stats["apart"] > 1.2
+    same = align(here, replace(b, frame="world"), matches)
+    assert same.status is Status.OK and same.stats["apart"] < 0.5
+    assert align(a, replace(there, frame=None), matches).status is Status.OK

@@ -82,14 +82,17 @@ def test_videos_may_have_different_numbers_of_tracks_and_frames(pair, matcher):
     fewer = b.take(np.sort(where[:40]))
     fewer = replace(fewer, xyz=fewer.xyz[:, :30], visible=fewer.visible[:, :30])
     found = match(a, fewer, matcher, throw=False)
-    assert found.status.ok and 0 < len(found) <= 40
+    assert 0 < len(found) <= 40
     found.check("found", 60, 40)
+    # the structure of a part differs from that of the whole: without features it misleads, and that is said
+    right = (np.searchsorted(np.sort(where[:40]), where[found.pairs[:, 0]]) == found.pairs[:, 1]).mean()
+    assert found.status.ok or (isinstance(matcher, GromovWasserstein) and right < 0.5)
 
 
 @pytest.mark.parametrize("matcher", [m for m in ALL if not isinstance(m, NearestNeighbor)], ids=name)
 def test_plans_meet_their_marginals(pair, matcher):
     a, b, _ = pair
-    found = match(a, b.take(slice(0, 45)), matcher)
+    found = match(a, b.take(slice(0, 45)), matcher, throw=False)
     mass = getattr(matcher, "mass", 1.0)
     assert abs(found.plan.sum() - mass) < 1e-6 and found.stats["marginal_error"] < 1e-6
     rows, columns = found.plan.sum(1) - 1 / 60, found.plan.sum(0) - 1 / 45
@@ -252,7 +255,8 @@ def test_matchers_refuse_nonsense(make):
 
 def test_any_callable_is_a_matcher_and_its_indices_are_checked(pair):
     a, b, _ = pair
-    assert match(a, b, lambda a, b: Matches(np.array([[1, 2]]))).pairs.tolist() == [[1, 2]]
+    one = match(a, b, lambda a, b: Matches(np.array([[1, 2]])), throw=False)
+    assert one.pairs.tolist() == [[1, 2]] and one.flags == (Status.FEW_MATCHES,)
     with pytest.raises(ValueError, match=r"matcher\.pairs: expected indices of b below 60; found 60"):
         match(a, b, lambda a, b: Matches(np.array([[1, 60]])))
 

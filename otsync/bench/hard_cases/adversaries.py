@@ -1,0 +1,179 @@
+"""Scenes that answer confidently and wrongly: the classes of the issue Trust, as rows of aligners and refiners."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...types import Matches, TrackSet
+from .case import FLAGGED, RIGHT, Case, cloud, near
+
+N, FRAMES = 40, 150
+ALL = Matches(np.stack([np.arange(N)] * 2, 1))
+TRUST = "Trust"
+Given = tuple[TrackSet, TrackSet, Matches]
+
+
+def filmed(xyz: np.ndarray, seed: int, noise: float = 0.005) -> TrackSet:
+    moved = xyz + noise * np.random.default_rng(seed).normal(size=xyz.shape)
+    return TrackSet(moved, fps=30, frame="world")
+
+
+def canon(later: int = 20) -> Given:
+    """Two dancers do the same, the second ``later`` frames afterwards, two metres away; each video sees one of them.
+
+    The videos started together: the true offset is 0.
+    """
+    dance = cloud(N, FRAMES + later, 21, 0.4)
+    first, second = dance[:, later:], dance[:, :FRAMES] + [2.0, 0, 0]
+    return filmed(first, 1), filmed(second, 2), ALL
+
+
+def takes() -> Given:
+    """Two takes of one choreography at one place, with a little freedom: there is no true offset."""
+    dance, freedom = cloud(N, FRAMES, 22, 0.5), cloud(N, FRAMES, 23, 0.03)
+    return filmed(dance, 1), filmed(dance + freedom - freedom[:, :1], 2), ALL
+
+
+def drift(seed: int, size: float) -> np.ndarray:
+    """(1, FRAMES, 3): one smooth motion that all tracks of a video share."""
+    motion = cloud(1, FRAMES, seed)
+    return size * (motion - motion[:, :1])
+
+
+def transient() -> Given:
+    """A static scene whose trackers settle in the same way during the first half second of each video."""
+    still = cloud(N, 1, 24).repeat(FRAMES, 1)
+    settle = 0.2 * np.exp(-np.arange(FRAMES) / 8.0)[None, :, None] * np.array([1.0, 0.3, 0.2])
+    return filmed(still + settle, 1), filmed(still + settle, 2), ALL
+
+
+def common_drift() -> Given:
+    """A static scene; both calibrations drift in the same way in each video's own clock."""
+    still = cloud(N, 1, 25).repeat(FRAMES, 1)
+    return filmed(still + drift(26, 0.5), 1), filmed(still + drift(26, 0.5), 2), ALL
+
+
+def frozen(frames: int) -> Given:
+    """b repeats a frame for a while and goes on where the scene is by then: its clock jumps."""
+    xyz = cloud(N, FRAMES + 40, 27)
+    late = 10
+    b = np.concatenate([xyz[:, late : late + 75], xyz[:, late + 75 - frames : late + FRAMES - frames]], 1)
+    return filmed(xyz[:, :FRAMES], 1), filmed(b, 2), ALL
+
+
+def dropped(frames: int) -> Given:
+    """b lost ``frames`` frames in the middle and does not say so."""
+    xyz = cloud(N, FRAMES + 60, 28)
+    late = 10
+    b = np.concatenate([xyz[:, late : late + 75], xyz[:, late + 75 + frames : late + FRAMES + frames]], 1)
+    return filmed(xyz[:, :FRAMES], 1), filmed(b, 2), ALL
+
+
+def rated(rate: float, frames: int) -> Given:
+    from scipy.interpolate import CubicSpline
+
+    xyz = cloud(N, round(frames * rate) + 60, 29)
+    b = CubicSpline(np.arange(xyz.shape[1]), xyz, axis=1)(10 + rate * np.arange(frames))
+    return filmed(xyz[:, :frames], 1), filmed(b, 2), ALL
+
+
+def like_in_two_places() -> Given:
+    """Two like performers in unison, two metres apart; each video sees the other one."""
+    dance = cloud(N, FRAMES + 10, 33, 0.4)
+    return filmed(dance[:, :FRAMES], 1), filmed(dance[:, 10:] + [2.0, 0, 0], 2), ALL
+
+
+def half_canon(later: int = 20) -> Given:
+    """As :func:`canon`, but half of the matches join the same dancer: those tell the truth."""
+    dance = cloud(N // 2, FRAMES + later, 34, 0.4)
+    first, second = dance[:, later:], dance[:, :FRAMES] + [2.0, 0, 0]
+    beside = first + np.array([0.05, 0, 0])
+    both = np.concatenate([first, beside]), np.concatenate([first, second])
+    return filmed(both[0], 1), filmed(both[1], 2), ALL
+
+
+wrong_anywhere = near(1e9)
+
+CASES: tuple[Case, ...] = (
+    Case(
+        "canon: somebody else, later",
+        "the second dancer does the same twenty frames later; each video sees one of them",
+        "one declared world frame: what is matched must be at one place at the answer",
+        canon,
+        (FLAGGED, RIGHT),
+        check=near(0.0),
+    ),
+    Case(
+        "somebody else in unison, declared frame",
+        "motions agree, places never do",
+        "flagged, or right",
+        like_in_two_places,
+        (FLAGGED, RIGHT),
+        check=near(1 / 3),
+    ),
+    Case(
+        "canon, half of the matches right",
+        "two offsets, each with half of the votes",
+        "flagged, or right",
+        half_canon,
+        (FLAGGED, RIGHT),
+        check=near(0.0),
+    ),
+    Case(
+        "two takes of one choreography",
+        "motions agree, and places too",
+        "flagged: there is no true offset",
+        takes,
+        (FLAGGED,),
+        check=wrong_anywhere,
+        open=TRUST,
+    ),
+    Case(
+        "trackers that settle",
+        "a static scene; all tracks of a video move alike at its beginning",
+        "flagged",
+        transient,
+        (FLAGGED,),
+        check=wrong_anywhere,
+        open=TRUST,
+    ),
+    Case(
+        "a drift of both calibrations",
+        "a static scene; all tracks of a video move alike",
+        "flagged",
+        common_drift,
+        (FLAGGED,),
+        check=wrong_anywhere,
+        open=TRUST,
+    ),
+    *(
+        Case(
+            f"a freeze of {k} frames",
+            "one offset before it, another behind it",
+            "flagged",
+            lambda k=k: frozen(k),
+            (FLAGGED,),
+            check=wrong_anywhere,
+            open=TRUST,
+        )
+        for k in (15, 30)
+    ),
+    Case(
+        "ten frames dropped",
+        "one offset before them, another behind them",
+        "flagged",
+        lambda: dropped(10),
+        (FLAGGED,),
+        check=wrong_anywhere,
+        open=TRUST,
+    ),
+    Case(
+        "frame rate wrong by 1 %, 12 s",
+        "wrong by frames at both ends",
+        "flagged",
+        lambda: rated(1.01, 360),
+        (FLAGGED,),
+        check=wrong_anywhere,
+        open=TRUST,
+    ),
+)
