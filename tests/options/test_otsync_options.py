@@ -354,7 +354,9 @@ def test_what_decides_where_some_pairs_do_not_vouch_for_themselves(option, films
 
 def test_frames_of_their_own(tmp_path):
     """--frames own finds transforms, heeds matcher and graph, and refuses what needs a common frame."""
-    tracks, _ = simulate("basketball", preset="clean", videos=3, own_frames=True, frames=90, seed=5, max_offset=8)
+    tracks, _ = simulate(
+        "basketball", preset="clean", videos=3, own_frames=True, frames=75, tracks=50, seed=5, max_offset=8
+    )
     for t in tracks:
         t.save(tmp_path / f"{t.name}.npz")
     files = [str(p) for p in sorted(tmp_path.glob("*.npz"))]

@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from ...types import Matches, TrackSet
-from .case import FLAGGED, RIGHT, Case, cloud, near
+from .case import FLAGGED, RIGHT, TRUST, Case, cloud, near
 
 N, FRAMES = 40, 150
 ALL = Matches(np.stack([np.arange(N)] * 2, 1))
-TRUST = "Trust"
 Given = tuple[TrackSet, TrackSet, Matches]
 
 

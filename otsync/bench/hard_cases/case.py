@@ -13,6 +13,9 @@ from ...types import Alignment, Matches, TrackSet
 RIGHT, FLAGGED, REFUSED = "right", "flagged", "refused"
 SOUND = (RIGHT, FLAGGED, REFUSED)
 
+TRUST = "Trust"
+"""The open issue about scenes that answer confidently and wrongly."""
+
 
 @dataclass(frozen=True)
 class Case:

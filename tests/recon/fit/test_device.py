@@ -146,14 +146,14 @@ def given(capture, scene):
     [
         plain,
         densified,
-        blurred,
+        pytest.param(blurred, marks=pytest.mark.slow),
         turning,
-        dual_quaternions,
+        pytest.param(dual_quaternions, marks=pytest.mark.slow),
         per_gaussian,
         static,
         per_video,
         view_dependent,
-        joint,
+        pytest.param(joint, marks=pytest.mark.slow),
         given,
     ],
     ids=lambda case: case.__name__,
@@ -161,7 +161,7 @@ def given(capture, scene):
 def test_a_fit_elsewhere_is_the_fit_here(capture, scene, second, case):
     """The definitions in torch instead of the kernels, a few steps: the same but for rounding, and back on the CPU."""
     start, footage, options = case(capture, scene)
-    options = {"steps": 4, **options}
+    options = {"steps": 2, **options}
     here = fit(start, footage, believed(capture), **options)
     there = fit(start.to(second), footage, believed(capture), **options)
     parts = {**vars(there.scene.dynamic), **there.scene.motion.parameters(), **there.parameters}
