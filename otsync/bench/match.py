@@ -66,6 +66,9 @@ MATCHERS: dict[str, tuple[MatcherLike, int]] = {
 }
 
 
+LIMIT = 60.0
+"""CPU seconds that a matcher may take for a world."""
+
 OTHERS_LARGEST = 2000
 """Largest size at which a matcher without a row of its own is tried: a dense one takes a minute there."""
 
@@ -95,7 +98,7 @@ def run(
     sizes: tuple[int, ...] = SIZES,
     seeds: int | None = None,
     first_seed: int | None = None,
-    limit: float = 60.0,
+    limit: float = LIMIT,
     only: tuple[str, ...] = (),
     promises: bool = False,
     gate: bool = False,
@@ -113,8 +116,12 @@ def run(
             Neither looks at matchers without a row in :data:`MATCHERS`, or at other packages' without one there.
     """
     if promises:
-        if only:
-            raise ValueError("only, promises: expected one of them; found both. The promises are of AnchoredFGW.")
+        for name, given in (("only", only), ("sizes", sizes != SIZES), ("limit", limit != LIMIT)):
+            if given:
+                raise ValueError(
+                    f"{name}, promises: expected one of them; found both. The promises are of AnchoredFGW at sizes of "
+                    "their own."
+                )
         chosen = {"seeds": seeds, "first_seed": first_seed}
         return match_limits.run(out, **{name: value for name, value in chosen.items() if value is not None})
     seeds, first_seed = 2 if seeds is None else seeds, 9000 if first_seed is None else first_seed

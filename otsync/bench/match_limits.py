@@ -17,6 +17,7 @@ from ..progress import counted
 from ..simulate import matching_world
 from ..types import TrackSet
 from .record import table, write_rows
+from .sync_acceptance import Check, at_least
 
 SCENES: dict[str, dict[str, float]] = {
     "no left/right cue": {"left_right": 0.0},
@@ -27,7 +28,10 @@ SCENES: dict[str, dict[str, float]] = {
 
 
 def run(out: Path, *, n: int = 4000, seeds: int = 6, pairs: int = 20, first_seed: int = 9500) -> int:
-    """Measure everything, print the tables, write CSV and JSON; nothing is tuned on these seeds."""
+    """Measure everything, print the tables, write CSV and JSON; nothing is tuned on these seeds.
+
+    0, or 1 when one of :func:`promises` is missed.
+    """
     seeds_used = range(first_seed, first_seed + seeds)
     hard = [scene(name, n, seeds_used, options) for name, options in SCENES.items()]
     print(f"AnchoredFGW, N = {n}, {seeds} fresh seeds:\n{table(hard)}\n")
@@ -38,7 +42,25 @@ def run(out: Path, *, n: int = 4000, seeds: int = 6, pairs: int = 20, first_seed
     print(table(speed))
     write_rows(out, "match_trust", trust)
     write_rows(out, "track_distance", speed)
-    return 0
+    checks = promises(hard, trust, speed)
+    print(f"\n{table([c.row() for c in checks])}")
+    write_rows(out, "match_promises", [c.row() for c in checks], {"n": n, "first_seed": first_seed})
+    return 0 if all(c.met for c in checks) else 1
+
+
+def promises(hard: list[dict[str, Any]], trust: list[dict[str, Any]], speed: list[dict[str, Any]]) -> tuple[Check, ...]:
+    """What matching promises. Speed is a ratio within one run."""
+    worst = {row["scene"]: row["worst_p50"] for row in hard}
+    share = {row["what"]: row["count"] / row["of"] for row in trust}
+    ours, numpys = (row["cpu_seconds"] for row in speed)
+    return (
+        at_least("no left/right cue: worst P50", worst["no left/right cue"], 0.85),
+        *(
+            at_least(f"{what}: share", value, 0.95 if what == "related scenes matched" else 1.0)
+            for what, value in share.items()
+        ),
+        at_least("D_track: times as fast as numpy's Gram", numpys / ours, 10.0),
+    )
 
 
 def scene(name: str, n: int, seeds: range, options: dict[str, Any]) -> dict[str, Any]:

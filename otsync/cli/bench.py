@@ -12,7 +12,19 @@ import tyro
 
 from ..bench import suites
 
-BENCH_OPTIONS = ("scene", "gate", "rebase", "promises", "first_seed", "seeds", "only", "json", "cache")
+BENCH_OPTIONS = (
+    "scene",
+    "gate",
+    "rebase",
+    "promises",
+    "first_seed",
+    "seeds",
+    "only",
+    "sizes",
+    "limit",
+    "json",
+    "cache",
+)
 """Options that a suite may take: each is handed on when it is set, and refused by suites that do not take it."""
 
 
@@ -50,6 +62,10 @@ class Bench:
     """For core, match, sync, chain and own-frames: how many seeds; default: the suite's own."""
     only: tuple[str, ...] = ()
     """For match, hard-cases and chain: names of the solvers to run; default: all."""
+    sizes: tuple[int, ...] = ()
+    """For match: numbers of tracks; default: 200 to 50,000."""
+    limit: float | None = None
+    """For match: CPU seconds that a matcher may take for a world; default: 60."""
     json: bool = False
     """For panoptic and own-frames: one line of JSON on standard output instead of tables."""
     cache: Path | None = None
@@ -84,7 +100,11 @@ class Bench:
             value = getattr(self, name)
             if value is not None and value < least:
                 raise ValueError(f"{spelled(name)}: expected {least} or more; found {value}.")
-        for name in ("first_seed", "seeds", "only", "promises"):
+        if any(size < 1 for size in self.sizes):
+            raise ValueError(f"--sizes: expected 1 or more; found {self.sizes}.")
+        if self.limit is not None and not self.limit > 0:
+            raise ValueError(f"--limit: expected seconds above 0; found {self.limit}.")
+        for name in ("first_seed", "seeds", "only", "promises", "sizes", "limit"):
             if (self.gate or self.rebase) and getattr(self, name) not in (None, (), False):
                 raise ValueError(
                     f"{spelled(name)}: expected without --gate and --rebase: a baseline is of the suite's own runs."

@@ -561,6 +561,8 @@ def test_options_of_bench_reach_a_suite_or_are_refused(tmp_path):
             (["--first-seed", "3"], {"first_seed": 3}),
             (["--seeds", "2"], {"seeds": 2}),
             (["--only", "a", "b"], {"only": ("a", "b")}),
+            (["--sizes", "20", "50"], {"sizes": (20, 50)}),
+            (["--limit", "600"], {"limit": 600.0}),
             (["--json"], {"json": True}),
             (["--cache", "kept"], {"cache": Path("kept")}),
         ):
@@ -596,7 +598,7 @@ def rows() -> set[str]:
         "simulate": "out motion preset videos frames fps max_offset own_frames seed",
         "init": "folder out reader fps force",
         "check": "scene every_frame allow_outside",
-        "bench": "suite scene out gate rebase promises first_seed seeds only json cache",
+        "bench": "suite scene out gate rebase promises first_seed seeds only sizes limit json cache",
         "plugins": "json",
     }
     shared = {row.replace("match matcher", "sync matcher") for row in algorithms if "matcher:" in row}  # the same slot

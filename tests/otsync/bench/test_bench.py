@@ -166,3 +166,26 @@ def test_the_gate_compares_figures_of_the_baseline_alone(tmp_path, monkeypatch, 
     assert record.gate("toy", {"error": float("nan")}, worse) == 1
     assert record.gate("toy", {"of a plugin": 9.0}, worse) == 1
     assert "error is in the baseline and was not measured" in capsys.readouterr().err
+
+
+def test_a_missed_promise_of_matching_is_told():
+    from otsync.bench.match_limits import promises
+
+    def made(worst: float, told: int, ours: float) -> list[bool]:
+        hard = [{"scene": "no left/right cue", "worst_p50": worst}]
+        trust = [
+            {"what": "related scenes matched", "of": 20, "count": 19},
+            {"what": "unrelated scenes: no match", "of": 20, "count": told},
+        ]
+        return [c.met for c in promises(hard, trust, [{"cpu_seconds": ours}, {"cpu_seconds": 5.0}])]
+
+    assert all(made(0.9, 20, 0.2))
+    assert made(0.8, 19, 1.0) == [False, True, False, False]
+
+
+@pytest.mark.parametrize("option", [{"only": ("AnchoredFGW",)}, {"sizes": (200,)}, {"limit": 9.0}])
+def test_promises_of_matching_take_no_options_of_the_table(option, tmp_path):
+    from otsync.bench.match import run
+
+    with pytest.raises(ValueError, match=f"{next(iter(option))}, promises"):
+        run(tmp_path, promises=True, **option)
