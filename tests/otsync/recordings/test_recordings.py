@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 import pytest
 
+from otsync import DTW, PAPER, Graph, Method, OptimalTransport, PartialFGW, SplineRefine, Unrefined, synchronize
 from otsync.cli import main
 from otsync.files.digest import content_key
 from otsync.io import open_scene
@@ -24,7 +25,7 @@ from otsync.plugins import forget, register
 from otsync.priors import Cache, ChainedFlow, Daisy, MedianBackground
 from otsync.recordings.kept_pairs import KeptPairs, pack, unpack
 from otsync.recordings.routes import choose_route, synchronize_scene, without_times
-from otsync.recordings.stages import Stages, stages_from, with_labels
+from otsync.recordings.stages import PIXELS, SPACE, Stages, stages_from, with_labels, with_method
 from otsync.recordings.tracking import Tracking, track_labels
 from otsync.sync.pairs import Job, run
 from otsync.types import Offsets
@@ -201,11 +202,15 @@ def test_given_depth_takes_the_tracks_route(tmp_path):
     for video, camera, offset in zip(scene.videos, ring(4), TRUE, strict=True):
         centres = paths((np.arange(100) + offset) / 30, 12, 1)
         videos.append(replace(video, depth=[exact_depth(camera, centres[:, k], 0.16) for k in range(100)]))
+    deep, cache = replace(scene, videos=tuple(videos)), Cache(tmp_path / "stages")
     with ThreadPoolExecutor(2) as pool:
-        found = synchronize_scene(replace(scene, videos=tuple(videos)), map=pool.map)
+        found = synchronize_scene(deep, map=pool.map, cache=cache)
     assert found.route == "tracks"
     np.testing.assert_allclose(found.offsets.frames, TRUE, atol=0.15)
     assert found.offsets.ok
+    paper = synchronize_scene(deep, method=PAPER, cache=cache)
+    assert set(paper.offsets.alignments) == {(0, 1), (0, 2), (0, 3)}
+    np.testing.assert_array_equal(paper.offsets.seconds, synchronize(paper.tracks, method=PAPER).seconds)
 
 
 def test_labels_are_read_and_keep_things_apart(recording, synced, tmp_path):
@@ -237,6 +242,21 @@ def test_labels_are_read_and_keep_things_apart(recording, synced, tmp_path):
     assert main(["check", str(tmp_path)]) == 0
     cv2.imwrite(str(tmp_path / "cam0" / "who" / "000.png"), np.zeros((4, 4, 3), np.uint8))
     assert main(["check", str(tmp_path)]) == 1
+
+
+def test_a_method_stands_in_the_slots_of_the_answer():
+    named = Method(matcher=OptimalTransport(), graph=Graph(extra=0), rematch=2)
+    for route in ("tracks", "stereo"):
+        space = with_method(Stages(), route, named).space
+        assert (space.matcher, space.graph, space.rematch) == (OptimalTransport(), Graph(extra=0), 2)
+        assert space.aligner == SPACE.aligner and with_method(Stages(), route, named).pixels == PIXELS
+    flat = with_method(Stages(), "epipolar", named)
+    assert flat.pixels.matcher == OptimalTransport() and flat.pixels.aligner == PIXELS.aligner and flat.space == SPACE
+    for slots in ({"matcher": PartialFGW()}, {"aligner": DTW()}, {"refiner": SplineRefine()}):
+        with pytest.raises(ValueError, match=f"{next(iter(slots))}, route: expected one that reads pixels"):
+            with_method(Stages(), "epipolar", Method(**slots))
+    assert with_method(Stages(), "epipolar", Method(refiner=Unrefined())).pixels.refiner == Unrefined()
+    assert with_method(Stages(), "tracks", PAPER).space.slots() == PAPER.slots()
 
 
 def test_a_tracks_label_is_what_most_of_it_lies_on():
