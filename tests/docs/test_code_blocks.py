@@ -60,7 +60,15 @@ def lacks(block: Block) -> str:
     return package if needed and importlib.util.find_spec(package) is None else ""
 
 
-@pytest.mark.parametrize("page", WITH_CODE, ids=name_of)
+LONG = {"own-frames.md"}
+"""Pages whose code takes half a minute; an example runs the same every time."""
+
+
+@pytest.mark.parametrize(
+    "page",
+    [pytest.param(p, marks=[pytest.mark.slow] if p.name in LONG else []) for p in WITH_CODE],
+    ids=[name_of(p) for p in WITH_CODE],
+)
 def test_the_code_of_a_page_runs_in_order(page, elsewhere):
     module = types.ModuleType("page")
     sys.modules["page"] = module

@@ -90,7 +90,8 @@ KINDS = {
     "benchmarks": "Mine",
 }
 
-WAYS = pytest.mark.parametrize("way", ["file", "installed"])
+WAYS = pytest.mark.parametrize("way", ["file", pytest.param("installed", marks=pytest.mark.slow)])
+"""Algorithms are tested with an installed package every time (test_plugins.py), other kinds with a file."""
 
 
 @pytest.fixture(scope="module")

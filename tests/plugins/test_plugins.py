@@ -85,9 +85,11 @@ def world(tmp_path_factory) -> list[str]:
     return [str(path) for path in sorted(folder.glob("*.npz"))]
 
 
-@pytest.fixture(scope="module", params=["file", "installed"])
+@pytest.fixture(scope="module", params=[pytest.param("file", marks=pytest.mark.slow), "installed"])
 def shell(request, tmp_path_factory):
-    """``otsync`` with the things in a file (``--plugin``), or in a package with entry points."""
+    """``otsync`` with the things in a file (``--plugin``; slow: test_other_kinds.py does so every time), or in a
+    package with entry points.
+    """
     run = shell_with(request.param, tmp_path_factory.mktemp(request.param), ALGORITHMS, KINDS)
     return partial(run, "otsync")
 
@@ -122,7 +124,6 @@ def test_they_run_from_the_shell_with_their_options(shell, world, tmp_path):
     later = offset(*plain, "aligner:likelihood-scan", "refiner:my-refiner")
     assert later - offset(*plain, "aligner:likelihood-scan", "refiner:spline-refine") == pytest.approx(0.1)
     # worker processes find them too
-    assert offset(*plain, "aligner:my-warping", "refiner:unrefined") == late
     workers = offset("--workers", "2", *plain, "aligner:my-warping", "refiner:unrefined")
     assert workers == late
 
