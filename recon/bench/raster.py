@@ -239,7 +239,7 @@ def about() -> dict[str, Any]:
 def run(
     out: str | os.PathLike[str],
     *,
-    sizes: Sequence[tuple[int, int, int]] = SIZES,
+    scenes: Sequence[tuple[int, int, int]] = SIZES,
     channels: Sequence[int] = (3, 32),
     repeats: int = 15,
     gate: bool = False,
@@ -259,7 +259,7 @@ def run(
     warmup()
     rows: list[dict[str, Any]] = []
     print("   size              C  back end    forward     total       min  x torch  peak MB  x bound")
-    for size, c in counted(list(itertools.product(sizes, channels)), "rasterizer", "size"):
+    for size, c in counted(list(itertools.product(scenes, channels)), "rasterizer", "size"):
         for row in measure(size, c, repeats, names):
             rows.append(row)
             say(

@@ -673,6 +673,7 @@ def test_ctrl_c_exits_with_130_and_says_how_to_go_on(world, tmp_path):
     assert run.returncode == 130 and b"continues from here" in told and b"Traceback" not in told
 
 
+@pytest.mark.slow  # an installed package is tested every time (tests/plugins/test_other_kinds.py)
 def test_a_loss_an_effect_and_a_format_of_one_file_are_found_by_every_command(world, tmp_path):
     """In the help, in a fit, in its run.json and in the evaluation that reads it, in an export, and among bench's
     rows.

@@ -256,7 +256,7 @@ def test_the_benchmark_writes_its_files_and_its_gate_closes(tmp_path, monkeypatc
     baseline = tmp_path / "baseline.json"
     monkeypatch.setattr(record, "baseline_path", lambda name: baseline)
     monkeypatch.setattr(bench_raster, "LEAST_RATIO", {})
-    options = {"sizes": [(48, 32, 200)], "channels": [3], "repeats": 3, "with_fit": False}
+    options = {"scenes": [(48, 32, 200)], "channels": [3], "repeats": 3, "with_fit": False}
     assert bench_raster.run(tmp_path / "out", rebase=True, gate=True, **options) == 0
     assert {p.name for p in (tmp_path / "out").iterdir()} == {"raster.csv", "raster.json", "raster.png"}
     report = json.loads((tmp_path / "out" / "raster.json").read_text())
