@@ -53,6 +53,23 @@ Tell = Callable[[str], None]
 """Receives lines of progress."""
 
 
+class Deadline:
+    """Wall time that a whole job may take. Its stages ask what is left, and leave out what would take too much of it.
+
+    Args:
+        seconds: from now on.
+    """
+
+    def __init__(self, seconds: float):
+        self.seconds = seconds
+        self._ends = time.perf_counter() + seconds
+
+    @property
+    def left(self) -> float:
+        """Seconds that are left; 0 when none are."""
+        return max(0.0, self._ends - time.perf_counter())
+
+
 class Progress:
     """Says what happens, remembers what the user should know, and times the stages.
 

@@ -95,11 +95,11 @@ def lag_statistics(a, wa, qa, b, wb, qb, lags, least, count, power, residual):
 
 @kernel(fastmath={"contract", "reassoc", "nsz"})
 def windowed_evidence(a, wa, qa, b, wb, qb, lags, block, least, floor, weight, out):
-    """Sum over matches (times their ``weight``) and windows of n/2 log((Var a + Var b + floor) / (Var(a - b) + floor)) at every lag.
+    """Sum over matches and windows of n/2 log((Var a + Var b + floor) / (Var(a - b) + floor)) at every lag.
 
-    Arrays as for :func:`lag_statistics`. Windows are two blocks of ``block`` frames long and start every block,
-    counted from the first common frame, which treats a and b alike; the first and last block are windows of their own
-    too. Adds to out (K,), each window with weight 1/2, since every sample is in two.
+    Matches count by their ``weight``. Arrays as for :func:`lag_statistics`. Windows are two blocks of ``block`` frames
+    long and start every block, counted from the first common frame, which treats a and b alike; the first and last
+    block are windows of their own too. Adds to out (K,), each window with weight 1/2, since every sample is in two.
     """
     M, _, Ta = a.shape
     Tb = b.shape[2]

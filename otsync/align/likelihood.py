@@ -51,9 +51,10 @@ class LikelihoodScan(Aligner):
         LLR = n/2 log((Var a + Var b + e²) / (Var(a - b) + e²)),   e = ½ sqrt(median_m min_k Var(a - b))
 
     summed over velocities of ±2 and ±5 frames and, with weight ½, positions in windows of 40 frames, averaged over the
-    matches (by their ``weight``, where they have one). The logarithm lets a wrong match add about nothing instead of a veto; the factor n gives no
-    reward for a tiny overlap; a point at rest adds nothing; e makes the noise scale automatic, so no unit enters.
-    Constant errors (depth bias, another surface point) drop out of velocities and of demeaned windows.
+    matches (by their ``weight``, where they have one). The logarithm lets a wrong match add about nothing instead of a
+    veto; the factor n gives no reward for a tiny overlap; a point at rest adds nothing; e makes the noise scale
+    automatic, so no unit enters. Constant errors (depth bias, another surface point) drop out of velocities and of
+    demeaned windows.
 
     Args:
         max_lag: largest |offset| in seconds; None: whatever leaves ``min_overlap`` seconds in common.

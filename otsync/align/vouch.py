@@ -25,8 +25,8 @@ def vouch(alignment: Alignment, a: TrackSet, b: TrackSet, matches: Matches, alig
     """``alignment`` with the flags that its aligner did not raise.
 
     Args:
-        aligner: whose answer it is. That of one which raises no flags itself (DTW, a constant shift, somebody else's) is
-            compared with the likelihood scan's over the same shifts: it carries its flags, and DISAGREE where that
+        aligner: whose answer it is. That of one which raises no flags itself (DTW, a constant shift, somebody else's)
+            is compared with the likelihood scan's over the same shifts: it carries its flags, and DISAGREE where that
             answers otherwise.
     """
     if not np.isfinite(alignment.offset) or a.xyz is None or b.xyz is None or not len(matches):

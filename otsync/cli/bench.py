@@ -47,7 +47,7 @@ class Bench:
     suite: tyro.conf.Positional[suite_names()]
     """Which benchmark; "all": every one that needs no recording."""
     scene: tyro.conf.Positional[Path | None] = None
-    """For panoptic, and for chain and own-frames if you like: a truly synchronised recording (its folder or scene.json)."""
+    """A truly synchronised recording (its folder or scene.json): of panoptic; if you like, of chain and own-frames."""
     out: Path = Path("bench/out")
     """Folder for CSV, JSON and plots."""
     gate: bool = False

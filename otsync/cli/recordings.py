@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -17,8 +19,10 @@ from ..progress import tell
 from .slots import one_of
 
 if TYPE_CHECKING:
+    from ..recordings.routes import Synchronized
     from ..recordings.stages import Stages
     from ..sync.method import Method
+    from ..sync.own_frames import Frames
 
 
 @dataclass
@@ -132,6 +136,7 @@ def sync_recording(
     out: Path,
     options: RecordingOptions,
     *,
+    frames: Frames = "common",
     method: Method | None = None,
     reference: str | None = None,
     truth: Path | None = None,
@@ -139,31 +144,36 @@ def sync_recording(
 ) -> int:
     """``otsync sync SCENE``: offsets.json, sync.json and report.html in ``out``.
 
-    Exit code 1 when an answer is flagged.
+    With frames "own" also scene.json, with the cameras that were found. Exit code 1 when an answer is flagged.
     """
     from ..files.arrays import write_json
     from ..files.cache import Cache
     from ..io import open_scene
+    from ..recordings.own_frames import found_document, open_without_poses, synchronize_own_scene
     from ..recordings.routes import synchronize_scene
     from ..report.frames import write_recording_report
-    from .tables import flagged, print_json, table, true_offsets, with_errors
+    from .tables import flagged, print_json, refuse_unused, table, true_offsets, with_errors
 
+    own = frames == "own"
+    if own:
+        refuse_unused(options, ("route",), "a recording with --frames own, which has one route,")
     stages, threads = options.stages(), options.threads()  # before the work, not after it
-    scene = open_scene(path, allow_outside=options.allow_outside)
+    solve: Callable[..., Synchronized]
+    if own:
+        scene, document = open_without_poses(path, allow_outside=options.allow_outside)
+        solve = synchronize_own_scene
+    else:
+        scene = open_scene(path, allow_outside=options.allow_outside)
+        solve = partial(synchronize_scene, route=options.route)
     if options.cameras:
         scene = scene.take(options.cameras)
-    chosen: int | Literal["auto"] = 0
-    if reference is not None:
-        if reference not in (*scene.names, "auto"):
-            raise ValueError(f"--reference: expected auto or one of {', '.join(scene.names)}; found {reference!r}.")
-        chosen = "auto" if reference == "auto" else scene.names.index(reference)
+    chosen = reference_among(scene.names, reference)
     known = None if truth is None else true_offsets(truth, scene.names)
     for note in scene.notes:
         tell(f"note: {note}")
     with ThreadPoolExecutor(threads) as pool:
-        found = synchronize_scene(
+        found = solve(
             scene,
-            route=options.route,
             method=method,
             stages=stages,
             reference=chosen,
@@ -173,12 +183,29 @@ def sync_recording(
         )
     if known is not None:
         known = known - known[found.offsets.component]
-    found.offsets.save(out / "offsets.json")
-    write_json(out / "sync.json", {"route": found.route, "why": list(found.why), "seconds": found.seconds})
-    write_recording_report(out / "report.html", scene, found, truth=None if known is None else list(known))
+    wrote = [out / "offsets.json", out / "sync.json", out / "report.html"]
+    found.offsets.save(wrote[0])
+    write_json(wrote[1], {"route": found.route, "why": list(found.why), "seconds": found.seconds})
+    write_recording_report(wrote[2], scene, found, truth=None if known is None else list(known))
+    if own:
+        wrote.append(out / "scene.json")
+        write_json(wrote[-1], found_document(document, found.offsets))
     if as_json:
         print_json({"route": found.route, "why": list(found.why), **with_errors(found.offsets, known)})
     else:
         print(table(found.offsets, known))
-        print(f"route {found.route}; wrote {out / 'offsets.json'}, {out / 'sync.json'} and {out / 'report.html'}")
+        print(f"route {found.route}; wrote {', '.join(map(str, wrote[:-1]))} and {wrote[-1]}")
+        if own:
+            print(f"scene.json has the cameras that were found; its paths are relative to {scene.root}: copy it there")
     return flagged(found.offsets)
+
+
+def reference_among(names: Sequence[str], wanted: str | None) -> int | Literal["auto"]:
+    """The index of the video that ``--reference`` names; the first one by default. ValueError for one there is not."""
+    if wanted is None:
+        return 0
+    if wanted == "auto":
+        return "auto"
+    if wanted not in names:
+        raise ValueError(f"--reference: expected auto or one of {', '.join(names)}; found {wanted!r}.")
+    return list(names).index(wanted)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
@@ -12,7 +12,7 @@ from ..sync.own_frames import Frames
 from ..sync.verb import unique_names
 from ..types import TrackSet
 from .method import MethodOptions
-from .recordings import RecordingOptions, sync_recording
+from .recordings import RecordingOptions, reference_among, sync_recording
 from .tables import refuse_unused, report, true_offsets, with_progress
 
 
@@ -54,22 +54,11 @@ class Sync:
     def run(self) -> int:
         if len(self.tracks) == 1 and self.tracks[0].suffix != ".npz":
             refuse_unused(self, ("workers",), f"a recording ({self.tracks[0]}), which has --recording.workers,")
-            if self.frames == "own":
-                from .own_frames import sync_own_recording
-
-                return sync_own_recording(
-                    self.tracks[0],
-                    self.out,
-                    self.recording,
-                    method=self.slots.chosen(),
-                    reference=self.reference,
-                    truth=self.truth,
-                    as_json=self.json,
-                )
             return sync_recording(
                 self.tracks[0],
                 self.out,
                 self.recording,
+                frames=self.frames,
                 method=self.slots.chosen(),
                 reference=self.reference,
                 truth=self.truth,
@@ -85,11 +74,7 @@ class Sync:
             )
         tracks = [TrackSet.load(path) for path in self.tracks]
         names = unique_names(tracks)
-        reference: int | Literal["auto"] = 0
-        if self.reference is not None:
-            if self.reference not in (*names, "auto"):
-                raise ValueError(f"--reference: expected auto or one of {', '.join(names)}; found {self.reference!r}.")
-            reference = "auto" if self.reference == "auto" else names.index(self.reference)
+        reference = reference_among(names, self.reference)
         known = None if self.truth is None else true_offsets(self.truth, names)
         method = self.slots.chosen()
         self.out.mkdir(parents=True, exist_ok=True)  # before the work, not after it

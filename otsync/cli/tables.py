@@ -145,7 +145,8 @@ def frame_lines(offsets: Offsets, width: int) -> list[str]:
         origin = " ".join(f"{x:.3g}" for x in S.t)
         turn = S.degrees_from(IDENTITY)
         lines.append(
-            f"{name:{width}}  {S.scale:8.4f} {100 * S.scale_sigma:6.2f}% {turn:6.1f}° {S.rotation_sigma:6.2f}°  {origin}"
+            f"{name:{width}}  {S.scale:8.4f} {100 * S.scale_sigma:6.2f}% "
+            f"{turn:6.1f}° {S.rotation_sigma:6.2f}°  {origin}"
         )
     return lines
 

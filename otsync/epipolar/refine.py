@@ -80,8 +80,8 @@ class EpipolarRefine(Refiner):
         for name in UNREAD:
             if getattr(self.scan, name) != getattr(EpipolarScan, name):
                 raise ValueError(
-                    f"EpipolarRefine.scan.{name}: expected without it, since the fit reads only the scan's likelihoods; "
-                    f"found {getattr(self.scan, name)}. Set it on the aligner."
+                    f"EpipolarRefine.scan.{name}: expected without it, since the fit reads only the scan's "
+                    f"likelihoods; found {getattr(self.scan, name)}. Set it on the aligner."
                 )
 
     def __call__(self, a: TrackSet, b: TrackSet, matches: Matches, alignment: Alignment) -> Alignment:

@@ -13,10 +13,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from ..clocks.splines import TrackSplines
-from ..refine.gauss_newton import CLUSTER, GROUPS, MIN_FRAMES, MOST_LEVERAGE, OUTLYING, ROBUST
+from ..refine.gauss_newton import CLUSTER, GROUPS, MIN_FRAMES, MOST_LEVERAGE, OUTLYING, ROBUST, neighbours
 from ..types import Clock, Similarity
 from ..types.similarity import cross_matrix, rotation_of
 
@@ -27,7 +27,7 @@ LONGEST_TURN = 0.2
 """Radians, and relative scale, by which one iteration may change the similarity."""
 
 SHORTEST_CORRELATION = 4 / 30
-"""Seconds over which the fast part of a residual is taken as one error: a tracker's jitter is smoothed by the spline."""
+"""Seconds over which the fast part of a residual is one error: the spline smooths a tracker's jitter."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,7 +262,8 @@ def linearise(
         H += np.tril(H, -1).swapaxes(1, 2)
     H_group, g_group = np.zeros((GROUPS, 8, 8)), np.zeros((GROUPS, 8))
     if clusters:
-        group = neighbourhoods((a.mean - state.middle_a) / root + (b.mean - state.middle_b) @ turned, GROUPS)
+        where = (a.mean - state.middle_a) / root + (b.mean - state.middle_b) @ turned
+        group = neighbours(where, GROUPS, where.mean(0))  # in a turned frame the median is another point
         np.add.at(H_group, group, H_match)
         np.add.at(g_group, group, g_match)
     power = sum(float(weight @ p[7].sum(1)) for p in parts)
@@ -277,22 +278,6 @@ def linearise(
         place,
         np.where(seen, np.hypot(rms_quick, rms_slow), np.inf),
     )
-
-
-def neighbourhoods(x: Float[np.ndarray, "M 3"], groups: int) -> Int[np.ndarray, " M"]:
-    """Group of each point: nearest of ``groups`` points far from each other, the first one nearest to their mean.
-
-    As :func:`otsync.refine.gauss_newton.neighbours`, which begins at the median of the coordinates: in a turned frame
-    that is another point, and sigma would depend on the frame.
-    """
-    distance = np.linalg.norm(x - x.mean(0), axis=1)
-    closest, nearest = np.full(len(x), np.inf), np.zeros(len(x), np.int64)
-    for k in range(min(groups, len(x))):
-        seed = int(np.argmin(distance) if k == 0 else np.argmax(closest))
-        d = np.linalg.norm(x - x[seed], axis=1)
-        nearest[d < closest] = k
-        closest = np.minimum(closest, d)
-    return nearest
 
 
 def _noise(parts: list[tuple], k: int) -> float:

@@ -22,6 +22,7 @@ from ..types.checks import positive
 from .agreement import Overlay, feature_distances, overlay
 from .clouds import Cloud, clouds, comes_first, from_units, in_units
 from .fit import Joint, fit_jointly
+from .mates import half_turns
 from .scan import APART, Shifts, scan
 
 WINDOW = 14 / 30
@@ -169,6 +170,10 @@ class OwnFrames:
             tops, _ = self._search(pair, FEATURES_ALONE)
             weighed = sorted([*weighed, *pair.weigh_all(tops)], key=lambda w: -w.agreement)
             stats["second_search"] = 1.0
+            if weighed and self._doubtful(weighed, pair):
+                mates = half_turns(pair.a, pair.b, weighed[0].joint.transform, self.max_lag)
+                weighed = sorted([*weighed, *pair.weigh_all(mates)], key=lambda w: -w.agreement)
+                stats["half_turns"] = 1.0
         if not weighed:
             fps = min(nominal_fps(a), nominal_fps(b))
             return nothing(Status.NO_MATCH), Alignment(math.nan, fps=fps, flags=(Status.NO_MATCH,), stats=stats)

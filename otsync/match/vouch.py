@@ -169,8 +169,8 @@ def random_cost(costs: tuple[Cost, ...], a: TrackSet, b: TrackSet) -> float | No
 def unlike(a: TrackSet, b: TrackSet, i: Int[np.ndarray, " H"], j: Int[np.ndarray, " H"], features: Likeness) -> bool:
     """Whether matched tracks are hardly liker than the next likest, and distances among them have nothing in common.
 
-    Between unrelated videos, too, every track has a likest partner: what tells is by how much it leads. Distances that a
-    matcher compared agree by construction; this asks those that looked at costs alone.
+    Between unrelated videos, too, every track has a likest partner: what tells is by how much it leads. Distances that
+    a matcher compared agree by construction; this asks those that looked at costs alone.
     """
     if features.table is None or features.pairs is None:
         return False

@@ -261,11 +261,14 @@ def _linearise(
     return System(H_match.sum(0), g_match.sum(0), (H_group, g_group), (H_time, g_time), weight, float(blur))
 
 
-def neighbours(x: Float[np.ndarray, "M 3"], groups: int) -> Int[np.ndarray, " M"]:
-    """Group of each point: nearest of ``groups`` points far from each other (farthest-point sampling from the
-    middle).
+def neighbours(
+    x: Float[np.ndarray, "M 3"], groups: int, middle: Float[np.ndarray, " 3"] | None = None
+) -> Int[np.ndarray, " M"]:
+    """Group of each point: nearest of ``groups`` points far from each other (farthest-point sampling).
+
+    The first one is nearest to the ``middle``; None: the median of each coordinate.
     """
-    distance = np.linalg.norm(x - np.median(x, 0), axis=1)
+    distance = np.linalg.norm(x - (np.median(x, 0) if middle is None else middle), axis=1)
     nearest = np.zeros(len(x), np.int64)
     closest = np.full(len(x), np.inf)
     for k in range(min(groups, len(x))):

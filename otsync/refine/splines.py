@@ -45,9 +45,9 @@ class SplineRefine(Refiner):
     Tracks become penalised cubic splines that never answer within a gap. The residual of a match is the difference of
     its two curves minus its mean over ±``windows[0]`` seconds, read at the frames of both videos, so that constant and
     slowly drifting errors drop out and exchanging a and b flips the sign to rounding. Samples and whole matches that
-    fit badly lose weight; matches with a ``weight`` of their own begin with it. Sigma adds the scatter over neighbourhoods of matches or blocks of one second, the ``spread``
-    of the answers with the other windows (the largest difference, so its square counts half), and what blur predicts:
-    errors of the model that no residual shows.
+    fit badly lose weight; matches with a ``weight`` of their own begin with it. Sigma adds the scatter over
+    neighbourhoods of matches or blocks of one second, the ``spread`` of the answers with the other windows (the largest
+    difference, so its square counts half), and what blur predicts: errors of the model that no residual shows.
 
     Args:
         windows: half windows of detrending in seconds: the answer's, and those that it is compared with.

@@ -1,4 +1,4 @@
-"""From the similarities of pairs to one frame of reference: where every video's frame lies, and which pairs disagree."""
+"""From the similarities of pairs to one frame of reference: where each video's frame lies, and which pairs disagree."""
 
 from __future__ import annotations
 

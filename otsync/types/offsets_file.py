@@ -20,9 +20,9 @@ SIGN = (
 )
 
 FRAMES = (
-    "every video has a frame of reference of its own; transform: x_reference = scale * R(quaternion w, x, y, z) * x_video "
-    "+ translation, in units of the reference (of pairs: from b's frame to a's); covariance: of a small rotation vector "
-    "(3, radians), relative scale (1) and translation (3) that act after it"
+    "every video has a frame of reference of its own; transform: x_reference = scale * R(quaternion w, x, y, z) * "
+    "x_video + translation, in units of the reference (of pairs: from b's frame to a's); covariance: of a small "
+    "rotation vector (3, radians), relative scale (1) and translation (3) that act after it"
 )
 
 

@@ -115,6 +115,7 @@ def fit_backdrop(
     floor: Floor | None = None,
     steps: int | None = None,
     budget: float | None = None,
+    at_most: float | None = None,
     sh_degree: int = 0,
     rates: Mapping[str, float] = RATES,
     seed: int = 0,
@@ -128,12 +129,15 @@ def fit_backdrop(
         points: (N,3) some positions of what moves: they tell scale and floor where the cameras alone do not.
         floor: the ground plane, where it is known; else it is searched for.
         steps, budget: a number of steps, or wall seconds. Default: 1500 steps.
+        at_most: wall seconds; fewer steps are taken where they would take longer. Not beside ``budget``.
         sh_degree: of the view-dependent colour. With 14 cameras degree 1 fits them better, but new views worse.
         rates: a group without one is frozen.
 
-    The result depends on the seed, not on the number of threads (with ``budget`` on the machine's speed as well).
+    The result depends on the seed, not on the number of threads (with ``budget`` and ``at_most`` on the machine's speed as well).
     Raises ValueError when no video has a background: give masks; FloatingPointError when the fit diverges.
     """
+    if budget is not None and at_most is not None:
+        raise ValueError("budget, at_most: expected one of them; found both.")
     total, device = _total(steps, budget), device_of(device)
     unknown = sorted(set(rates) - set(RATES))
     if unknown:
@@ -154,7 +158,7 @@ def fit_backdrop(
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # torch's pool would compete with the rasterizer's
     try:
-        loss = fit.run(total, budget, progress)
+        loss = fit.run(total, budget if at_most is None else at_most, progress)
     finally:
         torch.set_num_threads(threads)
     gains, scores = fit.result()
@@ -298,7 +302,7 @@ class _BackdropFit:
         return draw(g, view, self.views[a][1], ends[0].size, self.near, colors=nothing).alphas
 
     def run(self, total: int | None, budget: float | None, progress: bool) -> float:
-        """All steps; the mean loss of the last tenth."""
+        """All steps, at most ``total`` of them, within ``budget`` seconds; the mean loss of the last tenth."""
         rng = np.random.default_rng([self.seed, 2])
         order: list[int] = []
         recent: list[float] = []
@@ -309,11 +313,11 @@ class _BackdropFit:
                     order = rng.permutation(len(self.views)).tolist()
                 recent.append(self.one_step(order.pop(), 0.0 if total is None else self.step / total))
                 bar.update()
-                if total is None and self.step == WARM:
+                if self.step == WARM:
                     began = time.perf_counter()  # the steps before compile and warm up
-                if total is None and self.step == TIMED:
-                    assert budget is not None
-                    total = max(TIMED, int((TIMED - WARM) * budget / (time.perf_counter() - began)))
+                if budget is not None and self.step == TIMED:
+                    affordable = max(TIMED, int((TIMED - WARM) * budget / (time.perf_counter() - began)))
+                    total = affordable if total is None else min(total, affordable)
                     bar.total = total
                 if self.step % 50 == 0:
                     bar.set_postfix_str(f"loss {np.mean(recent[-50:]):.4f}", refresh=False)

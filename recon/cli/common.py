@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from otsync.progress import Progress, tell
+from otsync.progress import Deadline, Progress, tell
 from recon.cli.tables import offset_rows, offset_table, view_table
 
 if TYPE_CHECKING:
@@ -20,6 +20,11 @@ if TYPE_CHECKING:
 
 BUDGET = 300.0
 """Seconds of a fit that the shell is told no length of."""
+
+
+def deadline_of(plan: Plan) -> Deadline | None:
+    """The end of the command, from now on, where --budget says how long it may take."""
+    return None if plan.fit.budget is None else Deadline(plan.fit.budget)
 
 
 def with_length(plan: Plan) -> Plan:
@@ -65,6 +70,7 @@ def reconstructed(
     workers: int = 0,
     as_json: bool = False,
     progress: Progress | None = None,
+    deadline: Deadline | None = None,
 ) -> int:
     """Prepare, fit, evaluate, write, and print the outcome; the exit code."""
     from otsync.files.cache import Cache
@@ -87,6 +93,7 @@ def reconstructed(
             cache=Cache(cache or out / "stages"),
             map=pool.map,
             progress=progress or Progress(tell),
+            deadline=deadline,
         )
     wrote = f"wrote {out / 'scene.npz'}, {out / 'offsets.json'}, {out / 'metrics.json'} and {out / 'report.html'}"
     doubtful = [n for n, s in zip(outcome.coarse.names, outcome.coarse.status, strict=True) if not s.ok]

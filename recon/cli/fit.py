@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from recon.cli.common import opened, reconstructed, with_length
+from recon.cli.common import deadline_of, opened, reconstructed, with_length
 from recon.pipeline.plan import Plan
 
 
@@ -51,6 +51,7 @@ class Fit:
     def run(self) -> int:
         from otsync.types import Offsets, TrackSet
 
+        deadline = deadline_of(self.plan)
         scene = opened(self.scene, self.allow_outside)
         offsets = Offsets.load(self.offsets)
         tracks = tuple(TrackSet.load(path) for path in self.tracks) or None
@@ -65,4 +66,5 @@ class Fit:
             cache=self.cache,
             workers=self.workers,
             as_json=self.json,
+            deadline=deadline,
         )

@@ -55,7 +55,7 @@ class Run:
         from otsync.progress import Progress, tell
         from otsync.recordings.routes import synchronize_scene
         from otsync.report.frames import write_recording_report
-        from recon.cli.common import opened, reconstructed, with_length
+        from recon.cli.common import deadline_of, opened, reconstructed, with_length
         from recon.fit.run import Diverged
         from recon.pipeline.intake import readable
 
@@ -65,7 +65,7 @@ class Run:
                     f"--recording.{name}: expected without it, since the reconstruction tracks by its own; found "
                     f"{getattr(self.recording, name)}. Synchronise with otsync sync, then reconstruct with recon fit."
                 )
-        threads, method = self.recording.threads(), self.slots.chosen()
+        threads, method, deadline = self.recording.threads(), self.slots.chosen(), deadline_of(self.plan)
         scene = opened(self.scene, self.allow_outside or self.recording.allow_outside)
         if self.recording.cameras:
             scene = scene.take(
@@ -89,6 +89,7 @@ class Run:
                 cache=cache,
                 map=pool.map,
                 tell=tell,
+                deadline=deadline,
             )
         progress.seconds |= {f"synchronise: {stage}": s for stage, s in coarse.seconds.items()}
         if not self.json:
@@ -111,6 +112,7 @@ class Run:
                 workers=self.recording.workers,
                 as_json=self.json,
                 progress=progress,
+                deadline=deadline,
             )
         except (Diverged, FloatingPointError) as error:
             print(f"otsync: {error}", file=sys.stderr)

@@ -57,7 +57,10 @@ class FitOptions:
     steps: int | None = None
     """Length of the fit in steps: the result is then the same on any machine of a kind."""
     budget: float | None = None
-    """Length of the fit in wall seconds instead of steps, once everything is prepared; 120 steps at the least."""
+    """Wall seconds instead of steps: of the whole command (Python's ``fit`` and ``recon bench``: of the fit alone).
+    Stages before the fit leave out what would take too much of them; the fit takes what is left, 120 steps at the
+    least.
+    """
     batch: int = 2
     """Images a step: on a CPU each on a thread of its own, on a GPU in one rendering where effects allow it."""
     densify: Densify | None = None

@@ -23,7 +23,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from otsync.compute.threads import MapLike
-from otsync.progress import is_quiet
+from otsync.progress import Deadline, is_quiet
 from otsync.types import Offsets
 from recon.fit.checkpoint import Checkpoint
 from recon.fit.options import FitOptions
@@ -35,6 +35,9 @@ from recon.observe.effects import initial_parameters
 from recon.scene.gaussians4d import Gaussians4D
 
 __all__ = ["Diverged", "History", "Reconstruction", "fit"]
+
+FIT_SHARE = 0.9
+"""Of what is left of the whole job's time: views are compared and results written after the fit."""
 
 CALIBRATION = (20, 60)  # steps of a session between which the speed is taken when a budget in seconds is given
 
@@ -85,6 +88,7 @@ def fit(
     options: FitOptions | None = None,
     *,
     checkpoint: str | PathLike[str] | None = None,
+    deadline: Deadline | None = None,
     **changes: Any,
 ) -> Reconstruction:
     """Refine a 4D scene, and the clocks of the videos, from their images.
@@ -99,6 +103,7 @@ def fit(
             which :func:`recon.observe.recorded.with_declared` adds.
         checkpoint: file that the fit is kept in, every ``save_every`` seconds and on Ctrl-C; a fit that was killed
             continues from it and ends with the same numbers (on a GPU, whose sums run in any order, nearly so).
+        deadline: of the whole job, whose seconds ``options.budget`` are: the fit takes what is left of them.
 
     Raises:
         ValueError: for footage, offsets or rates that do not fit together.
@@ -126,7 +131,7 @@ def fit(
         stack.enter_context(one_thread_each(options.batch))
         hidden = True if is_quiet() else None  # None: hidden where there is no terminal
         bar = stack.enter_context(tqdm(total=run.total, initial=run.step, desc="fit", unit="step", disable=hidden))
-        calibrate = Calibration(options.budget)
+        calibrate = Calibration(options.budget, deadline)
         try:
             while run.total is None or run.step < run.total:
                 with uninterrupted():
@@ -149,8 +154,8 @@ def fit(
 class Calibration:
     """Turns a budget in seconds into a number of steps, once the first ones of a session have shown their speed."""
 
-    def __init__(self, budget: float | None):
-        self.budget, self.done, self.since = budget, 0, time.perf_counter()
+    def __init__(self, budget: float | None, deadline: Deadline | None = None):
+        self.budget, self.deadline, self.done, self.since = budget, deadline, 0, time.perf_counter()
 
     def __call__(self, step: int) -> int | None:
         """The number of steps in all; None until it is known."""
@@ -161,7 +166,8 @@ class Calibration:
             return None
         assert self.budget is not None  # only then is the number of steps open
         each = (time.perf_counter() - self.since) / (CALIBRATION[1] - CALIBRATION[0])
-        return max(2 * step, int(self.budget / each))  # rates must have time to decay
+        left = self.budget if self.deadline is None else step * each + FIT_SHARE * self.deadline.left
+        return max(2 * step, int(left / each))  # rates must have time to decay
 
 
 def _moved(problem: Problem, seconds: np.ndarray) -> str:

@@ -12,7 +12,7 @@ from otsync.clocks.shutter import at_frame_times
 from otsync.compute.threads import MapLike
 from otsync.io import Scene
 from otsync.io.mend import cut
-from otsync.progress import Progress
+from otsync.progress import Deadline, Progress
 from otsync.types import Clock, Offsets, TrackSet
 from recon.backdrop.fit import StaticFit, with_backdrop
 from recon.footage.footage import Footage
@@ -64,6 +64,7 @@ def prepare(
     cache: Any = None,
     map: MapLike = map,
     progress: Progress | None = None,
+    deadline: Deadline | None = None,
 ) -> Prepared:
     """Everything that a fit begins with.
 
@@ -74,6 +75,7 @@ def prepare(
         held_out: names of videos that nothing here sees but their own footage.
         backdrop: the static part, its gains those of the training videos in their order; default: fitted here.
         cache: an :class:`otsync.files.cache.Cache`. map: any map-like callable; two threads use two cores.
+        deadline: of the whole job; the static part takes at most a share of what is left.
 
     ValueError names what is missing or does not fit: a backdrop with gains of other videos, nothing that moves.
     """
@@ -107,7 +109,7 @@ def prepare(
     with progress.stage("backdrop"):
         static = backdrop
         if static is None:
-            static = backdrop_of_scene(train, tracks, footage, plan, cache, progress)
+            static = backdrop_of_scene(train, tracks, footage, plan, cache, progress, deadline)
     with progress.stage("initial scene"):
         initial = initial_scene(train, offsets, tuple(tracks), footage, static, plan, cache, map, progress)
     gains = np.ones((len(footage), 3)) if static is None else static.gains

@@ -18,7 +18,7 @@ import torch
 from otsync.compute.threads import MapLike
 from otsync.files.digest import content_key
 from otsync.io import Scene
-from otsync.progress import Progress
+from otsync.progress import Deadline, Progress
 from otsync.types import Offsets, TrackSet, Video
 from recon.backdrop.fit import StaticFit, fit_backdrop
 from recon.footage.depth import working_depth
@@ -144,9 +144,16 @@ def scene_key(scene: Scene, tracks: Sequence[TrackSet]) -> tuple[Any, ...]:
 
 
 def backdrop_of_scene(
-    scene: Scene, tracks: Sequence[TrackSet], footage: Sequence[Footage], plan: Plan, cache: Any, progress: Progress
+    scene: Scene,
+    tracks: Sequence[TrackSet],
+    footage: Sequence[Footage],
+    plan: Plan,
+    cache: Any,
+    progress: Progress,
+    deadline: Deadline | None = None,
 ) -> StaticFit | None:
     """Static Gaussians fitted to what the cameras see behind the things that move, kept; None where nothing shows."""
+    at_most = None if deadline is None else BACKDROP_SHARE * deadline.left
 
     def build() -> dict[str, np.ndarray]:
         lifted = [t.positions()[t.seen] for t in tracks]
@@ -157,15 +164,22 @@ def backdrop_of_scene(
             depth=None if all(d is None for d in depth) else depth,
             points=points,
             steps=plan.backdrop_steps,
+            at_most=at_most,
             seed=plan.fit.seed,
             device=plan.device,
         )
+        if static.stats["steps"] < plan.backdrop_steps:
+            progress.note(
+                f"budget: the static part takes {static.stats['steps']:.0f} steps in place of {plan.backdrop_steps}"
+            )
         parts = {n: getattr(static.gaussians, n).numpy() for n in GAUSSIAN}
         return {**parts, "gains": static.gains, "near": np.array(static.near), "psnr": static.psnr}
 
     key = (*scene_key(scene, tracks), plan.width, plan.backdrop_steps, plan.fit.seed)
     if plan.device != "cpu":  # rounds otherwise
         key = (*key, plan.device)
+    if deadline is not None:
+        key = (*key, "budget", deadline.seconds)
     try:
         kept = cache.arrays("backdrop", key, build)
     except ValueError as error:
@@ -175,6 +189,9 @@ def backdrop_of_scene(
     progress.tell(f"backdrop: {len(gaussians)} Gaussians, {np.nanmean(kept['psnr']):.2f} dB")
     return StaticFit(gaussians, kept["gains"], float(kept["near"]), kept["psnr"])
 
+
+BACKDROP_SHARE = 0.25
+"""Of the time that a budget leaves, for the static part at most."""
 
 POINTS = 2000
 """Positions of what moves, per video, that the backdrop takes its scale from."""

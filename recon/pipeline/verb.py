@@ -18,7 +18,7 @@ from otsync.files.arrays import write_json
 from otsync.io import Scene
 from otsync.io.mend import cut
 from otsync.metrics import offset_error
-from otsync.progress import Progress
+from otsync.progress import Deadline, Progress
 from otsync.types import Clock, Offsets, TrackSet
 from recon.evaluate.lpips import Lpips
 from recon.evaluate.views import ViewScore, view
@@ -51,6 +51,10 @@ class Outcome:
     lpips_reason: str = ""
 
 
+LEAST_SHARE = 0.2
+"""Of the budget, for the fit: with less it is said that more time would help."""
+
+
 def reconstruct(
     scene: Scene,
     offsets: Offsets,
@@ -63,6 +67,7 @@ def reconstruct(
     cache: Any = None,
     map: MapLike = map,
     progress: Progress | None = None,
+    deadline: Deadline | None = None,
 ) -> Outcome:
     """Prepare, fit, evaluate and write the result folder (see :mod:`recon.result.folder`).
 
@@ -75,20 +80,36 @@ def reconstruct(
         held_out: names of videos that only the evaluation sees.
         truth: true offsets of at least the training videos.
         cache: an :class:`otsync.files.cache.Cache`; default: ``stages`` in ``out``. map: any map-like callable.
+        deadline: of the whole job, whose seconds ``plan.fit.budget`` then are. The static part gets a share of what is
+            left, the fit the rest. What that leaves out is noted.
     """
     from otsync.files.cache import Cache
 
     plan, progress, cache = plan or Plan(), progress or Progress(), cache or Cache(out / "stages")
     out.mkdir(parents=True, exist_ok=True)
     clear_parts(out, out / "stages")
-    ready = prepare(scene, offsets, tracks, plan=plan, held_out=held_out, cache=cache, map=map, progress=progress)
+    ready = prepare(
+        scene,
+        offsets,
+        tracks,
+        plan=plan,
+        held_out=held_out,
+        cache=cache,
+        map=map,
+        progress=progress,
+        deadline=deadline,
+    )
     true = None if truth is None else true_seconds(truth, ready.offsets)
     effects = with_declared(plan.effects, [f.readout for f in ready.footage], ready.gains)
     kept([effect for effect in effects if not effect.groups])  # says before the work what run.json cannot name
     options = replace(plan.fit, effects=effects)
+    if deadline is not None:
+        progress.note(f"budget: {deadline.left:.0f} of {deadline.seconds:.0f} s are left for the fit")
+        if deadline.left < LEAST_SHARE * deadline.seconds:
+            progress.note("what comes before the fit took nearly all of the budget: a longer one gives a better scene")
     with progress.stage("fit"):
         initial = ready.initial.to(plan.device)
-        fitted = fit(initial, ready.footage, ready.offsets, options, checkpoint=out / "fit.npz")
+        fitted = fit(initial, ready.footage, ready.offsets, options, checkpoint=out / "fit.npz", deadline=deadline)
     _write_fit(out, fitted)
     with progress.stage("views"):
         videos, scores = compared(fitted, effects, ready, plan, progress)

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 import shutil
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from recon.scene.gaussians4d import Gaussians4D
-from tests.plugins.outside import KINDS_OF_SCENES, OF_SCENES, shell_with
+from tests.plugins.outside import KINDS_OF_SCENES, OF_SCENES, Shell, shell_with
 from tests.recon.worlds import write_world
 from tests.recording_world import write_recording
 
@@ -105,29 +104,33 @@ def recording(tmp_path_factory) -> Path:
 def test_readers_priors_and_benchmarks(way, recording, tmp_path):
     home = tmp_path / "plugins"
     home.mkdir()
-    shell = partial(shell_with(way, home, OF_RECORDINGS, KINDS), "otsync")
-    words = shell("sync", "--help").stdout
+    with shell_with(way, home, OF_RECORDINGS, KINDS) as shell:
+        readers_priors_and_benchmarks(shell, recording, tmp_path)
+
+
+def readers_priors_and_benchmarks(shell: Shell, recording: Path, tmp_path: Path) -> None:
+    words = shell("otsync", "sync", "--help").stdout
     assert "|bright" in words and "|few-points" in words and "|nothing" in words
-    assert "renamed" in shell("init", "--help").stdout
-    assert ",mine," in shell("bench", "--help").stdout
+    assert "renamed" in shell("otsync", "init", "--help").stdout
+    assert ",mine," in shell("otsync", "bench", "--help").stdout
 
     folder = tmp_path / "recording"
     shutil.copytree(recording, folder)
     (folder / "scene.json").rename(folder / "my_scene.json")
-    done = shell("init", str(folder))
+    done = shell.alone("otsync", "init", str(folder))
     assert done.returncode == 0 and "renamed" in done.stdout + done.stderr, done.stderr
 
     def offsets(*args: str) -> np.ndarray:
-        done = shell("sync", str(folder), "--json", "--out", str(tmp_path / "o"), "--quiet", *args)
+        done = shell("otsync", "sync", str(folder), "--json", "--out", str(tmp_path / "o"), "--quiet", *args)
         assert done.returncode in (0, 1), done.stderr
         return json.loads(done.stdout)["pairs"][0]["stats"]
 
     own = offsets()
     for option, value in (("masks", "bright:threshold=25"), ("points", "few-points"), ("features", "nothing")):
         assert offsets(f"--recording.{option}", value) != own, option
-    assert shell("bench", "mine", "--seeds", "4", "--out", str(tmp_path / "b")).returncode == 0
+    assert shell("otsync", "bench", "mine", "--seeds", "4", "--out", str(tmp_path / "b")).returncode == 0
     assert (tmp_path / "b" / "mine.txt").read_text() == "4 seeds"
-    listed = {(row["group"], row["name"]) for row in json.loads(shell("plugins", "--json").stdout)["plugins"]}
+    listed = {(row["group"], row["name"]) for row in json.loads(shell("otsync", "plugins", "--json").stdout)["plugins"]}
     names = {"readers": "renamed", "maskers": "bright", "trackers": "few-points", "describers": "nothing"}
     assert listed >= set(names.items()) | {("benchmarks", "mine")}
 
@@ -136,15 +139,20 @@ def test_losses_effects_and_exporters_of_a_package(tmp_path):
     """Those of a file: tests/recon/cli/test_recon_cli.py."""
     home = tmp_path / "plugins"
     home.mkdir()
-    shell = partial(shell_with("installed", home, OF_SCENES, KINDS_OF_SCENES), "recon")
+    with shell_with("installed", home, OF_SCENES, KINDS_OF_SCENES) as shell:
+        losses_effects_and_exporters(shell, tmp_path)
+
+
+def losses_effects_and_exporters(shell: Shell, tmp_path: Path) -> None:
     world, out = tmp_path / "world", tmp_path / "r"
     write_world(world)
-    words = shell("fit", "--help").stdout
+    words = shell("recon", "fit", "--help").stdout
     assert "colourless" in words and "dimmed" in words
-    assert "counted" in shell("export", "--help").stdout
-    words = shell("bench", "--help").stdout
+    assert "counted" in shell("recon", "export", "--help").stdout
+    words = shell("recon", "bench", "--help").stdout
     assert "with colourless" in words and "with dimmed" in words
     done = shell(
+        "recon",
         "fit",
         str(world),
         "--offsets",
@@ -171,6 +179,6 @@ def test_losses_effects_and_exporters_of_a_package(tmp_path):
     assert done.returncode == 0, done.stderr
     run = json.loads((out / "run.json").read_text())
     assert run["videos"][0]["optics"] == [{"name": "dimmed", "share": 0.8}]
-    done = shell("export", str(out), "--format", "counted")
+    done = shell.alone("recon", "export", str(out), "--format", "counted")
     assert done.returncode == 0, done.stderr
     assert int((out / "count.txt").read_text()) == len(Gaussians4D.load(out / "scene.npz"))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from functools import partial
 
 import pytest
 
@@ -87,34 +86,34 @@ def world(tmp_path_factory) -> list[str]:
 
 @pytest.fixture(scope="module", params=[pytest.param("file", marks=pytest.mark.slow), "installed"])
 def shell(request, tmp_path_factory):
-    """``otsync`` with the things in a file (``--plugin``; slow: test_other_kinds.py does so every time), or in a
+    """The commands with the things in a file (``--plugin``; slow: test_other_kinds.py does so every time), or in a
     package with entry points.
     """
-    run = shell_with(request.param, tmp_path_factory.mktemp(request.param), ALGORITHMS, KINDS)
-    return partial(run, "otsync")
+    with shell_with(request.param, tmp_path_factory.mktemp(request.param), ALGORITHMS, KINDS) as shell:
+        yield shell
 
 
 def test_they_stand_in_the_help(shell, world):
-    words = shell("sync", "--help").stdout
+    words = shell.alone("otsync", "sync", "--help").stdout
     for name in ("matcher:every-other", "aligner:my-warping", "refiner:my-refiner"):
         assert name in words
     assert "Keeps every other one of the nearest neighbours." in words
-    assert "matcher:every-other" in shell("match", "--help").stdout
-    assert "greet" in shell("--help").stdout and "Say hello." in shell("--help").stdout
+    assert "matcher:every-other" in shell("otsync", "match", "--help").stdout
+    assert "greet" in shell("otsync", "--help").stdout and "Say hello." in shell("otsync", "--help").stdout
 
 
 def test_they_run_from_the_shell_with_their_options(shell, world, tmp_path):
     def pairs(*args: str) -> list:
-        done = shell("match", *world, "--json", *args)
+        done = shell("otsync", "match", *world, "--json", *args)
         assert done.returncode in (0, 1), done.stderr
         return json.loads(done.stdout)["pairs"]
 
     every, odd = pairs("matcher:nearest-neighbor"), pairs("matcher:every-other", "--matcher.first", "1")
     assert odd == every[1::2] and len(odd) > 5
-    assert shell("greet", "--name", "world").stdout == "hello world\n"
+    assert shell("otsync", "greet", "--name", "world").stdout == "hello world\n"
 
     def offset(*args: str) -> float:
-        done = shell("sync", *world, "--out", str(tmp_path), "--json", "--rematch", "0", *args)
+        done = shell("otsync", "sync", *world, "--out", str(tmp_path), "--json", "--rematch", "0", *args)
         assert done.returncode in (0, 1), done.stderr
         return json.loads(done.stdout)["pairs"][0]["offset_seconds"]
 
@@ -129,14 +128,16 @@ def test_they_run_from_the_shell_with_their_options(shell, world, tmp_path):
 
 
 def test_they_are_on_the_lists_of_benchmarks_and_of_hard_cases(shell, tmp_path):
-    listed = json.loads(shell("plugins", "--json").stdout)["plugins"]
+    listed = json.loads(shell("otsync", "plugins", "--json").stdout)["plugins"]
     assert {(row["group"], row["name"]) for row in listed} >= {
         ("matchers", "every-other"),
         ("aligners", "my-warping"),
         ("refiners", "my-refiner"),
         ("commands", "greet"),
     }
-    done = shell("bench", "hard-cases", "--only", "every-other", "my-warping", "my-refiner", "--out", str(tmp_path))
+    done = shell(
+        "otsync", "bench", "hard-cases", "--only", "every-other", "my-warping", "my-refiner", "--out", str(tmp_path)
+    )
     assert done.returncode in (0, 1), done.stderr
     ran = json.loads((tmp_path / "hard_cases.json").read_text())["rows"]
     assert {row["solver"] for row in ran} == {"every-other", "my-warping", "my-refiner"}

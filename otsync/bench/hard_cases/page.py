@@ -17,8 +17,8 @@ HEAD = """# Hard cases
 
 What plain solvers do on hard inputs (POT and tslearn called directly, as their manuals show), and what otsync does. All
 outcomes are run, by `make stability`, from the tables in `otsync/bench/hard_cases`. The tests run every row on every
-solver of its slot: it answers rightly, flags its answer, or refuses the input with a ValueError, and never hangs. *Known
-limits* name solvers that flag or refuse where others answer; no limit excuses a wrong answer without a flag.
+solver of its slot: it answers rightly, flags its answer, or refuses the input with a ValueError, and never hangs.
+*Known limits* name solvers that flag or refuse where others answer; no limit excuses a wrong answer without a flag.
 `otsync bench hard-cases` runs the table from the shell, plugins included.
 """
 

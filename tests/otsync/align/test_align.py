@@ -182,7 +182,7 @@ def test_bad_arguments_are_refused_by_name():
 
 
 def test_answers_without_flags_of_their_own_get_a_second_opinion():
-    """DTW says nothing of its doubts: its answer carries the likelihood scan's, and DISAGREE where that answers else."""
+    """DTW tells no doubts: its answer carries the likelihood scan's, and DISAGREE where that answers otherwise."""
     a, b, matches = films(3, 0.5)
     right = align(a, b, matches, ConstantShift())
     assert right.status is Status.OK and right.frames == pytest.approx(15, abs=0.3)

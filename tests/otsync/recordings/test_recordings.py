@@ -23,8 +23,9 @@ from otsync.files.digest import content_key
 from otsync.io import open_scene
 from otsync.plugins import forget, register
 from otsync.priors import Cache, ChainedFlow, Daisy, MedianBackground
+from otsync.progress import Deadline
 from otsync.recordings.kept_pairs import KeptPairs, pack, unpack
-from otsync.recordings.routes import choose_route, synchronize_scene, without_times
+from otsync.recordings.routes import _too_late, choose_route, synchronize_scene, without_times
 from otsync.recordings.stages import PIXELS, SPACE, Stages, stages_from, with_labels, with_method
 from otsync.recordings.tracking import Tracking, track_labels
 from otsync.sync.pairs import Job, run
@@ -257,6 +258,11 @@ def test_a_method_stands_in_the_slots_of_the_answer():
             with_method(Stages(), "epipolar", Method(**slots))
     assert with_method(Stages(), "epipolar", Method(refiner=Unrefined())).pixels.refiner == Unrefined()
     assert with_method(Stages(), "tracks", PAPER).space.slots() == PAPER.slots()
+
+
+def test_a_budget_leaves_stereo_out_where_it_would_take_too_much():
+    assert _too_late(10.0, Deadline(1e6)) == ""
+    assert "no stereo: it would take about 15 s of the 0 s" in _too_late(10.0, Deadline(0.0))
 
 
 def test_a_tracks_label_is_what_most_of_it_lies_on():

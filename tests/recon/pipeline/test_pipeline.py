@@ -18,9 +18,10 @@ from otsync.files.cache import Cache
 from otsync.io import open_scene
 from otsync.io.mend import cut, keep_frames, unreadable
 from otsync.priors.points import ChainedFlow
-from otsync.progress import Progress
+from otsync.progress import Deadline, Progress
 from otsync.recordings.routes import synchronize_scene
 from otsync.types import Offsets, Status, TrackSet
+from recon.backdrop.fit import TIMED
 from recon.cli import main
 from recon.cli.tables import offset_table
 from recon.fit.options import FitOptions
@@ -358,3 +359,17 @@ def test_stages_are_shared_with_the_synchronisation_before(world, start, tmp_pat
     assert shared == {kind: sorted(tmp_path.glob(f"{kind}-*.npz")) for kind in shared}
     with pytest.raises(pytest.fail.Exception, match="tracked again"):
         lifted_tracks(train, offsets, Cache(tmp_path / "elsewhere"), map, Progress())
+
+
+def test_a_budget_is_the_whole_jobs_and_says_what_it_left_out(world, start, tmp_path):
+    """With no time left: as few steps as a stage can be measured by."""
+    progress, plan = Progress(), replace(QUICK, fit=FitOptions(budget=1e-9))
+    deadline = Deadline(1e-9)
+    outcome = reconstruct(
+        open_scene(world), start, tmp_path, plan=plan, held_out=("held0",), progress=progress, deadline=deadline
+    )
+    assert outcome.fitted.stats["steps"] == 120
+    assert f"budget: the static part takes {TIMED} steps in place of 60" in progress.notes
+    assert any("are left for the fit" in note for note in progress.notes)
+    assert any("a longer one gives a better scene" in note for note in progress.notes)
+    assert json.loads((tmp_path / "metrics.json").read_text())
