@@ -64,12 +64,6 @@ def clouds(a: TrackSet, b: TrackSet, limit: int) -> tuple[Cloud, Cloud] | None:
     return made[0], made[1]
 
 
-def thinned_cloud(cloud: Cloud, limit: int) -> Cloud:
-    """At most ``limit`` of the tracks, those seen longest."""
-    chosen = longest_seen(cloud.tracks, limit)
-    return Cloud(cloud.tracks.take(chosen), cloud.index[chosen], cloud.unit, cloud.curves.take(chosen))
-
-
 def sizes(tracks: TrackSet) -> tuple[float, float]:
     """(how far apart tracks get, how far they go in 0.2 s), in the video's units; 0 where unknown."""
     x = tracks.positions()

@@ -22,7 +22,6 @@ from ..types.checks import positive
 from .agreement import Overlay, feature_distances, overlay
 from .clouds import Cloud, clouds, comes_first, from_units, in_units
 from .fit import Joint, fit_jointly
-from .mates import half_turns
 from .scan import APART, Shifts, scan
 
 WINDOW = 14 / 30
@@ -65,6 +64,11 @@ FEATURES_ALONE: tuple[MatcherLike, ...] = (OptimalTransport(), OptimalTransport(
 """Matches of a second search, where the first one is doubtful. Structure can be wrong as a whole: people turned over
 stand like people. Then its wrong matches agree with each other, and outvote the right ones; those of features do not.
 """
+
+
+MORE = 4
+"""Times as many candidates are weighed in the second search. Where people turned over stand like people, the right
+answer was the eighth to seventeenth by consensus, and the first by how many tracks move alike."""
 
 
 @dataclass(frozen=True)
@@ -167,13 +171,9 @@ class OwnFrames:
             tops = [(0.0, start[0].offset, in_units(start[1], *made))]
         weighed = pair.weigh_all(tops)
         if start is None and self.matcher is None and self._doubtful(weighed, pair):
-            tops, _ = self._search(pair, FEATURES_ALONE)
+            tops, _ = self._search(pair, FEATURES_ALONE, MORE * self.candidates)
             weighed = sorted([*weighed, *pair.weigh_all(tops)], key=lambda w: -w.agreement)
             stats["second_search"] = 1.0
-            if weighed and self._doubtful(weighed, pair):
-                mates = half_turns(pair.a, pair.b, weighed[0].joint.transform, self.max_lag)
-                weighed = sorted([*weighed, *pair.weigh_all(mates)], key=lambda w: -w.agreement)
-                stats["half_turns"] = 1.0
         if not weighed:
             fps = min(nominal_fps(a), nominal_fps(b))
             return nothing(Status.NO_MATCH), Alignment(math.nan, fps=fps, flags=(Status.NO_MATCH,), stats=stats)
@@ -194,15 +194,15 @@ class OwnFrames:
         return poor or rival > self.trust.rival * first.agreement
 
     def _search(
-        self, pair: Pair, matchers: tuple[MatcherLike, ...] = STRUCTURE
+        self, pair: Pair, matchers: tuple[MatcherLike, ...] = STRUCTURE, most: int | None = None
     ) -> tuple[list[Candidate], dict[str, float]]:
-        """Candidates for offset and similarity, most promising first."""
+        """At most ``most`` (:attr:`candidates`) candidates for offset and similarity, most promising first."""
         proposed = self._propose(pair, matchers)
         if len(proposed) < 4:
             return [], {"proposed": float(len(proposed))}
         clock = thinned(common_clock(pair.a.tracks, pair.b.tracks, Matches(proposed)))
         shifts = scan(clock, draws=self.draws, near=self.near, seed=self.seed, max_lag=self.max_lag)
-        tops = different(shifts, clock, self.candidates)
+        tops = different(shifts, clock, most or self.candidates)
         stats = {"proposed": float(len(proposed)), "consensus": tops[0][0] if tops else 0.0}
         return tops, stats
 

@@ -86,6 +86,8 @@ def reconstruct(
     from otsync.files.cache import Cache
 
     plan, progress, cache = plan or Plan(), progress or Progress(), cache or Cache(out / "stages")
+    # what an effect lacks is said before the work, not after it
+    with_declared(plan.effects, [v.camera.readout for v in scene.videos if v.name not in held_out])
     out.mkdir(parents=True, exist_ok=True)
     clear_parts(out, out / "stages")
     ready = prepare(

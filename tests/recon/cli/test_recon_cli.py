@@ -728,7 +728,7 @@ def test_run_says_once_which_frames_it_leaves_out(world, synchronized, tmp_path,
     for k in (3, 5, 6, 7):
         (damaged / "images" / "cam1" / f"{k:04d}.png").write_bytes(b"\x89PNG broken")
     args = ["run", str(damaged), "--out", str(out), "--steps", "2", "--width", str(SIZE[0]), "--frames", "2", "12"]
-    assert otsync([*args, "--held-out", "held0"]) == 0
+    assert otsync([*args, "--held-out", "held0", "--backdrop-steps", "9"]) == 0
     told = capsys.readouterr().err
     assert synchronized == [[10, 6, 10]]
     for note in ("video cam1, frame 1 is left out", "video cam1: 1 further frames are left out"):
@@ -746,6 +746,8 @@ def test_run_tells_the_reconstruction_which_frames_and_how_long_shutters_were_op
         str(out),
         "--steps",
         "2",
+        "--backdrop-steps",
+        "9",
         "--width",
         str(SIZE[0]),
         "--frames",
