@@ -26,13 +26,15 @@ from .sync_worlds import FPS, MOVING
 FARTHEST = 50.0
 """Frames of offset, at most."""
 
+TOGETHER, GRAPH = 6, "recording, 6 cameras"
+
 STRANGERS = 0.6
 """Share of tracks that belong to another scene."""
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A pair of videos and the true offset of b, in seconds of a.
+    """A pair of videos and the true offset of b, in seconds of a; with ``more``, several videos and their offsets.
 
     ``largest``: frames, what a missing answer counts as: the clip's length, the largest error that there can be.
     """
@@ -42,6 +44,18 @@ class Case:
     b: TrackSet
     offset: float
     fps: float = FPS
+    more: tuple[tuple[TrackSet, float], ...] = ()
+
+    @property
+    def tracks(self) -> list[TrackSet]:
+        """Of all videos."""
+        return [self.a, self.b, *(tracks for tracks, _ in self.more)]
+
+    def errors(self, seconds: np.ndarray) -> np.ndarray:
+        """|error| of every video but the first, in frames; a missing answer counts as :attr:`largest`."""
+        true = np.array([self.offset, *(offset for _, offset in self.more)])
+        error = np.abs(seconds[1:] - true) * self.fps
+        return np.where(np.isfinite(error), error, self.largest)
 
     @property
     def largest(self) -> float:
@@ -105,7 +119,10 @@ SITUATIONS: dict[str, Callable[[int], Case]] = {
 def real_cases(
     scene: str | os.PathLike[str], cache: Path, pairs: int, seed: int
 ) -> list[tuple[str, Callable[[], Case]]]:
-    """Pairs of cameras of a truly synchronised recording, cut so that they begin 1-50 frames apart, in three bands."""
+    """Pairs of cameras of a truly synchronised recording, cut so that they begin 1-50 frames apart, in three bands.
+
+    And for every second pair :data:`TOGETHER` cameras at once, which begin up to 30 frames apart.
+    """
     opened = open_scene(scene)
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         material = Material.of(opened, Stages(), Cache(cache), pool.map, say)
@@ -122,6 +139,10 @@ def real_cases(
             starts = (0, shift) if later else (shift, 0)
             cases.append((name, partial(_clipped, material, int(a), int(b), starts, True)))
             cases.append(("recording, no depth", partial(_clipped, material, int(a), int(b), starts, False)))
+    for _ in range((pairs + 1) // 2):
+        chosen = rng.permutation(len(opened.videos))[:TOGETHER]
+        begin = rng.integers(0, 31, len(chosen))
+        cases.append((GRAPH, partial(_together, material, chosen.tolist(), begin.tolist())))
     return cases
 
 
@@ -130,3 +151,12 @@ def _clipped(material: Material, a: int, b: int, starts: tuple[int, int], lifted
     fps = float(first.fps or FPS)
     names = material.scene.names
     return Case(f"{names[a]} {names[b]} {starts}", first, second, (starts[1] - starts[0]) / fps, fps)
+
+
+def _together(material: Material, cameras: list[int], starts: list[int]) -> Case:
+    length = material.frames - 30
+    clips = [material.clip(v, s, s + length, 1, True) for v, s in zip(cameras, starts, strict=True)]
+    fps = float(clips[0].fps or FPS)
+    late = [(s - starts[0]) / fps for s in starts]
+    more = tuple(zip(clips[2:], late[2:], strict=True))
+    return Case(f"{[material.scene.names[v] for v in cameras]} {starts}", clips[0], clips[1], late[1], fps, more)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -23,6 +24,10 @@ def test_rows_on_two_situations(tmp_path, monkeypatch, capsys):
     paper = next(r for r in answers if r["matcher"] == "paper")
     offsets = synchronize([case.a, case.b], method=PAPER)
     assert paper["error"] == abs(offsets.seconds[1] - case.offset) * case.fps
+    three = replace(case, more=((case.b, case.offset + 1.0),))
+    assert len(three.tracks) == 3 and three.largest == 150
+    found = np.array([0.0, case.offset + 0.1, np.nan])
+    np.testing.assert_allclose(three.errors(found), [0.1 * case.fps, 150])
     assert (tmp_path / "chain.svg").read_text().startswith("<?xml") and "mid: errors" in capsys.readouterr().out
 
 
