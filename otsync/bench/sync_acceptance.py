@@ -271,16 +271,15 @@ def baseline(seeds: Sequence[int]) -> Iterator[Check]:
 
 def acceptance(seeds: Sequence[int], rows: Sequence[Row], progress: Callable[[str], None] = print) -> list[Check]:
     """All checks; ``rows`` from :func:`pair_rows`."""
-    few = list(seeds)[: max(1, len(seeds) // 2)]
     checks: list[Check] = []
     for part in (
         pairs(rows),
         views(seeds),
         thirty(seeds[0]),
         juggling(seeds),
-        flags(rows, few),
-        clocks(few),
-        baseline(few),
+        flags(rows, seeds),
+        clocks(seeds),
+        baseline(seeds),
     ):
         for check in part:
             checks.append(check)

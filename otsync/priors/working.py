@@ -49,6 +49,10 @@ class WorkingFrames(Sequence[np.ndarray]):
         """Working pixels (index convention: centre of the first pixel at 0) to the camera's (+0.5 convention)."""
         return (uv + 0.5) / self.scale
 
+    def from_full(self, uv: Float[np.ndarray, "*N 2"]) -> Float[np.ndarray, "*N 2"]:
+        """The other way round."""
+        return uv * self.scale - 0.5
+
     def mask(self, mask: np.ndarray) -> Bool[np.ndarray, "h w"]:
         import cv2
 
