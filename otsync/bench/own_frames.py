@@ -31,6 +31,7 @@ from ..types import Alignment, Offsets, Similarity, TrackSet
 from ..types.similarity import rotation_of
 from .panoptic import Material
 from .record import table, write_rows
+from .sync_acceptance import Check, at_least, at_most
 from .sync_worlds import MOVING
 
 FIRST_SEED = 7000
@@ -45,8 +46,8 @@ BEND = 95.0
 MID, REAL = (0.1, 2.0, 3.0), (0.3, 3.0, np.inf)
 """What counts as right: errors of offset (frames), rotation (degrees), scale (percent)."""
 
-WRONG_TIME, WRONG_TURN = 1.0, 6.0
-"""Frames and degrees (or four sigmas, where more) beyond which an answer without a flag is wrong."""
+WRONG_TIME, WRONG_TURN, WRONG_SCALE = 1.0, 6.0, 9.0
+"""Frames, degrees and percent (or four sigmas, where more) beyond which an answer without a flag is wrong."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +71,7 @@ def run(
     json: bool = False,
     cache: Path | None = None,
 ) -> int:
-    """Measure, print tables, write CSV and JSON to ``out``; 1 when an answer without a flag is wrong, else 0.
+    """Measure, print tables, write CSV and JSON to ``out``; 1 when a promise is not kept, else 0.
 
     Args:
         scene: a truly synchronised recording: its pairs and all its cameras at once are measured too.
@@ -104,9 +105,32 @@ def run(
     write_rows(out, "own_frames_pairs", details)
     if videos:
         write_rows(out, "own_frames_cameras", videos)
+    checks = promises(rows)
     if json:
-        print(json_module.dumps({"rows": rows}))
-    return int(any(row["wrong"] for row in rows))
+        print(json_module.dumps({"rows": rows, "promises": [c.row() for c in checks]}))
+    else:
+        print(table([c.row() for c in checks]))
+    return int(not all(c.met for c in checks))
+
+
+def promises(rows: list[dict[str, Any]]) -> list[Check]:
+    """What the documentation promises of each row that was measured."""
+    checks = []
+    for row in rows:
+        what = row["what"]
+        checks.append(at_most(f"{what}: wrong without a flag", row["wrong"], 0))
+        if what == "simulated, mid":
+            checks.append(at_least(f"{what}: right", row["right"], 0.9))
+        elif what.startswith("static"):
+            checks.append(at_least(f"{what}: flagged", row["flagged"], 1))
+        elif what.startswith("cameras, below"):
+            checks.append(at_least(f"{what}: right", row["right"], 0.95))
+        elif what.startswith("all cameras"):
+            bars = (("offset_mean", 0.15, "frames"), ("rotation_mean", 1, "degrees"), ("centre_mean", 0.05, "m"))
+            checks += [at_most(f"{what}: {key}, {unit}", row[key], bar) for key, bar, unit in bars]
+        if not what.startswith("all cameras"):
+            checks.append(at_most(f"{what}: CPU seconds a pair", row["cpu_seconds"], 2))
+    return checks
 
 
 def random_similarity(rng: np.random.Generator) -> Similarity:
@@ -185,7 +209,11 @@ def errors(pair: Pair, found: Alignment, limits: tuple[float, float, float]) -> 
     offset, turn = abs(found.offset - pair.offset) * fps, S.degrees_from(T)
     scale = 100 * abs(np.log(S.scale / T.scale))
     right = bool(offset <= limits[0] and turn <= limits[1] and scale <= limits[2])
-    apart = not offset <= WRONG_TIME or turn > max(WRONG_TURN, 4 * S.rotation_sigma)
+    apart = (
+        not offset <= WRONG_TIME
+        or turn > max(WRONG_TURN, 4 * S.rotation_sigma)
+        or scale > max(WRONG_SCALE, 400 * S.scale_sigma)
+    )
     return row | {
         "offset_error": _known(offset),
         "offset_sigma": found.sigma * fps,
@@ -220,6 +248,9 @@ def summary(what: str, details: list[dict[str, Any]]) -> dict[str, Any]:
         "n": len(details),
         "right": round(float(np.mean([d["right"] for d in details])), 3) if details else None,
         "flagged": round(float(np.mean([d["flagged"] for d in details])), 3) if details else None,
+        "neither": round(float(np.mean([not d["right"] and not d["flagged"] for d in details])), 3)
+        if details
+        else None,
         "wrong": sum(d["wrong"] for d in details),
         "offset_median": at("offset_error", 0.5),
         "offset_max": at("offset_error", 1.0),

@@ -67,7 +67,7 @@ def gate(name: str, measured: Mapping[str, float], worse: Callable[[str, float, 
     Args:
         worse: ``worse(key, measured, baseline)``, with the tolerance that the figure's kind calls for.
     """
-    baseline = read_json(baseline_path(name))["figures"]
+    baseline = baseline_of(name)
     missing = sorted(set(baseline) - set(measured))
     compared = {key: value for key, value in measured.items() if key in baseline}
     failed = [key for key, value in compared.items() if not math.isfinite(value) or worse(key, value, baseline[key])]
@@ -78,6 +78,14 @@ def gate(name: str, measured: Mapping[str, float], worse: Callable[[str, float, 
     if not failed and not missing:
         print(f"gate {name}: {len(compared)} figure{'s'[: len(compared) != 1]} no worse than the baseline")
     return 1 if failed or missing else 0
+
+
+def baseline_of(name: str) -> dict[str, float]:
+    """The figures of a suite's baseline. ValueError where there is none."""
+    path = baseline_path(name)
+    if not path.exists():
+        raise ValueError(f"{path}: expected a baseline; found none. Make one by --rebase.")
+    return read_json(path)["figures"]
 
 
 def save_baseline(name: str, figures: Mapping[str, float]) -> None:

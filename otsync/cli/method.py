@@ -39,8 +39,11 @@ class MethodOptions:
     refiner: slot("refiners", (*REFINERS, EpipolarRefine), optional=True) = None
     """From the frame to a fraction of it."""
 
-    def chosen(self) -> Method:
-        """The method that the options name. ValueError where costs have no matcher to minimise them."""
+    def chosen(self, graph: Graph | None = None) -> Method:
+        """The method that the options name. ValueError where costs have no matcher to minimise them.
+
+        graph: what options of the graph change, where no method brings one; default :class:`Graph`.
+        """
         method = Method()
         if self.method is not None:
             method = available("methods", METHODS)[self.method]
@@ -51,6 +54,6 @@ class MethodOptions:
             refiner=self.refiner,
             rate=self.rate,
             rematch=self.rematch,
-            graph=replace(method.graph or Graph(), **named_graph) if named_graph else None,
+            graph=replace(method.graph or graph or Graph(), **named_graph) if named_graph else None,
         )
         return method.but(matcher=with_costs(method.matcher, self.costs)) if self.costs else method

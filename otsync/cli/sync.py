@@ -8,7 +8,8 @@ from typing import Annotated
 
 import tyro
 
-from ..sync.own_frames import Frames
+from ..sync.graph import Graph
+from ..sync.own_frames import COMPLETE, Frames
 from ..sync.verb import unique_names
 from ..types import TrackSet
 from .method import MethodOptions
@@ -52,6 +53,7 @@ class Sync:
     """Print the content of offsets.json instead of the table."""
 
     def run(self) -> int:
+        method = self.slots.chosen(Graph(complete=COMPLETE) if self.frames == "own" else None)
         if len(self.tracks) == 1 and self.tracks[0].suffix != ".npz":
             refuse_unused(self, ("workers",), f"a recording ({self.tracks[0]}), which has --recording.workers,")
             return sync_recording(
@@ -59,7 +61,7 @@ class Sync:
                 self.out,
                 self.recording,
                 frames=self.frames,
-                method=self.slots.chosen(),
+                method=method,
                 reference=self.reference,
                 truth=self.truth,
                 as_json=self.json,
@@ -76,7 +78,6 @@ class Sync:
         names = unique_names(tracks)
         reference = reference_among(names, self.reference)
         known = None if self.truth is None else true_offsets(self.truth, names)
-        method = self.slots.chosen()
         self.out.mkdir(parents=True, exist_ok=True)  # before the work, not after it
         offsets = with_progress(
             tracks,

@@ -11,10 +11,11 @@ from ..costs.linear import Cosine
 from ..types import Similarity
 from .clouds import Cloud, seen_and_filled
 
-MOMENTS = 48
-"""Common moments that are looked at."""
+SPACING, MOST_MOMENTS = 0.1, 1200
+"""Seconds between the common moments that are looked at, and how many at most (two minutes; then further apart)."""
 
 LEAST_MOMENTS = 6
+"""That both tracks of a pair are seen at, however long the videos are: a track lives for a part of them."""
 
 PLACE, MOTION, FEATURE = 0.05, 0.025, 2.0
 """What costs 1 in matching: distance of place and of motion in units of the scene, and distance of features."""
@@ -70,7 +71,7 @@ def overlay(a: Cloud, b: Cloud, offset: float, rate: float, transform: Similarit
     last = min(a.curves.times[-1], rate * b.curves.times[-1] + offset)
     place, motion, alike = np.full((3, len(a), len(b)), np.nan)
     if last > first:
-        t = np.linspace(first, last, MOMENTS)
+        t = np.linspace(first, last, min(MOST_MOMENTS, max(LEAST_MOMENTS, round((last - first) / SPACING))))
         root = np.sqrt(transform.scale)
         xa, wa = seen_and_filled(a.curves.sample(t) / root)
         xb, wb = seen_and_filled(transform(b.curves.sample((t - offset) / rate)) / root)

@@ -122,7 +122,7 @@ class State:
     def of(cls, a: TrackSplines, b: TrackSplines, clock: Clock, start: Similarity) -> State:
         middle_a, middle_b = a.mean.mean(0), b.mean.mean(0)
         away = (start(middle_b) - middle_a) / np.sqrt(start.scale)
-        return cls(clock, start.scale, start.R, -away, middle_a, middle_b)
+        return cls(clock, start.scale, start.R, away, middle_a, middle_b)
 
     def stepped(self, step: Float[np.ndarray, " 8"]) -> State:
         return replace(

@@ -22,7 +22,7 @@ from ..types.checks import positive
 from .agreement import Overlay, feature_distances, overlay
 from .clouds import Cloud, clouds, comes_first, from_units, in_units
 from .fit import Joint, fit_jointly
-from .scan import APART, Shifts, scan
+from .scan import APART, STRIDE, Shifts, scan
 
 WINDOW = 14 / 30
 """Half window, s, of the moving means that split the residual: as of :class:`otsync.SplineRefine`."""
@@ -86,6 +86,7 @@ class PoseTrust:
         blur: WEAK when the residual of the motion is more than this many seconds of it.
         rotation: LOOSE_POSE when one sigma of the rotation is more than this, degrees.
         scale: LOOSE_POSE when one sigma of the scale is more than this share of it.
+        elsewhere: DISAGREE when the likelihood scan of the final matches peaks more than this many seconds away.
         chirality: AMBIGUOUS when fewer of the matched quads have the same handedness in both videos.
     """
 
@@ -94,6 +95,7 @@ class PoseTrust:
     blur: float = 4.2 / 30
     rotation: float = 6.0
     scale: float = 0.08
+    elsewhere: float = 3 / 30
     chirality: float = 0.5
 
 
@@ -246,6 +248,8 @@ class OwnFrames:
                 "rotation_sigma": transform.rotation_sigma,
                 "scale_sigma": transform.scale_sigma,
                 "place": joint.place,
+                "blur": fine.stats.get("blur", joint.blur),
+                "elsewhere": abs(scanned.offset - joint.clock.offset),
                 "chirality": chirality_of(a, b, rows[:, 0], rows[:, 1]),
             }
         )
@@ -258,6 +262,8 @@ class OwnFrames:
             Status.NO_MATCH: stats["agreement"] < t.agreement / 3,
             Status.WEAK: stats["agreement"] < t.agreement or stats["blur"] > t.blur,
             Status.AMBIGUOUS: stats["rival"] > t.rival or stats["chirality"] < t.chirality,
+            # the scan over all shifts, of the same matches, ended somewhere else
+            Status.DISAGREE: stats["elsewhere"] > t.elsewhere,
             Status.LOOSE_POSE: not (stats["rotation_sigma"] < t.rotation and stats["scale_sigma"] < t.scale),
         }
         return tuple(flag for flag, yes in raised.items() if yes)
@@ -335,8 +341,12 @@ class Pair:
 
 
 def thinned(clock: CommonClock, longest: int = 600) -> CommonClock:
-    """Long clips at fewer frames per second: the search needs no more, and its time grows with their square."""
+    """Long clips at fewer frames per second: the search needs no more, and its time grows with their square.
+
+    But never fewer than one in :data:`otsync.frames.scan.STRIDE` seconds: the fits that follow reach little further.
+    """
     every = -(-max(clock.a.shape[1], clock.b.shape[1]) // longest)
+    every = max(1, min(every, int(STRIDE * clock.fps)))
     return CommonClock(clock.a[:, ::every], clock.b[:, ::every], clock.fps / every, clock.origin)
 
 

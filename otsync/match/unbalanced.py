@@ -206,7 +206,7 @@ def check_partners(name: str, partners: int, top: int | None) -> None:
 
 
 def unrelated(M: Float[np.ndarray, "Na Nb"]) -> float:
-    """What two unrelated tracks cost: the median of M above its least entry; its range where most entries are equal."""
+    """What two unrelated tracks cost: the median of M; its range where most entries are equal."""
     typical = float(np.median(M))
     return typical if typical > 0 else float(np.ptp(M))
 

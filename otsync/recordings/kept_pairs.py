@@ -12,9 +12,10 @@ import numpy as np
 
 from ..compute.threads import MapLike
 from ..files.cache import Cache
+from ..sync.own_frames import OwnJob
 from ..sync.pairs import Job
 from ..sync.verdict import Answer
-from ..types import Alignment, Matches, Status, TrackSet
+from ..types import Alignment, Matches, Similarity, Status, TrackSet
 
 log = logging.getLogger("otsync")
 
@@ -31,9 +32,14 @@ class KeptPairs:
 
     def __call__(self, function: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
         def kept(item: Any) -> Any:
-            if self.cache.root is None or not isinstance(item, Job) or item.matches is not None:
+            given = isinstance(item, Job) and item.matches is not None
+            if self.cache.root is None or not isinstance(item, Job | OwnJob) or given:
                 return function(item)
-            key = (_without_name(item.a), _without_name(item.b), item.matcher, item.aligner, item.refiner)
+            key: tuple[Any, ...] = (_without_name(item.a), _without_name(item.b))
+            if isinstance(item, OwnJob):
+                key = (*key, item.solver, item.start)
+            else:
+                key = (*key, item.matcher, item.aligner, item.refiner)
             try:
                 self.cache.path("pair", key)
             except ValueError as error:  # an algorithm whose content cannot be read would be mistaken for another
@@ -69,6 +75,10 @@ def pack(answer: Answer) -> dict[str, np.ndarray]:
         out[f"{name}_hypotheses"] = np.asarray(alignment.hypotheses, float)
         if alignment.curve is not None:
             out[f"{name}_curve"] = np.asarray(alignment.curve, float)
+        if (S := alignment.transform) is not None:
+            out[f"{name}_transform"] = np.concatenate([[S.scale], S.R.ravel(), S.t])
+            if S.covariance is not None:
+                out[f"{name}_covariance"] = S.covariance
     return out
 
 
@@ -82,6 +92,12 @@ def unpack(pair: tuple[int, int], arrays: dict[str, np.ndarray]) -> Answer:
             "stats": dict(of["stats"]),
         }
 
+    def transform(name: str) -> Similarity | None:
+        of = arrays.get(f"{name}_transform")
+        if of is None:
+            return None
+        return Similarity(float(of[0]), of[1:10].reshape(3, 3), of[10:13], arrays.get(f"{name}_covariance"))
+
     def alignment(name: str) -> Alignment:
         of = told[name]
         return Alignment(
@@ -91,6 +107,7 @@ def unpack(pair: tuple[int, int], arrays: dict[str, np.ndarray]) -> Answer:
             arrays[f"{name}_hypotheses"],
             arrays.get(f"{name}_curve"),
             fps=of["fps"],
+            transform=transform(name),
             **words(of),
         )
 

@@ -23,6 +23,7 @@ from ..progress import Progress, Tell
 from ..sync.method import Method
 from ..sync.verb import synchronize
 from ..types import Offsets
+from .kept_pairs import KeptPairs
 from .routes import Synchronized, lift_given, track_all, without_times
 from .stages import Stages
 
@@ -75,9 +76,16 @@ def synchronize_own_scene(
     with progress.stage("lift"):
         lifted = [replace(t, frame=t.name) for t in lift_given(scene, raw, stages, cache, map)]
     with progress.stage("synchronise"):
-        offsets = synchronize(lifted, reference=reference, method=method, frames=solver or "own", map=map)
-    why = ("route own frames: as asked; depth is given, poses are not used across videos",)
-    return Synchronized(without_times(offsets), tuple(lifted), "own frames", why, None, progress.seconds)
+        kept = KeptPairs(cache, map)
+        offsets = synchronize(lifted, reference=reference, method=method, frames=solver or "own", map=kept)
+    why = ["route own frames: as asked; depth is given, poses are not used across videos"]
+    if method is not None and method.slots():
+        why.append(method.told())
+    if scene.labels:
+        why.append("labels are given; without a common frame they are not used")
+    for line in why:
+        tell(line)
+    return Synchronized(without_times(offsets), tuple(lifted), "own frames", tuple(why), None, progress.seconds)
 
 
 def found_document(document: dict[str, Any], offsets: Offsets) -> dict[str, Any]:

@@ -94,8 +94,11 @@ def synchronize_scene(
         check_within_a_frame(video.camera.readout, video.times, f"camera.readout of {video.name!r}")
     stages, cache = with_labels(stages or Stages(), scene), cache or Cache()
     chosen, why = choose_route(scene, route, stages)
+    named = method is not None and bool(method.slots())
     if method is not None:
-        stages = with_labels(with_method(stages, chosen, method), scene)
+        stages = with_method(stages, chosen, method)
+    if method is not None and named:
+        why = (*why, method.told())
     for line in why:
         tell(line)
     progress = Progress(tell)
@@ -113,9 +116,11 @@ def synchronize_scene(
     epipolar = Synchronized(first, tuple(flat), "epipolar", why, None, progress.seconds)
     if chosen == "epipolar":
         return epipolar
-    late = "" if deadline is None or route == "stereo" else _too_late(progress.seconds["epipolar"], deadline)
+    asked = named or route == "stereo"
+    late = "" if deadline is None or asked else _too_late(progress.seconds["epipolar"], deadline)
     doubt = late or _too_doubtful(first, stages)
     if doubt:
+        _refuse_unused(method, doubt)
         tell(doubt)
         return replace(epipolar, why=(*why, doubt))
     with progress.stage("stereo"):
@@ -124,11 +129,12 @@ def synchronize_scene(
     bare = [t.name for t in lifted if len(t) == 0]
     if bare:
         doubt = f"stereo found no depth for {', '.join(bare)}: the epipolar answer stands"
+        _refuse_unused(method, doubt)
         tell(doubt)
         return replace(epipolar, why=(*why, doubt))
     with progress.stage("synchronise"):
         offsets = without_times(pairs_in_space(lifted, reference, stages, cache, map))
-    if _flagged(offsets) > _flagged(first):
+    if _flagged(offsets) > _flagged(first) and not named:
         doubt = "the lifted tracks leave more doubt than the pixels did: the epipolar answer stands"
         tell(doubt)
         return replace(epipolar, why=(*why, doubt))
@@ -301,6 +307,15 @@ def without_times(offsets: Offsets) -> Offsets:
 
 def _flagged(offsets: Offsets) -> int:
     return sum(not s.ok for s in offsets.status)
+
+
+def _refuse_unused(method: Method | None, why: str) -> None:
+    """ValueError where slots were named for an answer from lifted tracks, and there is none."""
+    if method is not None and method.slots():
+        raise ValueError(
+            f"{', '.join(method.slots())}: expected lifted tracks to use them on; {why}. Choose --recording.route "
+            "epipolar, or leave them out. What was tracked is kept."
+        )
 
 
 STEREO_COST = 1.5

@@ -123,6 +123,13 @@ def with_method(stages: Stages, route: str, method: Method) -> Stages:
                 f"{slot}, route: expected one that reads pixels on the route epipolar; found {thing}, which reads "
                 "positions in space. Choose a route with depth (tracks, stereo), or leave it out."
             )
+    times = stages.pixels.rematch if method.rematch is None else method.rematch
+    mute = [c for c in getattr(method.matcher, "costs", ()) if isinstance(c, EpipolarDistance) and c.clock is None]
+    if mute and not times:
+        raise ValueError(
+            f"costs, rematch: expected --rematch 1 beside {type(mute[0]).__name__}, which tells nothing while no clock "
+            "is known; found no matching again. Add it, or leave the cost out."
+        )
     return replace(stages, pixels=stages.pixels.but(**method.slots()))
 
 

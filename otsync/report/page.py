@@ -12,6 +12,7 @@ import numpy as np
 from ..files.arrays import atomic_write
 from ..types import Alignment, Matches, Offsets, Status, TrackSet
 from ..types.drawing import clips_of
+from ..types.similarity import IDENTITY
 from . import figures
 
 DETAILED_PAIRS = 8
@@ -49,6 +50,7 @@ def write_report(
         f"<p>{_verdict(offsets)}</p>",
         "<h2>Offsets</h2>",
         _offset_table(offsets, truth),
+        _frames_table(offsets),
         "<p class=s>A positive offset means that the video started later than its reference. "
         "t<sub>world</sub> = rate · t<sub>video</sub> + offset.</p>",
         "<h2>On the common clock</h2>",
@@ -106,6 +108,26 @@ def _offset_table(offsets: Offsets, truth: Sequence[float] | None) -> str:
             cells += [f"<td>{number(truth[v] * fps, 3)}", f"<td>{number((offsets.seconds[v] - truth[v]) * fps, 3)}"]
         rows.append("<tr>" + "".join(cells) + f"<td class=t>{status_words(offsets.status[v], offsets.flags[v])}")
     return f"<div class=scroll><table><tr>{''.join(head)}<th class=t>status{''.join(rows)}</table></div>"
+
+
+def _frames_table(offsets: Offsets) -> str:
+    """Where each video's frame of reference lies, for videos that have one of their own."""
+    if not offsets.transforms:
+        return ""
+    rows = []
+    for name, S in zip(offsets.names, offsets.transforms, strict=True):
+        cells = ["–"] * 5
+        if S is not None:
+            cells = [
+                f"{S.scale:.4f}",
+                f"{100 * S.scale_sigma:.2f} %",
+                f"{S.degrees_from(IDENTITY):.1f}°",
+                f"{S.rotation_sigma:.2f}°",
+                " ".join(f"{x:.3g}" for x in S.t),
+            ]
+        rows.append(f"<tr><td>{escape(name)}" + "".join(f"<td>{c}" for c in cells))
+    head = "<th>video<th>scale<th>± sigma<th>turned by<th>± sigma<th>origin, in the reference's frame"
+    return f"<h2>Frames of reference</h2><div class=scroll><table><tr>{head}{''.join(rows)}</table></div>"
 
 
 def status_words(status: Status, flags: Sequence[Status]) -> str:
@@ -183,6 +205,8 @@ def _cost_map(
     """The pair's own cost map and path, or the paper's made from tracks and matches; and the offset of lag 0."""
     if tracks is None or key not in matches or len(matches[key]) == 0:
         return pair.cost, pair.path, 0.0
+    if pair.transform is not None:  # positions are in two frames
+        return None, None, 0.0
     i, j = key
     origin = float(tracks[i].times[0] - tracks[j].times[0])
     if pair.cost is not None:

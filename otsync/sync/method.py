@@ -38,6 +38,11 @@ class Method:
         assert set(slots) <= named, slots
         return replace(self, **{slot: thing for slot, thing in slots.items() if thing is not None})
 
+    def told(self) -> str:
+        """Its name and what it puts into which slot, in a line."""
+        things = ", ".join(f"{slot} {thing}" for slot, thing in self.slots().items())
+        return f"method {self.name}: {things}" if self.name else f"in the slots: {things}"
+
     def slots(self) -> dict[str, Any]:
         """What it names, by slot."""
         own = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "name"}

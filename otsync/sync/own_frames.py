@@ -15,7 +15,9 @@ from ..clocks.shutter import at_frame_times
 from ..compute.threads import MapLike
 from ..frames import OwnFrames
 from ..frames.clouds import sizes
+from ..frames.solver import SAME_TIME, SAME_TURN
 from ..match.slot import Matcher, MatcherLike
+from ..match.synchronous import longest_seen
 from ..types import Alignment, Clock, Matches, Similarity, Status, TrackSet, in_order
 from ..types.trust import Trust
 from .graph import Graph, Pair
@@ -32,6 +34,9 @@ COMPLETE = 16
 
 NEAR_TIME, NEAR_TURN = 3 / 30, 12.0
 """Seconds and degrees within which a pair that begins at the graph's prediction must stay to count."""
+
+SOME = 300
+"""Tracks that tell where a video's scene lies and how large it is."""
 
 ASTRAY_TIME = 1.5 / 30
 """Seconds by which a pair may contradict the clocks of the graph before its similarity is left out."""
@@ -97,7 +102,7 @@ def synchronize_own(
     if again:
         fresh = {a.pair: a for a in map(run_own, again)}
         starts = {job.pair: job.start for job in again}
-        answers = [better(a, fresh.get(a.pair), starts.get(a.pair)) for a in answers]
+        answers = [better(a, fresh.get(a.pair), starts.get(a.pair), solver) for a in answers]
         verdict, poses, links = decide(tracks, answers, chosen, centre, graph, trust, refit, middles)
     return with_pose_flags(verdict, poses, links, solver), poses.frames
 
@@ -146,8 +151,11 @@ def guided(
     return OwnJob(answer.pair, tracks[i], tracks[j], solver, (clock, predicted))
 
 
-def better(answer: Answer, fresh: Answer | None, start: tuple[Clock, Similarity] | None) -> Answer:
-    """The new answer where it vouches for itself and stays where the graph put it, else the old one."""
+def better(answer: Answer, fresh: Answer | None, start: tuple[Clock, Similarity] | None, solver: OwnFrames) -> Answer:
+    """The new answer where it vouches for itself and stays where the graph put it, else the old one.
+
+    A fit that begins where the graph puts it looks at no other answer: the one of the free search is its rival.
+    """
     if fresh is None or start is None:
         return answer
     found = fresh.refined
@@ -156,9 +164,19 @@ def better(answer: Answer, fresh: Answer | None, start: tuple[Clock, Similarity]
     near = abs(found.offset - start[0].offset) <= NEAR_TIME
     if not near or found.transform.degrees_from(start[1]) > NEAR_TURN:
         return answer
-    guided_stats = {"guided": 1.0}
+    before, own = answer.refined, found.stats.get("agreement", 0.0)
+    rival = before.stats.get("agreement", 0.0) if before.transform is not None and other(before, found) else 0.0
+    if rival > solver.trust.rival * own:
+        return answer
+    guided_stats = {"guided": 1.0, "rival": rival / max(own, 1e-300)}
     found = dataclasses.replace(found, stats=found.stats | guided_stats)
     return Answer(fresh.pair, fresh.matches, found, found)
+
+
+def other(one: Alignment, two: Alignment) -> bool:
+    """Whether two answers are not the same one."""
+    assert one.transform is not None and two.transform is not None
+    return abs(one.offset - two.offset) > SAME_TIME or one.transform.degrees_from(two.transform) > SAME_TURN
 
 
 def with_pose_flags(verdict: Verdict, poses: Poses, links: Sequence[tuple[Pair, Link]], solver: OwnFrames) -> Verdict:
@@ -200,16 +218,25 @@ def with_pose_flags(verdict: Verdict, poses: Poses, links: Sequence[tuple[Pair, 
 
 
 def middle_and_extent(tracks: TrackSet) -> tuple[np.ndarray, float]:
-    """(the median place of the tracks, how far apart they get), in the video's own frame."""
+    """(the median place of the tracks seen longest, how far apart they get), in the video's own frame."""
+    tracks = tracks.take(longest_seen(tracks, SOME))
     x = tracks.positions().reshape(-1, 3)
     return np.median(x[np.isfinite(x[:, 0])], 0), max(sizes(tracks)[0], 1e-300)
 
 
 def solver_from(frames: str | OwnFrames, matcher: MatcherLike | None) -> OwnFrames:
-    """The solver that ``frames`` names, with the matcher of the first matches. ValueError for two of them."""
+    """The solver that ``frames`` names, with the matcher of the first matches. ValueError for two of them, and for one
+    that compares positions.
+    """
     solver = frames if isinstance(frames, OwnFrames) else OwnFrames()
     if matcher is None:
         return solver
+    across = [c for c in Matcher.of(matcher).costs if getattr(c, "needs_xyz", False)]
+    if across:
+        raise ValueError(
+            f"matcher, frames: expected costs that compare no positions, which are in two frames; found {across[0]!r}. "
+            "Take features, or structure."
+        )
     if solver.matcher is not None:
         raise ValueError("matcher, frames: expected one matcher; found two. Leave out OwnFrames.matcher, or matcher.")
     return dataclasses.replace(solver, matcher=Matcher.of(matcher))

@@ -133,7 +133,8 @@ def fit_backdrop(
         sh_degree: of the view-dependent colour. With 14 cameras degree 1 fits them better, but new views worse.
         rates: a group without one is frozen.
 
-    The result depends on the seed, not on the number of threads (with ``budget`` and ``at_most`` on the machine's speed as well).
+    The result depends on the seed, not on the number of threads (with ``budget`` and ``at_most`` on the machine's speed
+    as well).
     Raises ValueError when no video has a background: give masks; FloatingPointError when the fit diverges.
     """
     if budget is not None and at_most is not None:

@@ -99,3 +99,13 @@ def test_sigmas_cover_the_errors():
 def test_nothing_in_common_is_no_answer():
     a, b = curves(0.0, draw(0))
     assert fit_jointly(a, b, Clock(10.0), draw(0), 14 / 30) is None
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_fit_begins_where_it_is_told_to(seed):
+    f = draw(seed)
+    a, b = curves(0.2, f, seed=seed)
+    start = State.of(a, b, Clock(0.2), f).transform(np.zeros((8, 8)))
+    np.testing.assert_allclose(start.t, f.t, atol=1e-9)
+    np.testing.assert_allclose(start.R, f.R, atol=1e-12)
+    assert start.scale == pytest.approx(f.scale)

@@ -42,6 +42,7 @@ def test_clock_and_cameras_of_a_recording_without_poses(tmp_path, capsys):
     printed = json.loads(capsys.readouterr().out)
     assert code == 0, printed["videos"]
     assert printed["route"] == "own frames"
+    assert "Frames of reference" in (out / "report.html").read_text()
     offsets = Offsets.load(out / "offsets.json")
     assert abs(offsets.frames[1] - SHIFTS[1]) < 0.3
     (folder / "scene.json").write_text((out / "scene.json").read_text())

@@ -19,17 +19,19 @@ import pytest
 
 from otsync import DTW, PAPER, Graph, Method, OptimalTransport, PartialFGW, SplineRefine, Unrefined, synchronize
 from otsync.cli import main
+from otsync.costs import Cosine, EpipolarDistance
 from otsync.files.digest import content_key
 from otsync.io import open_scene
+from otsync.match import UnbalancedOT
 from otsync.plugins import forget, register
 from otsync.priors import Cache, ChainedFlow, Daisy, MedianBackground
 from otsync.progress import Deadline
 from otsync.recordings.kept_pairs import KeptPairs, pack, unpack
-from otsync.recordings.routes import _too_late, choose_route, synchronize_scene, without_times
+from otsync.recordings.routes import _refuse_unused, _too_late, choose_route, synchronize_scene, without_times
 from otsync.recordings.stages import PIXELS, SPACE, Stages, stages_from, with_labels, with_method
 from otsync.recordings.tracking import Tracking, track_labels
 from otsync.sync.pairs import Job, run
-from otsync.types import Offsets
+from otsync.types import Offsets, Similarity
 from tests.otsync.epipolar.test_epipolar import world
 from tests.recording_world import exact_depth, exact_labels, paths, ring, write_recording
 
@@ -257,6 +259,13 @@ def test_a_method_stands_in_the_slots_of_the_answer():
         with pytest.raises(ValueError, match=f"{next(iter(slots))}, route: expected one that reads pixels"):
             with_method(Stages(), "epipolar", Method(**slots))
     assert with_method(Stages(), "epipolar", Method(refiner=Unrefined())).pixels.refiner == Unrefined()
+    again = Method(matcher=UnbalancedOT(costs=(Cosine(), EpipolarDistance())))
+    with pytest.raises(ValueError, match="costs, rematch: expected --rematch 1 beside EpipolarDistance"):
+        with_method(Stages(), "epipolar", again)
+    assert with_method(Stages(), "epipolar", replace(again, rematch=1)).pixels.rematch == 1
+    with pytest.raises(ValueError, match=r"matcher, aligner, .*: expected lifted tracks to use them on; no depth"):
+        _refuse_unused(PAPER, "no depth")
+    _refuse_unused(Method(), "no depth")
     assert with_method(Stages(), "tracks", PAPER).space.slots() == PAPER.slots()
 
 
@@ -301,6 +310,12 @@ def test_a_pair_survives_the_cache():
         np.testing.assert_array_equal(before.curve, after.curve)
         np.testing.assert_array_equal(before.hypotheses, after.hypotheses)
     assert content_key(a) == content_key(replace(a)) != content_key(b)
+    moved = Similarity(2.0, np.eye(3)[[1, 2, 0]], np.arange(3.0), np.eye(7))
+    turned = replace(answer, refined=replace(answer.refined, transform=moved))
+    back = unpack((0, 1), pack(turned)).refined.transform
+    assert back is not None and back.scale == 2.0 and back.covariance is not None
+    np.testing.assert_array_equal(back.R, moved.R)
+    np.testing.assert_array_equal(back.t, moved.t)
 
 
 def test_kept_pairs_compute_once_and_tell_algorithms_apart(tmp_path):

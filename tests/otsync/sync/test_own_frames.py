@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from otsync import LikelihoodScan, OwnFrames, SplineRefine, synchronize
+from otsync.costs import Cosine, CurveDistance
+from otsync.match import UnbalancedOT
 from otsync.simulate import simulate
+from otsync.sync.own_frames import better
 from otsync.sync.poses import Link, place, triangles
-from otsync.types import Offsets, Similarity, Status
+from otsync.sync.verdict import Answer
+from otsync.types import Alignment, Clock, Matches, Offsets, Similarity, Status
 
 
 def frames_of(n: int, seed: int) -> list[Similarity]:
@@ -137,3 +143,43 @@ def test_frames_that_there_are_not_are_refused(film):
     with pytest.raises(ValueError, match="frames"):
         synchronize(film[0], frames="mine")
     assert Status.from_code("loose_pose") is Status.LOOSE_POSE
+
+
+def test_a_fit_from_the_graph_has_the_free_answer_as_its_rival():
+    """Begun where the graph puts it, a fit looks at nothing else: what the search found before is not forgotten."""
+    there = Similarity(1.0, np.eye(3), np.zeros(3))
+    turned = Similarity(1.0, Rotation.from_rotvec([0, 0, np.pi]).as_matrix(), np.zeros(3))
+    none = Matches(np.zeros((0, 2), int))
+
+    def answer(transform: Similarity, agreement: float, *flags: Status) -> Answer:
+        found = Alignment(0.1, transform=transform, flags=flags, stats={"agreement": agreement})
+        return Answer((0, 1), none, found, found)
+
+    before, start = answer(turned, 0.17, Status.AMBIGUOUS), (Clock(0.1), there)
+    assert better(before, answer(there, 0.2), start, OwnFrames()) is before
+    fresh = better(before, answer(there, 0.4), start, OwnFrames())
+    assert fresh.refined.transform is there and fresh.refined.stats["rival"] == pytest.approx(0.17 / 0.4)
+    assert better(before, answer(there, 0.4, Status.WEAK), start, OwnFrames()) is before
+
+
+def test_costs_of_positions_are_refused_without_a_common_frame(film):
+    tracks, _ = film
+    matcher = UnbalancedOT(costs=(Cosine(), CurveDistance()))
+    with pytest.raises(ValueError, match=r"matcher, frames: expected costs that compare no positions.*CurveDistance"):
+        synchronize(tracks, frames="own", matcher=matcher)
+
+
+@pytest.mark.slow
+def test_clips_of_a_minute_are_found_as_those_of_seconds():
+    """A track is seen for a part of a long clip; moments are as dense as in a short one."""
+    (a, b), truth = simulate(
+        "basketball", preset="mid", videos=2, own_frames=True, frames=1800, offsets=[0.0, 3.3], seed=5
+    )
+    lives = np.random.default_rng(0).integers(0, 1650, len(a)), np.random.default_rng(1).integers(0, 1650, len(b))
+    brief = [
+        replace(t, visible=t.seen & ((np.arange(1800) >= s[:, None]) & (np.arange(1800) < s[:, None] + 150)))
+        for t, s in zip((a, b), lives, strict=True)
+    ]
+    _, found = OwnFrames()(*brief)
+    assert found.transform is not None and abs(found.offset - 3.3) < 0.3 / 30, found
+    assert found.transform.degrees_from(truth.transform(0, 1)) < 3
