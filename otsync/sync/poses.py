@@ -109,11 +109,8 @@ def place(n: int, links: Sequence[Link], references: Sequence[int]) -> Poses:
         frames[root] = IDENTITY.with_covariance(np.zeros((7, 7)))
         usable = [k for k, l in enumerate(links) if l.trusted and references[l.a] == references[l.b] == root]
         sound = [k for k in usable if closed[k]]
-        own = along_tree(root, links, sound, votes)
-        for k in [k for k in usable if not closed[k]]:  # a video that hangs on such links alone still gets a frame
-            l = links[k]
-            if (l.a in own) != (l.b in own):
-                _extend(own, l)
+        own = along_tree({root: IDENTITY}, links, sound, votes)
+        own = along_tree(own, links, usable, votes)  # a video that hangs on links that do not close still gets a frame
         kept = [k for k in usable if links[k].a in own and links[k].b in own]
         own, covariances, found = relax(own, [links[k] for k in kept], root)
         errors[kept] = found
@@ -148,9 +145,13 @@ def _turned(link: Link) -> Link:
     return Link(link.b, link.a, back, link.trusted, link.transform(link.middle), link.extent / link.transform.scale)
 
 
-def along_tree(root: int, links: Sequence[Link], usable: Sequence[int], votes: np.ndarray) -> dict[int, Similarity]:
-    """Frames along the links, the best confirmed first; ties by the smaller sigma of rotation."""
-    frames = {root: IDENTITY}
+def along_tree(
+    known: dict[int, Similarity], links: Sequence[Link], usable: Sequence[int], votes: np.ndarray
+) -> dict[int, Similarity]:
+    """Frames along the links from those that are known, the best confirmed first; ties by the smaller sigma of
+    rotation.
+    """
+    frames = dict(known)
     order = sorted(usable, key=lambda k: (-votes[k], links[k].transform.rotation_sigma, k))
     growing = True
     while growing:

@@ -19,6 +19,7 @@ What plain solvers do on hard inputs (POT and tslearn called directly, as their 
 outcomes are run, by `make stability`, from the tables in `otsync/bench/hard_cases`. The tests run every row on every
 solver of its slot: it answers rightly, flags its answer, or refuses the input with a ValueError, and never hangs.
 *Known limits* name solvers that flag or refuse where others answer; no limit excuses a wrong answer without a flag.
+Rows that are *open* have such answers today: they are counted below, and are to be mended.
 `otsync bench hard-cases` runs the table from the shell, plugins included.
 """
 

@@ -183,3 +183,15 @@ def test_clips_of_a_minute_are_found_as_those_of_seconds():
     _, found = OwnFrames()(*brief)
     assert found.transform is not None and abs(found.offset - 3.3) < 0.3 / 30, found
     assert found.transform.degrees_from(truth.transform(0, 1)) < 3
+
+
+def test_a_chain_of_links_that_do_not_close_is_followed_to_its_end():
+    true = frames_of(5, 3)
+    drop = tuple((i, j) for i in range(5) for j in range(i + 1, 5) if (i, j) not in ((0, 1), (1, 3), (3, 4), (1, 4)))
+    links = links_of(true, drop=drop)
+    for k, l in enumerate(links):
+        if (l.a, l.b) == (1, 4):  # the triangle 1, 3, 4 does not close
+            links[k] = Link(l.a, l.b, l.transform.moved(np.r_[0, 0, 3.0, 0, 0, 0, 0]), True, l.middle, l.extent)
+    for root in (4, 3, 0):
+        frames = place(5, links, [root] * 5).frames
+        assert [v for v in range(5) if frames[v] is not None] == [0, 1, 3, 4]
