@@ -22,10 +22,10 @@ demo: $(VENV)/.core  ## simulate, match and synchronise a small world; writes de
 	$(BIN)/otsync demo --out demo
 
 test: $(VENV)/.test lint  ## under ten minutes on two cores
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) -m "not slow"
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m "not slow"
 
 test-all: $(VENV)/.test lint  ## every test, the slow ones too
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 
 bench: $(VENV)/.test  ## what is timed; writes bench/out/
 	$(BIN)/otsync bench all --out bench/out

@@ -116,16 +116,21 @@ _HEADERS: dict[tuple[int, int], Callable[..., tuple[tuple[int, ...], bool, np.dt
 def _declared_bytes(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> int:
     """Bytes of one member's array by its own header, which must agree with the archive's directory."""
     with archive.open(info) as member:
-        version = np.lib.format.read_magic(member)
-        if version not in _HEADERS:
-            raise ValueError(f"member {info.filename!r} has the unknown .npy version {version}")
-        shape, _, dtype = _HEADERS[version](member)
-        header = member.tell()
+        return check_declared(member, info.file_size, f"member {info.filename!r}")
+
+
+def check_declared(stream: Any, length: int, what: str) -> int:
+    """Bytes of an ``.npy`` array by its header. ValueError unless ``length``, of header and array, is as declared."""
+    version = np.lib.format.read_magic(stream)
+    if version not in _HEADERS:
+        raise ValueError(f"{what} has the unknown .npy version {version}")
+    shape, _, dtype = _HEADERS[version](stream)
+    header = stream.tell()
     if dtype.hasobject:
-        raise ValueError(f"member {info.filename!r} holds pickled objects, which are never read")
+        raise ValueError(f"{what} holds pickled objects, which are never read")
     size = dtype.itemsize
-    for length in shape:
-        size *= int(length)
-    if any(length < 0 for length in shape) or size + header != info.file_size:
-        raise ValueError(f"member {info.filename!r} declares {size} bytes but holds {info.file_size - header}")
+    for n in shape:
+        size *= int(n)
+    if any(n < 0 for n in shape) or size + header != length:
+        raise ValueError(f"{what} declares {size} bytes but holds {length - header}")
     return size

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from ..files.arrays import existing, read_npz
+from ..files.arrays import check_declared, existing, read_npz
 
 MAX_PIXELS = 64 * 2**20
 """Largest image that is decoded (64 megapixels, 8K x 8K)."""
@@ -64,6 +64,8 @@ def read_npy(path: str | os.PathLike[str], *, memmap: bool = False) -> np.ndarra
     """A plain ``.npy`` array without pickle, its declared size checked against the file's."""
     path = existing(path)
     try:
+        with open(path, "rb") as stream:
+            check_declared(stream, path.stat().st_size, "it")
         return np.load(path, mmap_mode="r" if memmap or path.stat().st_size > 2**20 else None, allow_pickle=False)
     except (ValueError, OSError, EOFError, SyntaxError, TypeError, KeyError, OverflowError) as error:
         raise ValueError(f"{path}: expected a plain .npy array; {error}. Write it again.") from None

@@ -204,6 +204,12 @@ def test_depth_in_three_formats_agrees(tmp_path):
     np.save(tmp_path / "bad.npy", np.array([{}], object), allow_pickle=True)
     with pytest.raises(ValueError, match="plain"):
         read_depth(tmp_path / "bad.npy", 1.0)
+    with open(tmp_path / "huge.npy", "wb") as stream:  # claims 80 GB in a hundred bytes
+        np.lib.format.write_array_header_1_0(
+            stream, {"descr": "<f8", "fortran_order": False, "shape": (100_000, 100_000)}
+        )
+    with pytest.raises(ValueError, match=r"huge\.npy: expected a plain .npy array; it declares 80000000000 bytes"):
+        read_depth(tmp_path / "huge.npy", 1.0)
     np.save(tmp_path / "nan.npy", np.array([[np.nan, -1.0, np.inf, 2.0]]))
     np.testing.assert_array_equal(read_depth(tmp_path / "nan.npy", 1.0), [[0, 0, 0, 2]])
 
