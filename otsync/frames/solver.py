@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..align.likelihood import LikelihoodScan
+from ..align.vouch import drifts
 from ..clocks.common import CommonClock, common_clock, nominal_fps
 from ..costs.linear import Cosine
 from ..match.anchored import AnchoredFGW
@@ -253,7 +254,8 @@ class OwnFrames:
                 "chirality": chirality_of(a, b, rows[:, 0], rows[:, 1]),
             }
         )
-        flags = in_order((*fine.flags, *self._flags(stats)))
+        still = (Status.STATIC,) if drifts(a, rows[:, 0]) and drifts(b, rows[:, 1]) else ()
+        flags = in_order((*fine.flags, *self._flags(stats), *still))
         return matches, replace(fine, transform=transform, flags=flags, stats=stats)
 
     def _flags(self, stats: dict[str, float]) -> tuple[Status, ...]:

@@ -134,7 +134,6 @@ CASES: tuple[Case, ...] = (
         transient,
         (FLAGGED,),
         check=wrong_anywhere,
-        open=TRUST,
     ),
     Case(
         "a drift of both calibrations",
@@ -143,7 +142,6 @@ CASES: tuple[Case, ...] = (
         common_drift,
         (FLAGGED,),
         check=wrong_anywhere,
-        open=TRUST,
     ),
     *(
         Case(

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tslearn.metrics import dtw_path_from_metric
 
-from otsync import DTW, Alignment, ConstantShift, Matches, Refused, Status, TrackSet, align
+from otsync import DTW, Alignment, ConstantShift, LikelihoodScan, Matches, Refused, Status, TrackSet, align
 from otsync.align.kernels import open_end_path
 from otsync.align.peaks import most_frequent, peak
 
@@ -201,3 +201,30 @@ def test_somebody_else_who_does_the_same_later_is_flagged_in_one_world_frame():
     same = align(here, replace(b, frame="world"), matches)
     assert same.status is Status.OK and same.stats["apart"] < 0.5
     assert align(a, replace(there, frame=None), matches).status is Status.OK
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_drift_that_all_tracks_share_is_no_evidence(seed):
+    """A static scene whose calibration or trackers drift alike in each video's own clock: no offset is vouched for."""
+    rng = np.random.default_rng(seed)
+    t, size = np.arange(120) / 30, rng.uniform(0.1, 0.3)
+    turn, phase = rng.uniform(0.3, 1.2, 3), rng.uniform(0, 6.3, 3)
+    drift = size * (np.sin(turn * t[:, None] + phase) - np.sin(phase)) * rng.normal(size=3)
+    still = rng.normal(size=(40, 1, 3)) * [1.5, 1.5, 0.6]
+    a, b = (TrackSet(still + drift + 0.004 * rng.normal(size=(40, 120, 3)), fps=30, frame="world") for _ in "ab")
+    matches = Matches(np.stack([np.arange(40)] * 2, 1))
+    for aligner in (LikelihoodScan(), DTW(), ConstantShift()):
+        assert Status.STATIC in align(a, b, matches, aligner, throw=False).flags
+
+
+def test_a_rigid_thing_that_goes_somewhere_tells_the_time():
+    rng = np.random.default_rng(0)
+    t = np.arange(150) / 30
+    path = np.stack([np.sin(1.1 * t), np.cos(0.7 * t) + 0.3 * t, 0.2 * np.sin(3 * t)], 1)
+    body = 0.3 * rng.normal(size=(40, 1, 3))
+    a, b = (
+        TrackSet(body + path[k : k + 120] + 0.004 * rng.normal(size=(40, 120, 3)), fps=30, frame="world")
+        for k in (0, 9)
+    )
+    found = align(a, b, Matches(np.stack([np.arange(40)] * 2, 1)))
+    assert found.status.ok and found.offset == pytest.approx(0.3, abs=0.02)
