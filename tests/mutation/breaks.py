@@ -9,16 +9,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 COSTS = ("tests/otsync/costs",)
+POSITIONS = (*COSTS, "tests/otsync/epipolar/test_epipolar.py")  # costs of place are tested beside those of pixels
 MATCH = ("tests/otsync/match/test_match.py",)
 UNBALANCED = ("tests/otsync/match/test_unbalanced.py",)
 ANCHORED = ("tests/otsync/match/test_anchored.py",)
 ALIGN = ("tests/otsync/align",)
+CLOCKS = ("tests/otsync/clocks/test_splines.py",)
 REFINE = ("tests/otsync/refine",)
 EPIPOLAR = ("tests/otsync/epipolar",)
 FRAMES = ("tests/otsync/frames",)
 GRAPH = ("tests/otsync/sync/test_graph.py",)
 SYNC = ("tests/otsync/sync/test_graph.py", "tests/otsync/sync/test_sync.py")
-FIT = ("tests/recon/fit/test_fit.py", "tests/recon/fit/test_optimize.py", "tests/recon/fit/test_uncertainty.py")
+FIT = ("tests/recon/fit/test_fit.py",)
+RATES = ("tests/recon/fit/test_optimize.py",)
+SIGMA = ("tests/recon/fit/test_uncertainty.py",)
 LOSSES = ("tests/recon/losses/test_losses.py",)
 MOTION_LOSSES = ("tests/recon/losses/test_motion_losses.py",)
 WARP = ("tests/recon/motion/test_motion_warp.py",)
@@ -51,7 +55,7 @@ BREAKS = (
         "otsync/costs/kernels.py",
         "return ordered[:m].mean()",
         "return ordered[n - m :].mean()",
-        COSTS,
+        POSITIONS,
         "the distance of two paths averages the largest distances instead of the smallest",
     ),
     Break(
@@ -67,7 +71,7 @@ BREAKS = (
         "otsync/costs/kernels.py",
         "out[p] = total / n",
         "out[p] = total / A.shape[1]",
-        COSTS,
+        POSITIONS,
         "the distance at equal times is divided by all frames instead of the common ones",
     ),
     Break(
@@ -107,7 +111,7 @@ BREAKS = (
         "otsync/costs/linear.py",
         "np.hstack([p, 0.5 * u, 0.5 * ~u])",
         "np.hstack([p, 0.5 * u, 0.5 * u])",
-        COSTS,
+        (*COSTS, *ANCHORED),
         "an unlabelled track of b costs 1 with everything, not 1/2",
     ),
     Break(
@@ -115,7 +119,7 @@ BREAKS = (
         "otsync/costs/positions.py",
         "ta, tb = a.times, self.rate * b.times + self.offset",
         "ta, tb = a.times, self.rate * b.times - self.offset",
-        COSTS,
+        POSITIONS,
         "the distance at equal times takes the offset with the wrong sign",
     ),
     Break(
@@ -123,7 +127,7 @@ BREAKS = (
         "otsync/costs/positions.py",
         "np.where(np.isfinite(distance), np.minimum(distance / unit, cap), cap)",
         "np.where(np.isfinite(distance), np.minimum(distance / unit, cap), 0.0)",
-        COSTS,
+        POSITIONS,
         "tracks that were never seen together cost nothing",
     ),
     Break(
@@ -292,7 +296,7 @@ BREAKS = (
         "otsync/match/synchronous.py",
         "sample((t - self.offset) / self.rate)",
         "sample((t + self.offset) / self.rate)",
-        (*MATCH, *UNBALANCED),
+        SYNC,
         "matching at known times reads b with the offset's wrong sign",
     ),
     Break(
@@ -300,7 +304,7 @@ BREAKS = (
         "otsync/match/kernels.py",
         "(mx * mx + my * my + mz * mz) / (n * n)",
         "(mx * mx + my * my + mz * mz) / n",
-        (*MATCH, *UNBALANCED),
+        SYNC,
         "the distance in motion subtracts the square of a sum, not of a mean",
     ),
     # --- align ------------------------------------------------------------------------------------------------------
@@ -309,7 +313,7 @@ BREAKS = (
         "otsync/clocks/common.py",
         "return CommonClock(xa, xb, fps, float(a.times[0] - b.times[0]))",
         "return CommonClock(xa, xb, fps, float(b.times[0] - a.times[0]))",
-        ALIGN,
+        CLOCKS,
         "what lag 0 means has the wrong sign where clips do not begin at 0",
     ),
     Break(
@@ -341,7 +345,7 @@ BREAKS = (
         "otsync/align/likelihood.py",
         "gain *= weight[:, None]",
         "gain *= weight.mean()",
-        ALIGN,
+        (*ALIGN, *UNBALANCED),
         "the velocities' score forgets the weights of the matches",
     ),
     Break(
@@ -455,7 +459,7 @@ BREAKS = (
         "otsync/epipolar/scan.py",
         "nats = np.log(sums / counts + np.exp(FLOOR))",
         "nats = np.log(sums + np.exp(FLOOR))",
-        EPIPOLAR,
+        (*EPIPOLAR, *UNBALANCED),
         "a track with many candidates has more evidence than one with few",
     ),
     Break(
@@ -626,7 +630,7 @@ BREAKS = (
         "recon/fit/uncertainty.py",
         "return float(spread + step**2)",
         "return float(spread)",
-        FIT,
+        SIGMA,
         "sigma forgets the step on which all frames agree",
     ),
     Break(
@@ -634,7 +638,7 @@ BREAKS = (
         "recon/fit/uncertainty.py",
         "sigma = np.sqrt(variance + variance[reference])",
         "sigma = np.sqrt(variance)",
-        FIT,
+        SIGMA,
         "sigma relative to the reference forgets the reference's own",
     ),
     Break(
@@ -642,7 +646,7 @@ BREAKS = (
         "recon/fit/optimize.py",
         "max(0.0, (progress - self.hold) / (1 - self.hold))",
         "max(0.0, progress - self.hold)",
-        FIT,
+        RATES,
         "rates do not fall to their last value by the end",
     ),
     Break(
