@@ -19,7 +19,7 @@ REFINE = ("tests/otsync/refine",)
 EPIPOLAR = ("tests/otsync/epipolar",)
 FRAMES = ("tests/otsync/frames/test_fit.py",)
 GRAPH = ("tests/otsync/sync/test_graph.py",)
-SYNC = ("tests/otsync/sync/test_graph.py", "tests/otsync/sync/test_sync.py")
+SYNC = (*GRAPH, "tests/otsync/sync/test_verdict.py", "tests/otsync/sync/test_sync.py")
 FIT = ("tests/recon/fit/test_fit.py",)
 RATES = ("tests/recon/fit/test_optimize.py",)
 SIGMA = ("tests/recon/fit/test_uncertainty.py",)
@@ -232,7 +232,7 @@ BREAKS = (
         "otsync/match/vouch.py",
         "counts = (side_a != 0) & (side_b != 0)",
         "counts = side_a != 0",
-        MATCH,
+        ANCHORED,
         "quads without a side in b count as mirrored",
     ),
     Break(
