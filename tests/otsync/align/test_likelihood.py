@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from otsync import LikelihoodScan, Matches, Refused, Status, TrackSet, align
-from otsync.align.likelihood import Signal, evidence, noise_floor, statistics
+from otsync.align.likelihood import Curves, Signal, evidence, noise_floor, statistics, velocity_score
 from otsync.align.peaks import separate_peaks, vertex
 from otsync.clocks.common import common_clock
 from otsync.simulate import simulate
@@ -198,3 +198,34 @@ def test_curves_that_peak_elsewhere_disagree_and_short_overlaps_alias():
     end = curves.total.copy()
     end[2] = end[top] * 0.9
     assert scan._stats(pair, lags, dataclasses.replace(curves, total=end), [top])["alias"] > 1.0
+
+
+def test_the_noise_floor_is_a_quarter_of_the_typical_least_residual():
+    """Of the lags at which a match was seen; a match that never was says nothing."""
+    count = np.array([[0.0, 20], [30, 30], [0, 0]])
+    power, residual = np.where(count > 0, 5.0, 0), np.array([[0, 0.4], [0.2, 0.8], [0, 0]])
+    assert noise_floor(count, power, residual) == pytest.approx(0.25 * 0.3)
+
+
+def test_as_much_evidence_per_frame_over_fewer_frames_is_a_full_rival():
+    """A period later, exact repetition has the same rate of evidence over a shorter overlap."""
+    a, b = moving_pair(0)
+    pair = common_clock(a, b, ALL)
+    lags = pair.lags(24, None)
+    overlap = pair.overlap(lags)
+    top, later = (int(np.flatnonzero(lags == k)[0]) for k in (0, 30))
+    total = np.zeros(len(lags))
+    total[top], total[later] = 90.0, 90.0 * overlap[later] / overlap[top]
+    curves = Curves(total, total, total, np.full(len(lags), 12.0), np.ones(len(lags)))
+    assert LikelihoodScan()._stats(pair, lags, curves, [top, later])["margin"] == pytest.approx(0)
+
+
+def test_weights_count_matches_as_often_as_they_say():
+    """Weight 2 is being there twice, weight 0 is not being there, in velocities and in windows."""
+    a, b = moving_pair(9, noise=0.05)
+    pair = common_clock(a, b, ALL)
+    lags, weight = pair.lags(24, None), np.r_[np.zeros(4), np.ones(4), 2 * np.ones(4)]
+    weighted = velocity_score(pair, lags, 2, 12, weight)
+    alone = [velocity_score(pair, lags, 2, 12, 12.0 * (np.arange(12) == m)) for m in range(12)]
+    np.testing.assert_allclose(weighted, np.average(alone, axis=0, weights=weight))
+    assert not np.allclose(weighted, velocity_score(pair, lags, 2, 12))

@@ -89,6 +89,13 @@ def test_centring_removes_what_all_features_share():
     assert (unit_features(np.ones((5, 3)), center=True) == 0).all()
 
 
+def test_centred_features_are_units_about_the_mean_of_the_set():
+    f = np.random.default_rng(6).normal(size=(30, 6)) + 2
+    u = f / np.linalg.norm(f, axis=1, keepdims=True)
+    u -= u.mean(0)
+    np.testing.assert_allclose(unit_features(f, center=True), u / np.linalg.norm(u, axis=1, keepdims=True))
+
+
 def test_cosine_refuses_other_dimensions():
     a = TrackSet(np.zeros((2, 2, 3)), features=np.ones((2, 3)), fps=30)
     b = TrackSet(np.zeros((2, 2, 3)), features=np.ones((2, 4)), fps=30)

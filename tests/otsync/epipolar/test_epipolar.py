@@ -9,9 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from otsync import Matches, Status, TrackSet, synchronize
+from otsync import Alignment, Matches, Status, TrackSet, synchronize
 from otsync.align.peaks import separate_peaks
 from otsync.costs.positions import CurveDistance, MedianPosition, SynchronousDistance, capped, scene_scale
+from otsync.epipolar.kernels import epipolar_evidence
 from otsync.epipolar.refine import EpipolarRefine, detrended
 from otsync.epipolar.scan import TRACK_CAP, EpipolarScan, mixture
 from otsync.geometry import common_target, fundamental, fundamentals, sampson, undistort, view_angle
@@ -284,3 +285,38 @@ def test_candidates_hold_both_sides_best_and_the_cheapest_first():
     assert len(Candidates(3, 10)(a, b)) == 10
     flat = replace(a, features=np.ones((40, 3)))
     assert Candidates()(flat, replace(b, features=np.ones((40, 3)))).status is Status.NO_INFORMATION
+
+
+def test_a_moving_camera_stands_at_every_frame_where_its_pose_says():
+    """Residuals at every lag against Sampson distances with the poses of the two frames that meet."""
+    rng = np.random.default_rng(0)
+    a, b = ring(4, width=640, height=360)[:2]
+    poses = np.repeat(b.w2c[None], 20, 0)
+    poses[:, 0, 3] += 0.05 * np.arange(20)
+    moving = replace(b, w2c=poses)
+    A, B = rng.uniform(0, 300, (2, 25, 2)), rng.uniform(0, 300, (1, 20, 2))
+    A[0, 7:9] = np.nan
+    F, pairs = fundamentals(a, moving), np.array([[0, 0], [1, 0]])
+    mean, count = np.full((2, 2, 9), np.nan), np.zeros((2, 2, 9))
+    epipolar_evidence(A, B, F, pairs, -3, 5, 4, 10, 3, mean, count)
+    for m in range(2):
+        for k in range(-3, 6):
+            t = np.arange(max(0, k), min(25, 20 + k))
+            e = np.array([sampson(F[0, s - k], A[m, [s]], B[0, [s - k]])[0] for s in t])
+            assert mean[1, m, k + 3] == pytest.approx(np.nanmean(e**2))
+            assert count[1, m, k + 3] == np.isfinite(e).sum()
+
+
+def test_one_step_of_the_fit_goes_nearly_all_the_way():
+    """A derivative that is too large by a factor would leave the rest of the way, and too small a sigma."""
+    a, b = world(7.0)
+    matches = Matches(np.stack([np.arange(40)] * 2, 1))
+    start = Alignment((7.0 + 0.2) / FPS, fps=FPS)
+    found = EpipolarRefine(iterations=1)(a, b, matches, start)
+    assert abs(found.frames - 7.0) < 0.3 * 0.2
+
+
+def test_detrending_reaches_as_far_back_as_ahead():
+    x = np.random.default_rng(2).normal(size=(2, 30))
+    known = np.random.default_rng(3).random((2, 30)) < 0.9
+    np.testing.assert_allclose(detrended(x[:, ::-1], known[:, ::-1], 4), detrended(x, known, 4)[:, ::-1], atol=1e-12)

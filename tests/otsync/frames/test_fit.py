@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from otsync import TrackSet
 from otsync.clocks.splines import TrackSplines
 from otsync.frames import kernels
+from otsync.frames.clouds import clouds, sizes
 from otsync.frames.fit import State, fit_jointly, linearise
 from otsync.types import Clock, Similarity
 
@@ -109,3 +111,43 @@ def test_a_fit_begins_where_it_is_told_to(seed):
     np.testing.assert_allclose(start.t, f.t, atol=1e-9)
     np.testing.assert_allclose(start.R, f.R, atol=1e-12)
     assert start.scale == pytest.approx(f.scale)
+
+
+def test_exchanging_the_videos_changes_no_misfit():
+    """Distances count in the unit midway between the frames, whichever video is called a."""
+    rng = np.random.default_rng(0)
+    f = draw(3)
+    y = rng.normal(size=(6, 12, 3))
+    x = f(y) + 0.1 * rng.normal(size=y.shape)
+    seen = np.ones((6, 12), bool)
+    errors = np.empty((2, 6))
+    for out, first, second, g in zip(errors, (x, y), (y, x), (f, f.inverse()), strict=True):
+        kernels.misfits(first, seen, second, seen, 0, 1, 5, np.r_[g.scale, g.R.ravel(), g.t], 1.0, out)
+    np.testing.assert_allclose(errors[0], errors[1])
+    assert abs(f.scale - 1) > 0.1 and errors.min() > 0
+
+
+@pytest.mark.parametrize("k", range(1, 8))
+def test_covariances_are_of_the_frames_own_changes(k):
+    """A small step of the fit's parameters changes the similarity as its covariance says."""
+    f = draw(4)
+    a, b = curves(0.2, f)
+    state = State.of(a, b, Clock(0.2), f.moved(np.full(7, 0.05)))
+    h = 1e-5 * np.eye(8)[k]
+    there, back = (state.stepped(s * h).transform(np.zeros((8, 8))) for s in (1, -1))
+    change = back.difference(there) / 2e-5
+    told = state.transform(np.outer(np.eye(8)[k], np.eye(8)[k])).covariance
+    np.testing.assert_allclose(told, np.outer(change, change), atol=1e-4 * np.abs(told).max())
+
+
+def test_units_are_midway_between_what_extents_and_speeds_say():
+    """b sees the same points move as fast, but those at the rim of the scene are missing."""
+    rng = np.random.default_rng(0)
+    t = np.arange(60) / 30
+    x = rng.normal(size=(40, 1, 3)) + 0.2 * np.sin(rng.uniform(2, 5, (40, 1, 3)) * t[None, :, None])
+    inner = np.argsort(np.linalg.norm(x.mean(1), axis=1))[:20]
+    a, b = TrackSet(x, fps=30), TrackSet(3.0 * x[inner], fps=30)
+    one, other = clouds(a, b, 100)
+    (extent_a, hop_a), (extent_b, hop_b) = sizes(a), sizes(b)
+    assert extent_b / extent_a < 0.9 * hop_b / hop_a
+    assert other.unit / one.unit == pytest.approx(np.sqrt(extent_b / extent_a * hop_b / hop_a))

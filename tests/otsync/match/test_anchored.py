@@ -12,6 +12,7 @@ from scipy.sparse import issparse
 from otsync import AnchoredFGW, Cosine, FusedGromovWasserstein, Labels, Matches, Status, TrackSet, match, matcher_for
 from otsync.match.anchored import kernels
 from otsync.match.anchored.clouds import clouds
+from otsync.match.anchored.signatures import Scale, signatures
 from otsync.match.vouch import chirality
 from otsync.metrics import match_quality
 from otsync.simulate import matching_world
@@ -329,4 +330,21 @@ def test_chirality_of_a_mirror_image_is_the_complement():
     rng = np.random.default_rng(7)
     points = rng.normal(size=(60, 1, 3)) + 0.01 * rng.normal(size=(60, 5, 3))
     assert chirality(points, points) == 1 and chirality(points, points * [-1, 1, 1]) == 0
-    assert np.isnan(chirality(points * [1, 1, 0], points)) and np.isnan(chirality(points[:3], points[:3]))
+    assert np.isnan(chirality(points[:3], points[:3]))
+    # flat in either video: nobody can tell
+    assert np.isnan(chirality(points * [1, 1, 0], points)) and np.isnan(chirality(points, points * [1, 1, 0]))
+
+
+def test_distances_that_nobody_knows_do_not_agree():
+    """Track 0 is never seen together with the landmark, in either video: that is no likeness."""
+    rng = np.random.default_rng(8)
+    seen = np.ones((6, 8), bool)
+    seen[0, 4:] = False
+    seen[5, :4] = False
+    tracks = TrackSet(rng.normal(size=(6, 8, 3)), seen, features=rng.normal(size=(6, 4)), fps=30)
+    a, b = clouds(tracks, tracks)
+    mark = np.flatnonzero(a.index == 5)
+    sa, sb = signatures(a, b, (a.take(mark), b.take(mark)), Scale(1.0, 0.05, 1.0, 1.0))
+    apart = np.abs(sa - sb)[:, 0]
+    stranger = a.index == 0
+    assert (apart[stranger] > 1e3).all() and (apart[~stranger] == 0).all()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import ot
@@ -24,8 +24,10 @@ from otsync import (
     TrackSet,
     match,
 )
-from otsync.match.problem import Problem
+from otsync.match.problem import Problem, normalised_structure
 from otsync.match.sinkhorn import round_to_marginals, sinkhorn
+from otsync.match.vouch import geometry, moves_mirrored
+from otsync.types import Clock
 from tests.conftest import wiggle
 
 STRUCTURED = [FusedGromovWasserstein(), EntropicFGW(), PartialFGW()]
@@ -299,3 +301,46 @@ def test_partial_fgw_leaves_outliers_out():
     found = match(a, b, PartialFGW(mass=0.65))
     right = found.pairs[:, 0] == found.pairs[:, 1]
     assert right.mean() > 0.9 and (found.pairs[:, 0] < 50).mean() > 0.95
+
+
+def test_structures_are_compared_in_one_unit(pair):
+    """A scene of twice the size stays twice as large: it is another scene."""
+    a, _, _ = pair
+    small, large = normalised_structure(a, replace(a, xyz=2 * a.xyz))
+    np.testing.assert_allclose(large, 2 * small)
+
+
+def test_disagreement_of_distances_grows_with_their_square():
+    """Four points a metre apart, and four that are 2 % further: 1.98 % of the mean distance, where 5 % count as 1."""
+    x = np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])[:, None] / np.sqrt(8)
+    a, b = TrackSet(x, fps=30), TrackSet(1.02 * x, fps=30)
+    every = np.arange(4)
+    assert geometry(a, b, every, every) == pytest.approx((0.02 / 1.01 / 0.05) ** 2)
+    assert geometry(a, a, every, every) == pytest.approx(0, abs=1e-12)
+
+
+def test_motion_tells_a_mirror_image_at_a_known_clock(pair):
+    a, _, _ = pair
+    every, mirrored = np.arange(len(a)), replace(a, xyz=a.xyz * [1, -1, 1])
+    assert moves_mirrored(a, mirrored, every, every, Clock())
+    assert not moves_mirrored(a, a, every, every, Clock())
+    assert not moves_mirrored(a, mirrored, every, every, None)
+
+
+@dataclass(frozen=True)
+class Shifted:
+    """Feature distance plus a constant."""
+
+    by: float
+    weight: float = 1.0
+
+    def matrix(self, a, b):
+        return Cosine().matrix(a, b) + self.by
+
+
+def test_a_constant_on_all_costs_changes_no_partial_plan(pair):
+    """Costs below zero are costs, too: they must not draw more mass than there is."""
+    a, b, _ = pair
+    plain, below = (PartialFGW(costs=(Shifted(by),))(a, b) for by in (0.0, -3.0))
+    assert below.status.ok and below.stats["mass"] == pytest.approx(0.65)
+    assert as_set(below) == as_set(plain)

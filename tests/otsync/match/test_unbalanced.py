@@ -15,6 +15,7 @@ from otsync.align import LikelihoodScan, align
 from otsync.epipolar.scan import mixture
 from otsync.files.cache import Cache
 from otsync.match import Candidates, SemirelaxedFGW, UnbalancedFGW, UnbalancedOT
+from otsync.match.problem import Problem
 from otsync.match.unbalanced import partners_of, relaxed_plan, unrelated
 from otsync.recordings.kept_pairs import KeptPairs, pack, unpack
 from otsync.refine import SplineRefine, refine
@@ -221,6 +222,18 @@ def test_small_costs_do_not_underflow():
     p, q, M = problem(8)
     plan, _, failed = relaxed_plan(p, q, M + 3.0, 2e-3, 1.0)
     assert not failed and plan.sum() > 0 and np.isfinite(plan).all()
+
+
+def test_the_fused_plan_is_stationary_for_the_paper_s_objective():
+    """F of Eq. 1 with relaxed marginals, and ε: at a minimum its slope is the same wherever mass could go."""
+    a, b = videos(10, 20, seed=4, noise=0.5)
+    alpha, reg, marginal = 2.0, 0.05, 0.1
+    found = match(a, b, UnbalancedFGW(marginal, reg, alpha, max_iter=300), throw=False)
+    problem, plan = Problem.of(a, b, (Cosine(),), alpha), found.plan
+    mass, rows, columns = plan.sum(), plan.sum(1), plan.sum(0)
+    slope = problem.gradient(plan) / 2 + mass * reg * np.log(plan / np.outer(problem.p, problem.q))
+    slope += mass * marginal * (np.log(rows / problem.p)[:, None] + np.log(columns / problem.q)[None])
+    assert np.ptp(slope) < 1e-3 * np.ptp(problem.gradient(plan))
 
 
 # --- weights -----------------------------------------------------------------------------------------------------

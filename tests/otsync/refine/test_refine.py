@@ -10,6 +10,7 @@ import pytest
 from otsync import Alignment, Matches, Refused, SplineRefine, Status, TrackSet, Unrefined, align, refine
 from otsync.clocks.splines import TrackSplines
 from otsync.refine.gauss_newton import Side, _linearise, fit_clock, neighbours
+from otsync.refine.splines import COMMON_ERRORS
 from otsync.simulate import simulate
 from otsync.types import Clock
 
@@ -243,3 +244,45 @@ def test_blur_is_the_residual_over_the_speed():
     residual -= residual.mean(1, keepdims=True)
     speed = curves[1].velocity(t - 0.3)
     assert fit.blur == pytest.approx(np.sqrt((residual**2).sum() / (speed**2).sum()), rel=0.25)
+
+
+def curves_of(a: TrackSet, b: TrackSet) -> tuple[TrackSplines, TrackSplines]:
+    return TrackSplines(a.times, a.positions()), TrackSplines(b.times, b.positions())
+
+
+def test_the_second_from_which_clocks_count_changes_no_fit():
+    """b's clock set forward by s seconds: the offset falls by rate s, and sigma is carried along."""
+    a, b, _ = films(offset=0.3, noise=0.01, rate=1.004)
+    start, s = Clock(0.31, 1.0), 200.0
+    one, other = (
+        fit_clock(curves_of(a, x)[0], curves_of(a, x)[1], begin, 14 / 30, fit_rate=True)
+        for x, begin in (
+            (b, start),
+            (dataclasses.replace(b, fps=None, timestamps=b.times + s), Clock(start.offset - start.rate * s, 1.0)),
+        )
+    )
+    assert one is not None and other is not None
+    assert one.clock.rate == pytest.approx(1.004, abs=5e-4)
+    assert other.clock.rate == pytest.approx(one.clock.rate, abs=1e-6)
+    assert other.clock.offset == pytest.approx(one.clock.offset - one.clock.rate * s, abs=1e-4)
+    move = np.array([[1.0, -s], [0.0, 1.0]])
+    np.testing.assert_allclose(other.covariance, move @ one.covariance @ move.T, rtol=1e-3)
+    # the offset is best known in the middle of the overlap, where its error does not go with the rate's
+    there = np.array([1.0, 2.0])
+    assert there @ one.covariance @ there < 0.5 * one.covariance[0, 0]
+
+
+def test_detrending_windows_reach_as_far_back_as_ahead():
+    a, b, _ = films()
+    side = Side.of(*curves_of(a, b), 14 / 30, True)
+    inner = np.arange(14, 120 - 14)
+    np.testing.assert_array_equal(side.lo[inner], inner - 14)
+    np.testing.assert_array_equal(side.hi[inner], inner + 14 + 1)
+
+
+def test_sigma_never_falls_below_what_blur_predicts():
+    """However many matches agree: errors that whole videos share are in no residual."""
+    a, b, m = films(n=300, noise=0.8)
+    found = refine(a, b, m, near(0.3), SplineRefine(windows=(14 / 30,)), throw=False)
+    shared = found.stats["blur"] ** 2 / COMMON_ERRORS
+    assert found.sigma > shared > np.sqrt(found.sigma**2 - shared**2)  # the rest alone would be less

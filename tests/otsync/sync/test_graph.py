@@ -140,3 +140,33 @@ def test_cycles_close_or_do_not():
     assert cycle_errors(edges_of(x, all_pairs(3))) == pytest.approx([0.0])
     assert cycle_errors(edges_of(x, all_pairs(3), noise=[0.1, 0, 0])) == pytest.approx([0.1])
     assert len(cycle_errors(edges_of(np.zeros(4), all_pairs(4)))) == 4
+
+
+def test_inflation_multiplies_the_sigmas_and_nothing_else():
+    rng = np.random.default_rng(3)
+    edges = edges_of(rng.normal(size=5), all_pairs(5), 0.01, 0.01 * rng.normal(size=10))
+    plain, wide = solve(5, edges, 0), solve(5, edges, 0, inflation=1.5)
+    np.testing.assert_array_equal(wide.x, plain.x)
+    np.testing.assert_allclose(wide.sigma, 1.5 * plain.sigma)
+
+
+def test_lags_without_overlap_say_nothing():
+    """They score what an offset beyond the curve scores: 0, the level of its median."""
+    seen = curve([(0.5, 10.0)])
+    blind = seen.copy()
+    blind[seen[:, 0] < -1, 1] = -np.inf
+    total = CurveSum(2, [Edge(0, 1, 0.5, 0.01, True, blind + np.array([0.0, 3.0]))], 1 / 30)
+    at = [total.total(np.array([0.0, x])) for x in (-2.0, 50.0, 0.5)]
+    assert at == pytest.approx([0.0, 0.0, 10.0])
+
+
+def test_a_video_is_searched_for_wherever_its_curves_reach():
+    """Whether it comes first or second in a pair: candidates span all of every curve, about the other's place."""
+    lopsided = curve([(0.5, 10.0)])
+    lopsided = lopsided[lopsided[:, 0] >= -0.4]
+    total, x = CurveSum(2, [Edge(0, 1, 0.5, 0.01, True, lopsided)], 1 / 30), np.array([1.0, 1.2])
+    for v, low, high in ((1, 1.0 - 0.4, 1.0 + 3.0), (0, 1.2 - 3.0, 1.2 + 0.4)):
+        candidates, score = total.of_video(v, x)
+        assert candidates.min() == pytest.approx(low, abs=1.01 / 30)
+        assert candidates.max() == pytest.approx(high, abs=1.01 / 30)
+        assert abs(candidates[score.argmax()] - (1.5 if v == 1 else 0.7)) < 1 / 30

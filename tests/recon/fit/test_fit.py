@@ -24,11 +24,13 @@ from recon.fit.run import Diverged, Run
 from recon.fit.verb import fit
 from recon.losses import ImageLoss
 from recon.losses.image import Mask, Photometric
+from recon.losses.motion import Velocity
 from recon.motion import HermiteSpline, PerGaussian, Scaffold, Static, build_scaffold
 from recon.observe.cameras import Clip, observer
 from recon.observe.effects import Gain, MotionBlur, RollingShutter, Shot
 from recon.observe.recorded import with_declared
 from recon.raster import set_threads
+from recon.rotations import rotation_matrices
 from recon.scene.gaussians import Gaussians
 from recon.scene.gaussians4d import Gaussians4D
 from recon.simulate.capture import synthetic
@@ -305,6 +307,65 @@ def test_densification_splits_what_is_pulled_and_drops_what_is_faint(scene):
     for parent in (20, 30):
         rows = torch.nonzero(old == parent)[:, 0]
         assert torch.allclose(denser.dynamic.means[rows].mean(0), scene.dynamic.means[parent], atol=1e-6)
+
+
+def test_a_step_follows_the_mean_of_its_images(capture, scene):
+    """Weights of losses mean the same for any number of images a step: motion losses are not divided by it."""
+    problem = Problem.of(scene, capture.footage, believed(capture), FitOptions((Squared(), Velocity()), batch=3))
+    run = Run(problem, {"means": 0.01, "knots": 0.01}, None, 10)
+    values, names, taken = run.values(), list(run.adam.groups), {}
+    run.adam.step = lambda gradients, factor: taken.update({n: g.clone() for n, g in gradients.items()})
+    run.one_step(map)
+    of_images = [run.image_gradient(values, names, [key], False).gradients for key in problem.pick(0)]
+    run.step = 0
+    of_motion = run.motion_gradient(values, names).gradients
+    for i, name in enumerate(names):
+        expected = sum(g[i] for g in of_images) / 3
+        if of_motion[i] is not None:
+            expected = expected + of_motion[i]
+        torch.testing.assert_close(taken[name], expected)
+    assert of_motion[names.index("knots")].any()
+
+
+class Watched(Densify):
+    """Keeps what it is given, and what it answers."""
+
+    def __call__(self, scene, pull):
+        object.__setattr__(self, "given", pull)
+        object.__setattr__(self, "answer", super().__call__(scene, pull))
+        return self.answer
+
+
+def test_pulls_are_means_over_the_images_and_new_rows_have_no_past(capture, scene):
+    """A Gaussian that many images drew is not pulled harder for that; halves of a split begin without momentum."""
+    problem = Problem.of(scene, capture.footage, believed(capture), FitOptions(batch=1))
+    run, watched = Run(problem, dict(RATES), None, 10), Watched((0.5,), share=0.2)
+    run.one_step(map)
+    before = run.adam.moments()["means.exp_avg"].clone()
+    times = torch.arange(len(scene)) % 4
+    length = torch.rand(len(scene), generator=torch.Generator().manual_seed(0))
+    run._pull = torch.stack([length * times, times.float()])
+    run.densify(watched)
+    torch.testing.assert_close(watched.given, length * (times > 0))
+    _, old, fresh = watched.answer
+    after = run.adam.moments()["means.exp_avg"]
+    assert fresh.any() and before[old[fresh]].any()
+    assert not after[fresh].any() and torch.equal(after[~fresh], before[old[~fresh]])
+
+
+def test_halves_of_a_split_lie_along_the_longest_axis(scene):
+    n, g = len(scene), torch.Generator().manual_seed(0)
+    size = torch.tensor([0.02, 0.08, 0.03]).repeat(n, 1) * torch.linspace(0.5, 1.5, n)[:, None]
+    quats = torch.randn(n, 4, generator=g)
+    long = replace(scene, dynamic=replace(scene.dynamic, log_scales=size.log(), quats=quats))
+    pull = torch.zeros(n)
+    pull[-10:] = 1.0  # the largest
+    denser, old, fresh = Densify((0.5,), share=10 / n)(long, pull)
+    axes = rotation_matrices(torch.nn.functional.normalize(quats, dim=-1))[..., 1]
+    for parent in range(n - 10, n):
+        one, other = denser.dynamic.means[old == parent]
+        torch.testing.assert_close((other - one).abs(), (size[parent, 1] * axes[parent]).abs(), rtol=1e-4, atol=1e-6)
+        assert fresh[old == parent].all()
 
 
 def test_a_scaffold_gains_nodes_where_it_is_pulled(capture, scene):

@@ -54,3 +54,21 @@ def test_a_video_that_shows_no_motion_has_no_sigma():
     keys = np.array([(0, 0), (0, 1), (1, 0), (1, 1)])
     sigma = newton_sigma(lambda v, k, later: still, lambda v, k: still, keys, 0, 2, 1 / 30)
     assert sigma[0] == 0 and np.isnan(sigma[1])
+
+
+def test_the_reference_s_own_error_counts():
+    """Offsets are relative to the reference: where that is wrong, all others are as unsure."""
+    phase = torch.linspace(0, 6, 400).reshape(10, 40, 1).repeat(1, 1, 3)
+
+    def pixels(seconds: float) -> torch.Tensor:
+        return torch.sin(phase + 9 * seconds)
+
+    sigma = newton_sigma(
+        lambda v, k, later: pixels(k / 30 + later),
+        lambda v, k: pixels(k / 30 + (0.004 if v == 0 else 0.0)),
+        np.array([(v, k) for v in range(2) for k in range(12)]),
+        0,
+        2,
+        1 / 30,
+    )
+    assert sigma[0] == 0 and sigma[1] == pytest.approx(0.004, rel=0.1)

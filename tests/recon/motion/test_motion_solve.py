@@ -144,6 +144,27 @@ def test_the_solver_shrugs_off_a_lost_track():
     assert errors[1] < 0.03 < 0.5 < errors[0]
 
 
+def test_hidden_nodes_turn_with_their_body():
+    """A body turns at a constant rate; some of its nodes are seen in the first half only, and still go round."""
+    path, grid = HermiteSpline(-0.1, 0.1, 18), np.arange(0, 1.4, FRAME)
+    cloud = np.random.default_rng(0).normal(size=(8, 3))
+    angle = 1.5 * grid
+    turn = np.stack([np.stack([np.cos(angle), -np.sin(angle)], 1), np.stack([np.sin(angle), np.cos(angle)], 1)], 1)
+    truth = np.tile(cloud[:, None], (1, len(grid), 1))
+    truth[..., :2] = np.einsum("tij,mj->mti", turn, cloud[:, :2])
+    seen = np.ones((8, len(grid)), bool)
+    seen[:3, len(grid) // 2 :] = False
+    i, j = np.nonzero(~np.eye(8, dtype=bool))
+    coupling = Coupling(np.stack([i, j], 1), np.ones(len(i)), grid, seen, 1.0)
+    observed = [Observations(grid, np.where(seen[..., None], truth, np.nan), np.arange(8))]
+    errors = []
+    for rounds in (1, 6):
+        knots = solve_curves(path, observed, coupling, Smoothness(), robust=0.1, rounds=rounds)
+        followed = np.einsum("tp,pmk->mtk", path.design(grid), knots)
+        errors.append(np.linalg.norm(followed - truth, axis=2)[:3, -1].max())
+    assert errors[1] < 0.3 * errors[0]
+
+
 def test_angular_velocities_are_those_of_the_seen():
     """Two bodies that turn about different axes; half of each is not seen, and claims to go elsewhere."""
     rng = np.random.default_rng(0)

@@ -1,0 +1,95 @@
+"""From answers of pairs to clocks: rates, contradictions and trust, on answers that were made with their clocks."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from otsync import Graph, LikelihoodScan, Matches, SplineRefine, Status, TrackSet
+from otsync.sync.pairs import Job, run
+from otsync.sync.verdict import Answer, Verdict, judge
+from otsync.types import Alignment
+from otsync.types.trust import Trust
+from tests.conftest import wiggle
+
+NONE = Matches(np.zeros((0, 2), int))
+X, RATES = np.array([0.0, 2.0, -1.5]), np.array([1.0, 1.25, 0.8])
+"""World seconds at which three videos' own clocks show 0, and how fast these run."""
+
+
+def between(a: int, b: int) -> Alignment:
+    """b's clock on a's: t_a = rate t_b + offset, sure of itself."""
+    rate = RATES[b] / RATES[a]
+    known = {"fitted_rate": rate, "rate_sigma": 1e-4}
+    return Alignment((X[b] - X[a]) / RATES[a], rate, sigma=0.002 if 1 in (a, b) else 0.005, fps=30.0, stats=known)
+
+
+def settle(answers: list[Answer], reference: int | None, graph: Graph) -> tuple[Verdict, list[tuple]]:
+    """The verdict, and what was asked to be fitted anew: (pair, offset, rate). A new fit finds the truth."""
+    asked = []
+
+    def refit(tasks):
+        asked.extend((answer.pair, offset, rate) for answer, offset, rate in tasks)
+        return [between(*answer.pair) for answer, _, _ in tasks]
+
+    return judge(3, answers, reference, 0, graph, Trust(), refit), asked
+
+
+@pytest.mark.parametrize("reference", [0, 1, 2, None])
+def test_clocks_of_any_rate_are_told_on_the_reference_s(reference):
+    answers = [Answer(p, NONE, between(*p), between(*p)) for p in itertools.combinations(range(3), 2)]
+    found, _ = settle(answers, reference, Graph(curves=False))
+    assert found.reference == (1 if reference is None else reference)  # 1 is the one best tied
+    of = RATES[found.reference]
+    np.testing.assert_allclose(found.rates, RATES / of, atol=1e-9)
+    np.testing.assert_allclose(found.x, (X - X[found.reference]) / of, atol=1e-6)
+    assert not any(found.flags)
+
+
+def test_a_pair_astray_is_fitted_anew_at_its_own_rate_from_where_the_others_put_it():
+    pairs = [(0, 1), (0, 2), (1, 2)]
+    wrong = Alignment(
+        between(1, 2).offset + 3.0, RATES[2] / RATES[1], sigma=0.5, fps=30.0, stats=dict(between(1, 2).stats)
+    )
+    answers = [Answer(p, NONE, between(*p), wrong if p == (1, 2) else between(*p)) for p in pairs]
+    asked = []
+
+    def refit(tasks):
+        asked.extend((answer.pair, offset, rate) for answer, offset, rate in tasks)
+        return [answer.refined if len(asked) <= 3 else between(*answer.pair) for answer, _, _ in tasks]
+
+    found = judge(3, answers, 0, 0, Graph(curves=False), Trust(), refit)
+    pair, offset, rate = asked[-1]
+    assert pair == (1, 2) and rate == pytest.approx(RATES[2] / RATES[1])
+    assert offset == pytest.approx(between(1, 2).offset, abs=0.05)
+    np.testing.assert_allclose(found.x, X, atol=1e-3)
+    assert found.stats["pairs_relocated"] == 1
+
+
+@pytest.mark.parametrize("flag, joins", [(Status.AMBIGUOUS, True), (Status.POOR_FIT, False)])
+def test_summed_curves_vouch_only_for_pairs_with_a_common_motion(flag, joins):
+    """Video 2 hangs on two flagged pairs whose curves peak clearly at the solution."""
+    t = np.arange(-3, 3, 1 / 30)
+    x = np.array([0.0, 0.5, -0.4])
+
+    def answer(a: int, b: int) -> Answer:
+        curve = np.stack([t, 100 * np.exp(-0.5 * ((t - (x[b] - x[a])) / 0.05) ** 2)], 1)
+        pair = Alignment(x[b] - x[a], sigma=0.002, fps=30.0, curve=curve, flags=(flag,) if b == 2 else ())
+        return Answer((a, b), NONE, pair, pair)
+
+    found, _ = settle([answer(0, 1), answer(0, 2), answer(1, 2)], 0, Graph())
+    np.testing.assert_allclose(found.x, x, atol=1e-6)
+    assert found.flags[1] == () and found.flags[2] == (() if joins else (flag,))
+
+
+def test_a_pair_with_forced_matches_is_aligned():
+    """Aligners bear wrong matches, and judge for themselves; other doubts about matches go along with the answer."""
+    xyz = wiggle(np.random.default_rng(0), 12, 100)
+    a, b = (TrackSet(x, fps=30) for x in (xyz[:, :90], xyz[:, 10:]))
+    every = np.stack([np.arange(12)] * 2, 1)
+    for flags, kept in (((Status.FORCED,), ()), ((Status.AMBIGUOUS,), (Status.AMBIGUOUS,))):
+        found = run(Job((0, 1), a, b, None, LikelihoodScan(), SplineRefine(), Matches(every, flags=flags)))
+        assert found.refined.frames == pytest.approx(10, abs=0.1)
+        assert found.refined.flags == kept
