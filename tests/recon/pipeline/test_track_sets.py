@@ -21,7 +21,8 @@ from recon.motion import ScaffoldOptions
 from recon.pipeline.intake import given_clocks, only, split
 from recon.pipeline.plan import Plan
 from recon.pipeline.prepare import prepare
-from recon.pipeline.stages import lifted_tracks, read_footage, scene_key, seeded
+from recon.pipeline.stages import lifted_tracks, read_footage, scene_key
+from recon.pipeline.starts import Given, OnScaffold
 from recon.pipeline.track_sets import of_every_video, tracks_of
 from recon.scene.gaussians4d import Gaussians4D, scene_arrays
 from recon.scene.seed import cloud_at, shown_at
@@ -45,7 +46,8 @@ def given(world):
 
 def begun(given, tracks, plan=PER_VIDEO, offsets=None) -> Gaussians4D:
     scene, known, footage = given
-    return seeded(scene, offsets or known, tuple(tracks), footage, np.ones((3, 3)), plan, Cache(), map, Progress())
+    gains = np.ones((3, 3))
+    return OnScaffold()(Given(scene, offsets or known, tuple(tracks), footage, gains, plan, Cache(), map, Progress()))
 
 
 def test_the_order_of_the_tracks_is_no_matter(given):
