@@ -12,6 +12,7 @@ import pytest
 import torch
 
 import recon.cli
+from otsync.bench import record
 from otsync.files.cache import Cache
 from otsync.io import open_scene
 from otsync.plugins import forget, register
@@ -429,3 +430,16 @@ def test_tables_hold_the_longest_fits():
     ]
     told = paper_tables(rows, "tennis")
     assert "22.22" in told and "33.33" in told and "11.11" not in told
+
+
+@pytest.mark.slow
+def test_the_gate_is_passed_and_repeats_itself_and_its_rows_are_what_the_page_says():
+    """On a simulated world: what was measured stands beside each bar."""
+    found = gate.measured()
+    assert gate.figures_of(gate.measured()) == gate.figures_of(found)
+    assert record.gate("recon", gate.figures_of(found), gate.worse) == 0
+    rows = {r["configuration"]: r for r in found}
+    ours, fixed, without = (rows[name] for name in ("ours", "fixed", "w/o scaffold"))
+    assert ours["mean"] < 0.3 * ours["start"]  # .13
+    assert ours["mask_psnr"] > fixed["mask_psnr"] + 0.5  # 1.1 dB
+    assert without["neighbour_change"] > 3 * ours["neighbour_change"]  # 6.7 times
