@@ -29,7 +29,7 @@ def run(script: str, *args: str, cwd: Path) -> str:
         ("04_your_own_matcher.py", ["--videos", "3"], "given matches: errors"),
         (
             "07_ablations.py",
-            ["--rows", "ours", "w/o scaffold", "--out", "ablations", *SMALL],
+            ["--rows", "w/o scaffold", "--out", "ablations", *SMALL],
             "w/o scaffold",
         ),
         ("09_own_frames.py", ["--videos", "2", "--preset", "clean", "--out", "own"], "camera stands at"),

@@ -84,6 +84,7 @@ OPTIONS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start", [OnTracks(), FromImages()], ids=["tracks", "images"])
 def test_what_a_start_says_that_it_ignores_it_ignores_and_nothing_else(world, start):
     def content(plan: Plan) -> list[bytes]:
