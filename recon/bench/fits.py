@@ -69,7 +69,8 @@ class Protocol:
     """Names of videos that no fit sees: every row is compared with them."""
     cameras: tuple[str, ...] | None = None
     """Names of the videos that train; default: all that are not held out. Depth, and with it the tracks' positions, and
-    the static part always come from all of them: few cameras are few images of what moves, nothing else."""
+    the static part always come from all of them: few cameras are few images of what moves, nothing else. A row that
+    begins from images alone has those of the training videos."""
     amplitudes: tuple[float, ...] = (1.0,)
     """Frames: errors of the clocks are drawn uniformly within them."""
     seeds: tuple[int, ...] = (0,)

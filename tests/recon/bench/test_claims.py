@@ -1,7 +1,7 @@
-"""What docs/reconstruction.md says of the rows of ``recon bench``, measured again on the real scene, in shorter fits.
+"""What docs/reconstruction.md says of the rows of ``recon bench``, measured again on the real scene by its commands.
 
 Every bar lies between what two rows came to, several times their spread over draws away from either. What was measured
-stands beside it.
+stands beside it. On two quiet cores this takes some ten minutes, most of it fits.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from recon.pipeline.plan import Plan
 
 pytestmark = pytest.mark.slow
 
-STEPS = 1000
-MANY: dict[str, Any] = {"held_out": ("0",)}
-FEW: dict[str, Any] = {"held_out": ("0", "12", "21"), "cameras": ("5", "23", "29"), "amplitudes": (0.0,)}
+MANY: dict[str, Any] = {"held_out": ("0",), "steps": 1500}
+FAR = MANY | {"amplitudes": (30.0,)}
+FEW: dict[str, Any] = {"held_out": ("0", "12", "21"), "cameras": ("5", "23", "29"), "amplitudes": (0.0,), "steps": 1000}
 
 
 @pytest.fixture(scope="module")
@@ -31,11 +31,10 @@ def measured(data, tmp_path_factory):
         pytest.skip(f"no {scene}: it holds the recording that the page's figures are of")
     folder = tmp_path_factory.mktemp("basketball")
 
-    def ask(*rows: str, held_out: tuple[str, ...], **protocol: Any) -> dict[str, Row]:
-        plan = Plan(views=16, frames=(20, 68), fit=FitOptions(steps=STEPS))
-        out = folder / "-".join(map(str, (*held_out, *protocol.values())))
-        recording, truth = known_scene(scene, None, held_out, False)
-        wanted = Protocol(plan, held_out=held_out, **protocol)
+    def ask(*rows: str, steps: int, **protocol: Any) -> dict[str, Row]:
+        wanted = Protocol(Plan(views=16, frames=(20, 68), fit=FitOptions(steps=steps)), **protocol)
+        recording, truth = known_scene(scene, None, wanted.held_out, False)
+        out = folder / f"{len(wanted.held_out)}-held-out-{wanted.amplitudes[0]:g}-frames"
         found = run(recording, truth, out, protocol=wanted, rows=rows, cache=folder / "stages")
         return {row["configuration"]: row for row in found if row["configuration"] in rows}
 
@@ -45,35 +44,42 @@ def measured(data, tmp_path_factory):
 def test_refinement_is_worth_having(measured):
     rows = measured("ours", "fixed", "true time", **MANY)
     ours, fixed, ceiling = (rows[name] for name in ("ours", "fixed", "true time"))
-    assert ours["mean"] < 0.25 * ours["start"] and fixed["mean"] == fixed["start"] == ours["start"]
-    assert ours["mask_psnr"] > fixed["mask_psnr"] + 0.5
-    assert abs(ours["mask_psnr"] - ceiling["mask_psnr"]) < 0.5
+    assert fixed["mean"] == fixed["start"] == ours["start"]
+    assert ours["mean"] < 0.1 and ours["max"] < 0.2  # .044, .061; .003 over draws
+    assert ours["mask_psnr"] > fixed["mask_psnr"] + 0.7  # 24.6, 22.6; .2 and .6 over draws
+    assert abs(ours["mask_psnr"] - ceiling["mask_psnr"]) < 0.6  # 24.8
 
 
-def test_a_scaffold_keeps_the_motion_coherent_and_is_not_needed_for_the_offsets(measured):
+def test_with_many_cameras_a_scaffold_gives_coherence_and_costs_decibels(measured):
     rows = measured("ours", "w/o scaffold", "scaffold per video", **MANY)
-    ours, without = rows["ours"], rows["w/o scaffold"]
-    assert without["neighbour_change"] > 3 * ours["neighbour_change"]
-    assert without["mean"] < 0.25 * without["start"]
+    ours, without, each = (rows[name] for name in ("ours", "w/o scaffold", "scaffold per video"))
+    assert without["neighbour_change"] > 4 * ours["neighbour_change"]  # 2.7, .33; .01 over draws
+    assert without["neighbour_change"] > 1.2 * each["neighbour_change"] > 2.4 * ours["neighbour_change"]  # 1.6
+    assert without["mask_psnr"] > ours["mask_psnr"] + 0.5  # 25.9, 24.6; .2 over draws
+    assert without["mean"] < 0.1  # .053: offsets are refined without one, too
 
 
-def test_a_spline_costs_no_quality(measured):
+def test_a_spline_costs_no_quality_at_true_time(measured):
     rows = measured("true time", "w/o spline, true time", **MANY)
     spline, without = rows["true time"], rows["w/o spline, true time"]
-    assert abs(spline["psnr"] - without["psnr"]) < 0.3
+    assert spline["psnr"] > without["psnr"] - 0.2  # 30.1, 30.0
+    assert spline["mask_psnr"] > without["mask_psnr"] - 0.2  # 24.8, 24.3
 
 
-def test_rigidity_keeps_free_gaussians_together_less_than_a_scaffold(measured):
+def test_rigidity_holds_free_gaussians_together_less_than_a_scaffold(measured):
     rows = measured("true time", "w/o scaffold, true time", "Dynamic3DGaussians", **MANY)
-    scaffold, rigid = rows["true time"], rows["Dynamic3DGaussians"]
-    assert rigid["neighbour_change"] > 1.5 * scaffold["neighbour_change"]
+    scaffold, without, rigid = (rows[n] for n in ("true time", "w/o scaffold, true time", "Dynamic3DGaussians"))
+    assert 2 * scaffold["neighbour_change"] < rigid["neighbour_change"]  # .33, 1.2
+    assert rigid["neighbour_change"] < 0.75 * without["neighbour_change"]  # 2.5
+    assert rigid["mask_psnr"] > scaffold["mask_psnr"] + 0.3  # 25.7, 24.8
 
 
-def test_images_alone_do_not_find_clips_that_begin_far_apart(measured):
-    near = measured("ours", "Sync-NeRF style", **MANY)["Sync-NeRF style"]
-    far = measured("Sync-NeRF style", amplitudes=(30.0,), **MANY)["Sync-NeRF style"]
-    assert near["mean"] < near["start"]
-    assert far["mean"] > 5 and far["mean"] > 0.5 * far["start"]
+def test_images_alone_refine_small_errors_and_do_not_find_clips_that_begin_far_apart(measured):
+    rows, far = measured("ours", "Sync-NeRF style", **MANY), measured("Sync-NeRF style", **FAR)["Sync-NeRF style"]
+    near = rows["Sync-NeRF style"]
+    assert near["mean"] < 0.2  # .067, from .53
+    assert near["mask_psnr"] < rows["ours"]["mask_psnr"] - 1  # 22.3, 24.6
+    assert far["mean"] > 8 and far["mean"] > 0.7 * far["start"]  # 16.1, from 16.0
 
 
 def test_with_three_cameras_a_scaffold_is_worth_decibels(measured):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-import recon.pipeline.stages
+import recon.pipeline.starts
 from otsync.files.cache import Cache
 from otsync.files.digest import content_key, sequence_key
 from otsync.io import open_scene
@@ -124,7 +124,7 @@ def test_every_frame_that_seeding_asks_for_has_its_depth(given, monkeypatch, shi
             cloud_at(footage, [of(maps) for maps in depth], offsets, float(t), frame_step)
         return None
 
-    monkeypatch.setattr(recon.pipeline.stages, "seed", watched)
+    monkeypatch.setattr(recon.pipeline.starts, "seed", watched)
     early = replace(offsets, seconds=np.array([0, shift, 0]) * STEP)
     begun(given, capture().tracks, offsets=early)
     assert len(asked) >= 6 and all(z is not None for z in asked)
