@@ -86,5 +86,6 @@ def test_with_three_cameras_a_scaffold_is_worth_decibels(measured):
     """Offsets held at the truth in both rows, then learnt at one rate in both: the scaffold is the only difference."""
     rows = measured("true time", "w/o scaffold, true time", "ours", "w/o scaffold", **FEW)
     for scaffold, without in (("true time", "w/o scaffold, true time"), ("ours", "w/o scaffold")):
-        assert rows[scaffold]["psnr"] > rows[without]["psnr"] + 0.3
-        assert rows[scaffold]["mask_psnr"] > rows[without]["mask_psnr"] + 0.3
+        assert rows[scaffold]["psnr"] > rows[without]["psnr"] + 0.15  # 26.9, 26.5; .01 over seeds
+        assert rows[scaffold]["mask_psnr"] > rows[without]["mask_psnr"] + 0.25  # 21.7, 21.2
+        assert rows[without]["neighbour_change"] > 4 * rows[scaffold]["neighbour_change"]  # 2.6, .27
