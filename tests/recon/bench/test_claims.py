@@ -56,6 +56,7 @@ def test_with_many_cameras_a_scaffold_gives_coherence_and_costs_decibels(measure
     assert without["neighbour_change"] > 4 * ours["neighbour_change"]  # 2.7, .33; .01 over draws
     assert without["neighbour_change"] > 1.2 * each["neighbour_change"] > 2.4 * ours["neighbour_change"]  # 1.6
     assert without["mask_psnr"] > ours["mask_psnr"] + 0.5  # 25.9, 24.6; .2 over draws
+    assert each["mask_psnr"] > ours["mask_psnr"] + 0.4  # 25.7
     assert without["mean"] < 0.1  # .053: offsets are refined without one, too
 
 
