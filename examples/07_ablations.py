@@ -30,16 +30,20 @@ def main() -> None:
     parser.add_argument(
         "--steps", type=int, nargs="+", default=[700], help="several: what accuracy costs, in recon.svg"
     )
+    parser.add_argument("--width", type=int, default=160, help="of the images, pixels")
+    parser.add_argument("--frames", type=int, default=24)
+    parser.add_argument("--backdrop-steps", type=int, default=800, help="of the fit of the static part")
     parser.add_argument("--out", type=Path, default=Path("ablations"))
     args = parser.parse_args()
 
     # the cameras' clocks are right here: the protocol puts the errors in, so that every row begins with the same ones
-    capture = synthetic(args.seed, offsets=[0.0] * 5)
+    size = (args.width, args.width * 3 // 5)
+    capture = synthetic(args.seed, frames=args.frames, size=size, offsets=[0.0] * 5)
     held_out = tuple(f.name for f in capture.held_out)
     with tempfile.TemporaryDirectory() as folder:
         write_capture(capture, folder)
         protocol = Protocol(
-            Plan(width=capture.footage[0].size[0], backdrop_steps=800, views=16),
+            Plan(width=args.width, backdrop_steps=args.backdrop_steps, views=16),
             held_out=held_out,
             seeds=(args.seed,),
             lengths=tuple(args.steps),

@@ -41,13 +41,14 @@ from recon.observe.effects import Effect
 from recon.observe.recorded import optics, with_declared
 from recon.pipeline.plan import Plan
 from recon.pipeline.prepare import Prepared, prepare
+from recon.pipeline.starts import world_footprint
 from recon.scene.device import device_of
 from recon.scene.gaussians4d import Gaussians4D
 
 Row = dict[str, Any]
-FIGURES = 3
+FIGURES = 4
 """Version of what the figures mean: rows of another one are not continued. 2: tracks at their videos' own times. 3:
-rows of several lengths."""
+rows of several lengths. 4: a seed is the fit's, too; rows without a scaffold never had one."""
 
 REACH = 5.0  # footprints within which a held-out track must have a Gaussian, to be followed
 PUBLISHED = (
@@ -68,15 +69,17 @@ class Protocol:
     """Names of videos that no fit sees: every row is compared with them."""
     cameras: tuple[str, ...] | None = None
     """Names of the videos that train; default: all that are not held out. Depth, and with it the tracks' positions, and
-    the static part always come from all of them: few cameras are few images of what moves, nothing else."""
+    the static part always come from all of them: few cameras are few images of what moves, nothing else. A row that
+    begins from images alone has those of the training videos."""
     amplitudes: tuple[float, ...] = (1.0,)
     """Frames: errors of the clocks are drawn uniformly within them."""
     seeds: tuple[int, ...] = (0,)
-    """Of the draws of these errors: one row each."""
+    """Of the draws of these errors, one row each; added to the seed of the fit, so that rows without errors have a
+    spread, too."""
     lengths: tuple[int, ...] = ()
     """Several lengths of the fit, instead of --steps: every row is measured at each, to show what accuracy costs."""
     held_out_tracks: float = 0.1
-    """Share of the tracks that no scaffold sees: the motion is compared with them."""
+    """Share of the tracks that no row begins from: the motion is compared with them."""
 
     def __post_init__(self) -> None:
         fit = self.plan.fit
@@ -106,8 +109,8 @@ class Material:
     """A recording with its depth, tracks and truth, before errors are put in.
 
     Args:
-        scene: training and held-out videos; the training ones with depth. tracks: that scaffolds are built from.
-        kept: tracks that none is. truth: offsets of every video.
+        scene: training and held-out videos; the training ones with depth. tracks: that rows begin from. kept: tracks
+            that none does. truth: offsets of every video.
         backdrop: the static part, where cameras that do not train have a share in it; its gains are those of ``train``.
             None: every row fits one to its training videos.
     """
@@ -195,7 +198,7 @@ def measure(
 ) -> Row:
     """One row: build from the believed offsets, fit (``steps`` as of Protocol.steps), and hold against the truth."""
     believed = material.believed(amplitude, seed)
-    built_from = believed if configuration.start == "given" else material.truth
+    built_from = believed if configuration.clocks == "given" else material.truth
     plan = replace(configuration.plan(protocol.plan), frames=None)  # the material is cut already
     margin = max(plan.scaffold.margin, (amplitude + 1) / float(believed.fps[believed.reference]))
     plan = replace(plan, scaffold=replace(plan.scaffold, margin=margin))
@@ -205,7 +208,8 @@ def measure(
         material.tracks,
         plan=plan,
         held_out=material.held_out,
-        backdrop=material.backdrop,
+        backdrop=material.backdrop if configuration.start.reads_geometry else None,
+        start=configuration.start,
         cache=cache,
         map=map,
     )
@@ -213,7 +217,7 @@ def measure(
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
     effects = with_declared(plan.effects, [f.readout for f in ready.footage], ready.gains)
-    options = replace(plan.fit, effects=effects)
+    options = replace(plan.fit, effects=effects, seed=plan.fit.seed + seed)
     options = options if options.budget is not None else replace(options, steps=steps)
     began = time.perf_counter(), time.process_time()
     fitted = fit(configuration.motion(ready.initial).to(device), ready.footage, ready.offsets, options)
@@ -235,7 +239,7 @@ def measure(
         "gauge_free": free.mean,
         "sigma": float(np.nanmedian(fitted.offsets.sigma) * fps),
         **held_out_figures(fitted, effects, ready, plan.views, lpips),
-        **motion_figures(fitted.scene, ready, material.kept),
+        **motion_figures(fitted.scene, ready, material.kept, world_footprint(material.tracks, ready.footage)),
         "images": fitted.stats["images"],
         "seconds": seconds,
         "cpu_seconds": cpu,
@@ -260,15 +264,14 @@ def held_out_figures(
     return {k: float(np.mean([s.get(k, math.nan) for s in scores])) if scores else math.nan for k in keys}
 
 
-def motion_figures(scene: Gaussians4D, ready: Prepared, kept: Sequence[TrackSet]) -> Row:
-    """Coherence, following error and acceleration, in footprints: what a scaffold is for.
+def motion_figures(scene: Gaussians4D, ready: Prepared, kept: Sequence[TrackSet], unit: float) -> Row:
+    """Coherence, following error and acceleration: what a scaffold is for.
 
-    kept: tracks that no scaffold was built from, on the clocks of ``ready.offsets``.
+    kept: tracks that no row was built from, on the clocks of ``ready.offsets``. unit: footprint, alike for all rows.
     """
     seen = scene.dynamic.opacities.detach() > 0.1
     times = np.arange(math.ceil(scene.span[0] / scene.frame_step), scene.span[1] / scene.frame_step) * scene.frame_step
     tracks = scene.tracks(times)[seen.numpy()]
-    unit = scene.footprint
     errors = []
     for t in kept:
         at = ready.offsets.names.index(t.name)

@@ -85,19 +85,21 @@ def view_table(rows: Sequence[Row], style: Style = "text", lpips_reason: str = "
     """Novel views in the paper's layout: a line per scene and figure, columns by setting and method.
 
     rows: ``{"scene", "setting": "true time" | "unsynchronised", "psnr", "ssim", "lpips", "mask_psnr", "mask_ssim"}``;
-    what is missing or nan is a dash. lpips_reason: why there is no LPIPS, said below the table.
+    what is missing or nan is a dash; the spread of a figure, where there is one, is named like it with ``_spread``.
+    lpips_reason: why there is no LPIPS, said below the table.
     """
     lines = []
     for scene in _scenes(rows):
         for figure in ("PSNR", "SSIM", "LPIPS", "PSNR in the mask", "SSIM in the mask"):
             nerf, paper, nerf_unsync, paper_unsync = VIEWS.get(scene, {}).get(figure, (None,) * 4)
             key = ("mask_" if "mask" in figure else "") + figure.split()[0].lower()
-            own = [_find(rows, key, scene=scene, setting=setting) for setting in ("true time", "unsynchronised")]
-            if "mask" in figure and own == [None, None]:
-                continue
             digits = 2 if "PSNR" in figure else 3
-            values = (nerf, paper, own[0], nerf_unsync, paper_unsync, own[1])
-            lines.append([scene, figure, *(_number(v, digits) for v in values)])
+            settings = ("true time", "unsynchronised")
+            own = [_found(rows, key, digits, scene=scene, setting=setting) for setting in settings]
+            if "mask" in figure and own == [NOTHING, NOTHING]:
+                continue
+            theirs = [number(v, digits) for v in (nerf, paper, nerf_unsync, paper_unsync)]
+            lines.append([scene, figure, *theirs[:2], own[0], *theirs[2:], own[1]])
     header = ["scene", "figure", "SyncNeRF, true time", "SyncTrack4D, true time", "otsync, true time"]
     header += ["SyncNeRF, unsync.", "SyncTrack4D, unsync.", "otsync, unsync."]
     below = "SyncNeRF and SyncTrack4D: figures of the paper, by its protocol."
@@ -107,12 +109,13 @@ def view_table(rows: Sequence[Row], style: Style = "text", lpips_reason: str = "
 def offset_table(rows: Sequence[Row], style: Style = "text") -> str:
     """Offset errors in the paper's layout: mean absolute errors in frames.
 
-    rows: ``{"scene", "initial", "coarse", "refined", "refined_max"}`` in frames; what is missing or nan is a dash.
+    rows: ``{"scene", "initial", "coarse", "refined", "refined_max"}`` in frames, with spreads as of :func:`view_table`;
+    what is missing or nan is a dash.
     """
     lines = []
     for scene in _scenes(rows):
-        own = [_find(rows, key, scene=scene) for key in ("initial", "coarse", "refined", "refined_max")]
-        lines.append([scene, *(_number(v, 3) for v in (*OFFSETS.get(scene, (None,) * 4), *own))])
+        own = [_found(rows, key, 3, scene=scene) for key in ("initial", "coarse", "refined", "refined_max")]
+        lines.append([scene, *(number(v, 3) for v in OFFSETS.get(scene, (None,) * 4)), *own])
     header = ["scene", "initial (paper)", "SyncNeRF (paper)", "DTW (paper)", "refined (paper)"]
     header += ["initial", "coarse", "refined", "refined, worst"]
     return layout(header, lines, style, "Mean absolute error in frames of the reference; last column: the largest.")
@@ -121,13 +124,13 @@ def offset_table(rows: Sequence[Row], style: Style = "text") -> str:
 def ablation_table(rows: Sequence[Row], style: Style = "text") -> str:
     """Ablations, a line each: held-out figures, offset error and the coherence of tracks.
 
-    rows: ``{"variant", "psnr", "ssim", "lpips", "mask_psnr", "offset", "coherence", "following"}``; variants named as
-    in :data:`ABLATION` stand beside the paper's figures.
+    rows: ``{"variant", "psnr", "ssim", "lpips", "mask_psnr", "offset", "coherence", "following"}``, with spreads as of
+    :func:`view_table`; variants named as in :data:`ABLATION` stand beside the paper's figures.
     """
     lines = []
     for row in rows:
         paper = ABLATION.get(str(row["variant"]), (None,) * 3)
-        cells = [_number(v, d) for v, d in zip(paper, (2, 3, 3), strict=True)]
+        cells = [number(v, d) for v, d in zip(paper, (2, 3, 3), strict=True)]
         keys = (
             ("psnr", 2),
             ("ssim", 3),
@@ -137,7 +140,7 @@ def ablation_table(rows: Sequence[Row], style: Style = "text") -> str:
             ("coherence", 3),
             ("following", 2),
         )
-        lines.append([str(row["variant"]), *cells, *(_number(row.get(key), digits) for key, digits in keys)])
+        lines.append([str(row["variant"]), *cells, *(with_spread(row, key, digits) for key, digits in keys)])
     header = ["variant", "PSNR (paper)", "SSIM (paper)", "LPIPS (paper)", "PSNR", "SSIM", "LPIPS", "PSNR in the mask"]
     header += ["offset error, frames", "neighbour distance change", "following error"]
     return layout(header, lines, style)
@@ -162,14 +165,25 @@ def _scenes(rows: Sequence[Row]) -> list[str]:
     return list(dict.fromkeys(str(row["scene"]) for row in rows))
 
 
-def _find(rows: Sequence[Row], key: str, **where: str) -> float | None:
-    """The value of the first row that fits; None when there is none, or it is nan."""
+def _found(rows: Sequence[Row], key: str, digits: int, **where: str) -> str:
+    """The figure of the first row that fits and has one; a dash when there is none."""
     for row in rows:
-        value = row.get(key)
-        if all(row.get(name) == wanted for name, wanted in where.items()) and value is not None:
-            return None if math.isnan(value) else float(value)
-    return None
+        if all(row.get(name) == wanted for name, wanted in where.items()) and row.get(key) is not None:
+            return with_spread(row, key, digits)
+    return NOTHING
 
 
-def _number(value: float | None, digits: int) -> str:
-    return "–" if value is None or math.isnan(value) else f"{value:.{digits}f}"
+def with_spread(row: Row, key: str, digits: int) -> str:
+    """A figure of a row, and its spread where the row has one."""
+    return number(row.get(key), digits, row.get(f"{key}_spread"))
+
+
+def number(value: float | None, digits: int, spread: float | None = None) -> str:
+    """A figure with so many digits, "± spread" behind it where there is one; a dash where there is no figure."""
+    if value is None or math.isnan(value):
+        return NOTHING
+    return f"{value:.{digits}f}" + ("" if spread is None else f" ± {spread:.{digits}f}")
+
+
+NOTHING = "–"
+"""Stands where there is no figure."""

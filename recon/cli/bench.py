@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -36,11 +36,13 @@ class Bench:
     On a GPU, with the time and the most memory that it took: recon bench recording/ --held-out 0 --frames 0 150
     --width 640 --rows ours --steps 10000 --batch 8 --device cuda --out bench
 
+    Whether anything got worse, on a small recording that is simulated: recon bench --gate
+
     Every option of a fit holds for all rows, but for what a row is about.
     """
 
-    scene: tyro.conf.Positional[Path]
-    """A scene.json, or a folder that holds one, or a folder in Panoptic layout."""
+    scene: tyro.conf.Positional[Path | None] = None
+    """A scene.json, or a folder that holds one, or a folder in Panoptic layout; none for --gate and --rebase."""
     truth: Path | None = None
     """True offsets; default: all zero, a recording that is truly synchronised."""
     rows: Annotated[tuple[str, ...], row_names()] = ("ours", "fixed", "true time")
@@ -58,12 +60,22 @@ class Bench:
     """Print the rows as one JSON document instead of tables."""
     allow_outside: bool = False
     """Let the scene name files outside its folder."""
+    gate: bool = False
+    """Measure a small simulated recording instead, and exit with 1 where it is worse than the committed baseline."""
+    rebase: bool = False
+    """Make the figures of the small simulated recording the baseline."""
 
     def run(self) -> int:
         from recon.bench.fits import run
+        from recon.bench.gate import run as on_a_small_world
         from recon.bench.rows import paper_tables
         from recon.evaluate.lpips import Lpips
 
+        if self.gate or self.rebase:
+            self._check_alone()
+            return on_a_small_world(self.out, gate=self.gate, rebase=self.rebase)
+        if self.scene is None:
+            raise ValueError("scene: expected a recording; found none. Name one, or measure a simulated one (--gate).")
         scene, truth = known_scene(self.scene, self.truth, self.protocol.held_out, self.allow_outside)
         path, lpips = self.scene.resolve(), Lpips.load(self.lpips_weights)
         name = self.name or (path if path.is_dir() else path.parent).name
@@ -86,6 +98,17 @@ class Bench:
             print(paper_tables(rows, name, lpips.reason))
             print(wrote)
         return 0
+
+    def _check_alone(self) -> None:
+        """ValueError for options that say how another recording is measured."""
+        usual = {f.name: f.default if f.default_factory is MISSING else f.default_factory() for f in fields(self)}
+        own = ("gate", "rebase", "out")
+        others = [name for name, value in usual.items() if name not in own and getattr(self, name) != value]
+        if others:
+            raise ValueError(
+                f"gate, rebase: expected no other option than out, since recording and protocol are the baseline's; "
+                f"found {', '.join(others)}. Leave them out."
+            )
 
 
 @dataclass

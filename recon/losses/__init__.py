@@ -1,5 +1,7 @@
 """Losses of a fit: a tuple of objects with weights, on images (:mod:`.image`) and on the motion (:mod:`.motion`).
 
+:mod:`.rigidity` holds those of Dynamic3DGaussians.
+
 To add a loss: one class in one file, and its name in :data:`LOSSES`; or ``@register("losses")`` in a file of your own.
 """
 
@@ -13,6 +15,7 @@ from recon.losses.motion import (
     RotationVelocity,
     Velocity,
 )
+from recon.losses.rigidity import Isometry, Rigidity, RotationSimilarity
 
 Loss = ImageLoss | MotionLoss
 
@@ -29,6 +32,9 @@ LOSSES: tuple[type[Loss], ...] = (
     Acceleration,
     RotationVelocity,
     RotationAcceleration,
+    Rigidity,
+    RotationSimilarity,
+    Isometry,
 )
 """Our own losses."""
 
@@ -39,12 +45,15 @@ __all__ = [
     "Depth",
     "Feature",
     "ImageLoss",
+    "Isometry",
     "Length",
     "Loss",
     "Mask",
     "MotionLoss",
     "Photometric",
+    "Rigidity",
     "RotationAcceleration",
+    "RotationSimilarity",
     "RotationVelocity",
     "ScaleHinge",
     "Track",

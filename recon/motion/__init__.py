@@ -5,7 +5,7 @@ paths.py         HermiteSpline, Sampled: curves in time as sums over four knots
 scaffold.py      Scaffold: nodes, and binding Gaussians to them; binding.py: which nodes carry which Gaussian
 warp.py          carrying Gaussians with nodes: the definition in torch
 fused.py         the same, poses and motion losses in compiled kernels: *_kernels.py
-per_gaussian.py  PerGaussian, Static
+per_gaussian.py  PerGaussian, Static; track_curves.py: splines through tracks, with which PerGaussian begins
 build.py         build_scaffold: from lifted tracks and offsets
 nodes.py         tracks on one grid of world time, D_track, picking nodes; solve.py: their curves and rotations
 density.py       more nodes where they are needed, fewer where they are not
@@ -17,6 +17,7 @@ from recon.motion.motion import Motion, motion_from_arrays
 from recon.motion.paths import HermiteSpline, Path, Sampled
 from recon.motion.per_gaussian import PerGaussian, Static
 from recon.motion.scaffold import Scaffold
+from recon.motion.track_curves import TrackCurves
 
 __all__ = [
     "Binding",
@@ -28,6 +29,7 @@ __all__ = [
     "Scaffold",
     "ScaffoldOptions",
     "Static",
+    "TrackCurves",
     "build_scaffold",
     "motion_from_arrays",
 ]

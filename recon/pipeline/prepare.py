@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from recon.pipeline.intake import readable, split
 from recon.pipeline.plan import Plan
 from recon.pipeline.readings import read_by, with_readings
 from recon.pipeline.stages import backdrop_of_scene, initial_scene, lifted_tracks, read_footage
+from recon.pipeline.starts import Given, OnScaffold, Start
 from recon.pipeline.track_sets import tracks_of
 from recon.scene.gaussians4d import Gaussians4D
 
@@ -61,6 +62,7 @@ def prepare(
     plan: Plan | None = None,
     held_out: Sequence[str] = (),
     backdrop: StaticFit | None = None,
+    start: Start | None = None,
     cache: Any = None,
     map: MapLike = map,
     progress: Progress | None = None,
@@ -74,6 +76,8 @@ def prepare(
             tracked and lifted here.
         held_out: names of videos that nothing here sees but their own footage.
         backdrop: the static part, its gains those of the training videos in their order; default: fitted here.
+        start: how the moving part begins; default: on a scaffold. One that reads neither tracks nor depth is not given
+            any, nor is the static part.
         cache: an :class:`otsync.files.cache.Cache`. map: any map-like callable; two threads use two cores.
         deadline: of the whole job; the static part takes at most a share of what is left.
 
@@ -81,7 +85,7 @@ def prepare(
     """
     from otsync.files.cache import Cache
 
-    plan, progress, cache = plan or Plan(), progress or Progress(), cache or Cache()
+    plan, progress, cache, start = plan or Plan(), progress or Progress(), cache or Cache(), start or OnScaffold()
     for video in scene.videos:
         check_effects(plan.effects, video.times)
     if plan.frames is not None:
@@ -96,7 +100,9 @@ def prepare(
             f"backdrop: expected gains of shape ({len(train.videos)},3), of the videos to fit in their order "
             f"({', '.join(train.names)}); found {backdrop.gains.shape}. Keep the gains of those videos alone."
         )
-    if tracks is None:
+    if not start.reads_geometry:
+        train, tracks = replace(train, videos=tuple(replace(v, depth=None) for v in train.videos)), ()
+    elif tracks is None:
         with progress.stage("tracks"):
             tracks = lifted_tracks(train, offsets, cache, map, progress)
     else:
@@ -111,8 +117,9 @@ def prepare(
         if static is None:
             static = backdrop_of_scene(train, tracks, footage, plan, cache, progress, deadline)
     with progress.stage("initial scene"):
-        initial = initial_scene(train, offsets, tuple(tracks), footage, static, plan, cache, map, progress)
-    gains = np.ones((len(footage), 3)) if static is None else static.gains
+        gains = np.ones((len(footage), 3)) if static is None else static.gains
+        given = Given(train, offsets, tuple(tracks), footage, gains, plan, cache, map, progress)
+        initial = initial_scene(given, static, start)
     if static is not None:
         footage = tuple(
             f if f.background is None else with_backdrop(static, f, gains[v]) for v, f in enumerate(footage)

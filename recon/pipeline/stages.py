@@ -3,7 +3,7 @@
 tracks, depth    otsync's own stages, shared with the synchronisation that came before
 footage          frames at working size, masks, backgrounds
 backdrop         static Gaussians behind what moves
-initial scene    a scaffold through the lifted tracks, Gaussians seeded from depth
+initial scene    what moves as a fit begins with it: :mod:`.starts`
 """
 
 from __future__ import annotations
@@ -23,13 +23,11 @@ from otsync.types import Offsets, TrackSet, Video
 from recon.backdrop.fit import StaticFit, fit_backdrop
 from recon.footage.depth import working_depth
 from recon.footage.footage import Footage, footage_of
-from recon.motion import build_scaffold
 from recon.pipeline.intake import only
 from recon.pipeline.plan import Plan
-from recon.pipeline.track_sets import of_every_video
+from recon.pipeline.starts import Given, Start
 from recon.scene.gaussians import Gaussians
 from recon.scene.gaussians4d import Gaussians4D, scene_arrays, scene_from_arrays
-from recon.scene.seed import moments, seed, shown_at
 
 MANY: dict[str, Any] = {"count": 700, "min_life": 10, "apart": 4.0}
 """Tracks for a scaffold: more and shorter ones than synchronisation asks for, since every limb must have some."""
@@ -83,15 +81,6 @@ def lifted_tracks(scene: Scene, offsets: Offsets, cache: Any, map: MapLike, prog
     return tuple(out)
 
 
-def without_depth(scene: Scene) -> set[str]:
-    """Names of videos that came without depth and for which none can be measured."""
-    from otsync.recordings.routes import Stages
-
-    static = [v.name for v in scene.videos if v.camera.w2c.ndim == 2]
-    measured = set(static) if len(static) >= Stages().stereo.min_views else set()
-    return {v.name for v in scene.videos if v.depth is None} - measured
-
-
 def read_footage(scene: Scene, width: int, cache: Any, map: MapLike, progress: Progress) -> tuple[Footage, ...]:
     """Frames, masks and backgrounds of every video at working size."""
     from otsync.recordings.routes import Stages
@@ -108,21 +97,6 @@ def read_footage(scene: Scene, width: int, cache: Any, map: MapLike, progress: P
         return footage_of(video, tracking.masks(video, given, cache), width=width)
 
     return tuple(map(one, list(zip(scene.videos, scene.masks, strict=True))))
-
-
-def world_footprint(tracks: Sequence[TrackSet], footage: Sequence[Footage]) -> float:
-    """World units that a working pixel covers at the median depth of what moves."""
-    focal = {f.name: float(f.K[0, 0]) for f in footage}
-    samples = []
-    for t in tracks:
-        if t.camera is None or t.name not in focal:
-            continue
-        z = t.camera.to_camera(t.positions())[..., 2]
-        samples.append(z[np.isfinite(z) & (z > 0)] / focal[t.name])
-    values = np.concatenate(samples) if samples else np.zeros(0)
-    if not len(values):
-        raise ValueError("tracks: expected tracks in space of the fitted videos, with their cameras; found none.")
-    return float(np.median(values))
 
 
 def scene_key(scene: Scene, tracks: Sequence[TrackSet]) -> tuple[Any, ...]:
@@ -157,7 +131,7 @@ def backdrop_of_scene(
 
     def build() -> dict[str, np.ndarray]:
         lifted = [t.positions()[t.seen] for t in tracks]
-        points = np.concatenate([p[:: max(1, len(p) // POINTS)] for p in lifted])
+        points = np.concatenate([p[:: max(1, len(p) // POINTS)] for p in lifted]) if lifted else None
         depth = [None if v.depth is None else working_depth(v, width=plan.width) for v in scene.videos]
         static = fit_backdrop(
             footage,
@@ -199,83 +173,19 @@ POINTS = 2000
 GAUSSIAN = tuple(f.name for f in fields(Gaussians))
 
 
-def initial_scene(
-    scene: Scene,
-    offsets: Offsets,
-    tracks: tuple[TrackSet, ...],
-    footage: tuple[Footage, ...],
-    static: StaticFit | None,
-    plan: Plan,
-    cache: Any,
-    map: MapLike,
-    progress: Progress,
-) -> Gaussians4D:
-    """The scene before any refinement: a scaffold through the tracks, and what the depth maps show of it; kept."""
+def initial_scene(given: Given, static: StaticFit | None, start: Start) -> Gaussians4D:
+    """The scene before any refinement, as ``start`` begins it; kept."""
+    offsets, plan = given.offsets, given.plan
     clocks = (np.round(offsets.seconds, 6).tolist(), np.round(offsets.rates, 9).tolist(), offsets.reference)
-    gains = np.ones((len(footage), 3)) if static is None else static.gains
-    key = (*scene_key(scene, tracks), clocks, gains.tolist(), plan.width, plan.scaffold, plan.seeding, plan.fit.seed)
+    key = (*scene_key(given.scene, given.tracks), clocks, given.gains.tolist())
+    key = (*key, plan.width, plan.scaffold, plan.seeding, plan.fit.seed, start)
 
     def build() -> dict[str, np.ndarray]:
-        built = seeded(scene, offsets, tracks, footage, gains, plan, cache, map, progress)
         # in the layout that a file gives back: sums over another one differ in their last bits
-        return {k: np.array(v, order="C") for k, v in scene_arrays(built).items()}
+        return {k: np.array(v, order="C") for k, v in scene_arrays(start(given)).items()}
 
-    initial = scene_from_arrays(cache.arrays("initial", key, build))
-    progress.tell(f"initial scene: {len(initial)} moving Gaussians")
+    initial = scene_from_arrays(given.cache.arrays("initial", key, build))
+    given.progress.tell(f"initial scene: {len(initial)} moving Gaussians")
     if static is None:
         return initial
     return replace(initial, static=static.gaussians, near=static.near)
-
-
-def seeded(
-    scene: Scene,
-    offsets: Offsets,
-    tracks: tuple[TrackSet, ...],
-    footage: tuple[Footage, ...],
-    gains: np.ndarray,
-    plan: Plan,
-    cache: Any,
-    map: MapLike,
-    progress: Progress,
-) -> Gaussians4D:
-    """Build what :func:`initial_scene` keeps."""
-    from otsync.recordings.dense_depth import depth_maps
-
-    footprint = world_footprint(tracks, footage)
-    frame_step = 1.0 / float(offsets.fps[offsets.reference])
-    motion = build_scaffold(
-        of_every_video(tracks, offsets.names),
-        offsets.seconds,
-        footprint=footprint,
-        frame_step=frame_step,
-        options=plan.scaffold,
-        rates=offsets.rates,
-        seed=plan.fit.seed,
-    )
-    progress.tell(f"scaffold: {len(motion)} nodes of {sum(len(t) for t in tracks)} tracks, footprint {footprint:.4g}")
-    worlds = [offsets.clock(v).world(f.times) for v, f in enumerate(footage)]
-    span = (float(min(t[0] for t in worlds)), float(max(t[-1] for t in worlds)))
-    times = moments(span, frame_step)
-    blind = without_depth(scene)
-    shown = zip(*(shown_at(footage, offsets, float(t), frame_step) for t in times), strict=True)
-    wanted = [
-        [] if v.name in blind else sorted({k for k in frames if k is not None})
-        for v, frames in zip(scene.videos, shown, strict=True)
-    ]
-    maps = depth_maps(scene, offsets, wanted, width=plan.width, cache=cache, map=map)
-    depth = [
-        working_depth(v, dict(zip(k, m, strict=True)).get, width=plan.width)
-        for v, k, m in zip(scene.videos, wanted, maps, strict=True)
-    ]
-    return seed(
-        motion,
-        footage,
-        offsets,
-        depth,
-        footprint=footprint,
-        frame_step=frame_step,
-        span=span,
-        times=times,
-        gains=gains,
-        options=plan.seeding,
-    )

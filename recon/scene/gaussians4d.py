@@ -186,7 +186,7 @@ def scene_from_arrays(arrays: Mapping[str, np.ndarray]) -> Gaussians4D:
         raise ValueError(f"expected a 4D scene (format {FORMAT!r}, version {VERSION}); found another. Write it anew.")
     dynamic = _gaussians(arrays, "dynamic")
     motion = {k[len("motion.") :]: v for k, v in arrays.items() if k.startswith("motion.")}
-    for name, axis in (("binding_rest", 0), ("own_knots", 1)):
+    for name, axis in (("binding_rest", 0), ("own_knots", 1), ("own_quats", 1), ("near", 0)):
         if name in motion and (motion[name].ndim <= axis or motion[name].shape[axis] != len(dynamic)):
             raise ValueError(
                 f"motion.{name}: expected {len(dynamic)} Gaussians along axis {axis}; found shape {motion[name].shape}."

@@ -43,6 +43,7 @@ SCENE = (
     Group("knots", 0.075, "footprints", "nodes", axis=1),
     Group("own_knots", 0.075, "footprints", "gaussians", axis=1),
     Group("knot_quats", 2e-3, rows="nodes", axis=1),
+    Group("own_quats", 2e-3, rows="gaussians", axis=1),
     Group("features", rows="gaussians"),
     Group("static.means", unit="footprints"),
 )

@@ -1,8 +1,8 @@
 """Seeding: the first Gaussians of a scene, on the surfaces that the depth maps show, moment by moment.
 
-At the middle of the clip every surface voxel gets a Gaussian, which is bound to the scaffold. At each further moment
-the Gaussians are carried there, and new ones are added where none is near: on what earlier moments hid. Their means
-hold at that moment, so each moment is a rest of the scaffold.
+At the middle of the clip every surface voxel gets a Gaussian, which is bound to the motion. At each further moment the
+Gaussians are carried there, and new ones are added where none is near: on what earlier moments hid. Their means hold at
+that moment, so each moment is a rest of the scaffold.
 
 A rolling shutter is not undone here: its rows are off by up to half a readout, which the fit corrects.
 """
@@ -10,8 +10,9 @@ A rolling shutter is not undone here: its rows are off by up to half a readout, 
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,7 +24,7 @@ from otsync.types import Offsets
 from otsync.types.checks import check_number, check_whole
 from recon.footage.depth import Depths, depth_at
 from recon.footage.footage import Footage
-from recon.motion import Scaffold
+from recon.motion import Motion, Scaffold
 from recon.scene.gaussians import Gaussians
 from recon.scene.gaussians4d import Gaussians4D
 
@@ -59,6 +60,15 @@ class Seeding:
         check_whole("support", self.support, 1)
         check_number("opacity", self.opacity, 0, 1)
         check_whole("sh_degree", self.sh_degree, 0, 4)
+
+
+Bind = Callable[[Any, Float[np.ndarray, "n 3"], float, int | None], Motion]
+"""A motion, points that hold at a world second, and the video that seeds them (None: all): the motion of n more."""
+
+
+def to_scaffold(motion: Scaffold, points: Float[np.ndarray, "n 3"], t: float, video: int | None) -> Scaffold:
+    """The scaffold with Gaussians bound to its nodes."""
+    return motion.bind(points, t, video=video)
 
 
 def moments(span: tuple[float, float], frame_step: float, apart: float = APART) -> np.ndarray:
@@ -141,7 +151,7 @@ def thinned(
 
 
 def seed(
-    motion: Scaffold,
+    motion: Motion,
     footage: Sequence[Footage],
     offsets: Offsets,
     depth: Sequence[Depths | None],
@@ -152,10 +162,12 @@ def seed(
     times: Float[np.ndarray, " R"] | None = None,
     gains: Float[np.ndarray, "V 3"] | None = None,
     options: Seeding | None = None,
+    bind: Bind = to_scaffold,
 ) -> Gaussians4D:
-    """Gaussians on the surfaces that the depth maps show, bound to a scaffold.
+    """Gaussians on the surfaces that the depth maps show, bound to a motion.
 
     Args:
+        motion: a scaffold, or any motion of no Gaussians yet that ``bind`` gives some.
         depth: per video, in the order of ``footage``. offsets: believed clocks, by name.
         footprint: world units of a working pixel. span: (first, last) world seconds. times: see :func:`moments`.
         gains: factors of the videos' colours.
@@ -170,8 +182,9 @@ def seed(
     voxel = options.voxel * footprint
     means, colors = torch.zeros(0, 3), np.zeros((0, 3))
     everyone = range(len(footage))
-    own = set() if motion.clock is None else set(motion.clock.tolist())
-    groups = [list(everyone)] if motion.clock is None else [[v] for v in everyone if v in own]
+    clock = motion.clock if isinstance(motion, Scaffold) else None
+    own = set() if clock is None else set(clock.tolist())
+    groups = [list(everyone)] if clock is None else [[v] for v in everyone if v in own]
     for t in times:
         for group in groups:
             points, shades = thinned(
@@ -192,7 +205,7 @@ def seed(
                 points, shades = points[new], shades[new]
             if not len(points):
                 continue
-            motion = motion.bind(points, float(t), video=None if motion.clock is None else group[0])
+            motion = bind(motion, points, float(t), None if clock is None else group[0])
             means = torch.cat([means, torch.as_tensor(points, dtype=torch.float32)])
             colors = np.concatenate([colors, shades])
         logger.info("seeds until %.3f s: %d", t, len(means))
@@ -201,8 +214,13 @@ def seed(
             "depth: expected depth where something moves, at one moment at least; found none. Check masks and "
             "depth maps."
         )
+    return Gaussians4D(balls(means, colors, voxel, options), motion, footprint, frame_step, span)
+
+
+def balls(means: torch.Tensor, colors: Float[np.ndarray, "N 3"], voxel: float, options: Seeding) -> Gaussians:
+    """Round Gaussians at means [N,3], of the size and opacity of a seed; voxel: world units."""
     n = len(means)
-    gaussians = Gaussians.from_colors(
+    return Gaussians.from_colors(
         means,
         _upright(n),
         torch.full((n, 3), options.scale * voxel),
@@ -210,7 +228,6 @@ def seed(
         torch.as_tensor(colors, dtype=torch.float32),
         sh_degree=options.sh_degree,
     )
-    return Gaussians4D(gaussians, motion, footprint, frame_step, span)
 
 
 def _upright(n: int) -> torch.Tensor:

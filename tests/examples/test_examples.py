@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
+SMALL = [*("--width", "96", "--frames", "14"), *("--backdrop-steps", "20", "--steps", "20")]
 
 
 FIRST = "01_match_tracks.py"
@@ -41,6 +42,11 @@ def run(tmp_path, monkeypatch, capsys):
         ("02_synchronize.py", ["--videos", "3", "--out", "sync"], "report.html"),
         ("03_ot_versus_fgw.py", ["--n", "120", "--seeds", "0", "--out", "picture.png"], "fused (FGW)"),
         ("04_your_own_matcher.py", ["--videos", "3"], "given matches: errors"),
+        (
+            "07_ablations.py",
+            ["--rows", "w/o scaffold", "--out", "ablations", *SMALL],
+            "w/o scaffold",
+        ),
         ("09_own_frames.py", ["--videos", "2", "--preset", "clean", "--out", "own"], "camera stands at"),
     ],
 )

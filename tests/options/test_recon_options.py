@@ -316,7 +316,7 @@ def test_every_group_s_rate_changes_a_fit_or_is_refused(prepared):
     for name in (*GROUPS_THERE, "clock_rates"):
         assert content(prepared, with_rates(f"{name}=0.004")) != begin, name
     absent = set(every_group()) - {*GROUPS_THERE, "clock_rates"}
-    assert absent >= {"sh_rest", "own_knots", "features", "static.means"}
+    assert absent >= {"sh_rest", "own_knots", "own_quats", "features", "static.means"}
     for name in absent:
         with pytest.raises(ValueError, match=f"rates: expected groups of this fit .* found {name}"):
             content(prepared, with_rates(f"{name}=0.004"))
@@ -346,6 +346,9 @@ LOSS_FIELDS = {
     "acceleration": {"weight": 3.0, "every": 1},
     "rotation-velocity": {"weight": 3.0, "every": 1},
     "rotation-acceleration": {"weight": 3.0, "every": 1},
+    "rigidity": {"weight": 3.0, "every": 1, "neighbours": 2, "falloff": 0.5},
+    "rotation-similarity": {"weight": 30.0, "every": 1, "neighbours": 2, "falloff": 0.5},
+    "isometry": {"weight": 3.0, "every": 1, "neighbours": 2, "falloff": 0.5},
 }
 """Another value of every field of every loss, as ``--losses NAME:FIELD=VALUE`` takes it; None: not for the shell."""
 
@@ -594,6 +597,10 @@ def test_the_plan_of_a_benchmark_reaches_its_fits(options, measuring, world, hom
 def test_what_a_benchmark_does_not_heed_it_refuses(measuring, world, home):
     refused(recon.cli.main, benching(world, home / "b", "--device", "abacus"), "device")
     refused(recon.cli.main, benching(world, home / "b", "--save-every", "3"), "save_every")
+    for option, row in (("--scaffold.unit", "w/o scaffold"), ("--seeding.support", "Sync-NeRF style")):
+        refused(recon.cli.main, benching(world, home / "b", option, "9", "--rows", row), option.strip("-"))
+    for option in ("--gate", "--rebase"):  # what they do: tests/recon/bench/test_bench.py
+        refused(recon.cli.main, benching(world, home / "b", option), "gate, rebase")
     held = measuring(benching(world, home / "b", "--rates", "offsets=0.1", "--rows", "fixed"))[0]["options"]
     assert "offsets" not in held.active_rates()
     for option, value in (("--rates", "own_knots=0.1"), ("--freeze", "own_knots")):
@@ -853,7 +860,7 @@ def rows() -> set[str]:
         "fit": "scene offsets out held_out tracks truth cache json allow_outside",
         "run": "scene out held_out reference truth json allow_outside recording.route recording.cameras "
         "recording.cache recording.allow_outside recording.masks recording.points recording.features",
-        "bench": "scene truth rows out cache name lpips_weights json allow_outside protocol.held_out "
+        "bench": "scene truth rows out cache name lpips_weights json allow_outside gate rebase protocol.held_out "
         "protocol.cameras protocol.amplitudes protocol.seeds protocol.lengths protocol.held_out_tracks",
         "lifting": "scene out cache json allow_outside lifting.cameras lifting.steps lifting.seed lifting.width "
         "lifting.frames lifting.held_out lifting.channels",

@@ -11,22 +11,27 @@ import numpy as np
 import pytest
 import torch
 
+import recon.cli
+from otsync.bench import record
 from otsync.files.cache import Cache
 from otsync.io import open_scene
 from otsync.plugins import forget, register
 from otsync.progress import Progress
 from otsync.types import Clock, Offsets, TrackSet
 from recon.bench import fits as bench
-from recon.bench.configurations import OWN, configurations
+from recon.bench import gate
+from recon.bench.configurations import OWN, check_heeded, configurations, per_frame
 from recon.bench.plot import curve, held, plot
-from recon.bench.rows import find, measured_before, paper_tables
+from recon.bench.rows import find, measured_before, paper_tables, row_table, summary
+from recon.fit.optimize import RATES
 from recon.fit.options import FitOptions
 from recon.losses import ImageLoss, Mask
-from recon.motion import HermiteSpline, PerGaussian
+from recon.motion import HermiteSpline, PerGaussian, ScaffoldOptions
 from recon.observe.effects import Effect, Gain, RollingShutter
 from recon.pipeline.plan import Plan
 from recon.pipeline.prepare import prepare
 from recon.scene.gaussians4d import Gaussians4D
+from recon.scene.seed import Seeding
 from tests.recon.worlds import FRAMES, SIZE, capture, write_world
 
 STEP = 1 / 30
@@ -66,9 +71,9 @@ def test_held_out_tracks_are_compared_at_their_own_times(truth, clock):
         own = own[7:]
     tracks = TrackSet(truth.tracks(rate * own + offset)[::40], timestamps=own, name="b")
     offsets = replace(Offsets.known(("a", "b"), np.array([0.0, offset]), fps), rates=np.array([1.0, rate]))
-    figures = bench.motion_figures(truth, SimpleNamespace(offsets=offsets), [tracks])  # type: ignore[arg-type]
+    figures = bench.motion_figures(truth, SimpleNamespace(offsets=offsets), [tracks], 0.02)  # type: ignore[arg-type]
     plain = TrackSet(truth.tracks(np.arange(60) * STEP)[::40], fps=30.0, name="a")
-    wanted = bench.motion_figures(truth, SimpleNamespace(offsets=offsets), [plain])  # type: ignore[arg-type]
+    wanted = bench.motion_figures(truth, SimpleNamespace(offsets=offsets), [plain], 0.02)  # type: ignore[arg-type]
     assert figures["follow_20"] == pytest.approx(wanted["follow_20"], abs=0.1)  # footprints
 
 
@@ -218,6 +223,91 @@ def test_every_loss_and_every_plugin_is_a_row():
     )
 
 
+def test_rows_that_are_compared_learn_offsets_alike():
+    compared = (
+        ("ours", "w/o scaffold", "scaffold per video", "Sync-NeRF style"),
+        ("true time", "w/o scaffold, true time", "w/o spline, true time", "Dynamic3DGaussians"),
+        ("fixed", "w/o spline"),
+    )
+    for plan in (Plan(), Plan(fit=FitOptions(rates={**RATES, "offsets": 0.5})), Plan(fit=FitOptions(freeze=("sh",)))):
+        for rows in compared:
+            rates = [OWN[row].plan(plan).fit.active_rates().get("offsets") for row in rows]
+            usual = plan.fit.active_rates()["offsets"] if rows[0] == "ours" else None
+            assert rates == [usual] * len(rows)
+            assert len({OWN[row].clocks for row in rows}) == 1
+    assert {row for rows in compared for row in rows} == OWN.keys()
+
+
+def test_no_row_leaves_an_option_out_in_silence():
+    unit, steps = Plan(scaffold=ScaffoldOptions(unit=20.0)), Plan(fit=FitOptions(losses=(Mask(),)))
+    for plan, option, row in (
+        (unit, "scaffold.unit", "w/o scaffold"),
+        (unit, "scaffold.unit", "Dynamic3DGaussians"),
+        (Plan(seeding=Seeding(support=3)), "seeding.support", "Sync-NeRF style"),
+        (steps, "losses", "Sync-NeRF style"),
+        (steps, "losses", "Dynamic3DGaussians"),
+    ):
+        with pytest.raises(ValueError, match=f"{option}: expected an option that a row heeds; found .*Leave it out"):
+            check_heeded([OWN[row]], plan)
+        check_heeded([OWN[row], OWN["ours"]], plan)
+    check_heeded([OWN["w/o scaffold"]], Plan(width=160, views=3, scaffold=ScaffoldOptions(spacing=0.2, margin=1.0)))
+
+
+def test_samples_of_every_frame_lie_on_the_frames():
+    """Whatever the margin: half-way between two samples a frame might take either."""
+    start = PerGaussian.at_rest(HermiteSpline.of(0.2, 0.5, 4 * STEP, 4.5 * STEP), 3)
+    scene = SimpleNamespace(motion=start, span=(0.2, 0.5), frame_step=STEP)
+    times = per_frame(scene).times  # type: ignore[arg-type]
+    frames = (times - 0.2) / STEP
+    np.testing.assert_allclose(frames, np.rint(frames), atol=1e-9)
+    assert times[0] <= 0.2 - 4.5 * STEP + 1e-9 and times[-1] >= 0.5 + 4.5 * STEP - STEP
+
+
+SOME = ("w/o scaffold", "Sync-NeRF style", "Dynamic3DGaussians", "true time")
+
+
+@pytest.mark.parametrize("names", [SOME, pytest.param(tuple(OWN), marks=pytest.mark.slow)], ids=["some", "all"])
+def test_every_row_can_be_measured_and_a_seed_is_the_fits_too(world, monkeypatch, names):
+    """Two steps each; rows at true time differ from seed to seed as well."""
+    whole, seeds, fit = material(world), [], bench.fit
+
+    def spied(scene, footage, offsets, options):
+        seeds.append(options.seed)
+        return fit(scene, footage, offsets, options)
+
+    monkeypatch.setattr(bench, "fit", spied)
+    monkeypatch.setattr("recon.fit.run.Run.sigma", lambda self, values: np.zeros(len(self.problem.clips)))
+    cache = world[2]
+    for name in names:
+        row = OWN[name]
+        for seed in (0, 3) if name == "true time" else (0,):
+            found = bench.measure(name, row, whole, TINY, 1.0, seed, 2, cache, map)
+            assert found["psnr"] > 10 and found["gaussians"] > 100
+            assert (found["start"] == 0) == (row.clocks == "true")
+            held = "offsets" not in row.plan(TINY.plan).fit.active_rates()
+            assert (found["mean"] == found["start"]) == held, name
+    assert sorted(set(seeds)) == [0, 3]
+
+
+def test_the_gate_compares_with_the_baseline_and_takes_no_other_options(tmp_path, monkeypatch, capsys):
+    rows = [row(name) for name in gate.ROWS]
+    monkeypatch.setattr(gate, "measured", lambda: rows)
+    monkeypatch.setattr("otsync.bench.record.baseline_path", lambda name: tmp_path / f"{name}.json")
+    out = ["--out", str(tmp_path / "out")]
+    assert recon.cli.main(["bench", "--rebase", *out]) == 0 == recon.cli.main(["bench", "--gate", *out])
+    assert (tmp_path / "out" / "recon_gate.csv").exists() and "no worse" in capsys.readouterr().out
+    for key, change in (("psnr", -0.4), ("mask_psnr", -0.4), ("mean", 0.05), ("neighbour_change", 0.2)):
+        rows[0] = row("ours", **{key: row("ours")[key] + change})
+        assert recon.cli.main(["bench", "--gate", *out]) == 1
+        assert "ours" in capsys.readouterr().err
+    rows[0] = row("ours", psnr=24.8, mean=0.13, neighbour_change=0.2)
+    assert recon.cli.main(["bench", "--gate", *out]) == 0
+    for more, named in ((["world"], "scene"), (["--steps", "3"], "protocol"), (["--json"], "json")):
+        assert recon.cli.main(["bench", "--gate", *out, *more]) == 2
+        assert f"found {named}" in capsys.readouterr().err
+    assert recon.cli.main(["bench", *out]) == 2 and "scene: expected a recording" in capsys.readouterr().err
+
+
 def test_lengths_and_steps_exclude_each_other():
     assert bench.Protocol().steps == (bench.STEPS,) and bench.Protocol(lengths=(3, 9)).steps == (3, 9)
     assert bench.Protocol(Plan(fit=FitOptions(budget=3))).steps == (0,)
@@ -231,6 +321,7 @@ def test_lengths_and_steps_exclude_each_other():
 def row(name: str, amplitude: float = 1.0, seed: int = 0, **figures: float | None) -> dict:
     base = {
         "steps": 2500,
+        "images": 5000,
         "cpu_seconds": 100.0,
         "start": 0.5,
         "mean": 0.1,
@@ -276,18 +367,35 @@ def test_tables_in_the_papers_layout_average_seeds_and_say_why_lpips_lacks():
         row("ours", psnr=24.0, max=0.2),
         row("ours", seed=1, psnr=25.0, max=0.7),
         row("true time", psnr=27.5),
-        row("w/o spline"),
+        row("w/o spline", psnr=26.5),
+        row("w/o spline, true time", psnr=27.25),
         row("ours", amplitude=30.0, psnr=None, mean=None),
     ]
     small, large = paper_tables(rows, "tennis", "no weights given").split("errors of up to 30 frames")
     views = next(line.split() for line in small.splitlines() if line.split()[:2] == ["tennis", "PSNR"])
-    assert views[2:] == ["26.41", "27.30", "27.50", "23.14", "26.32", "24.50"]
+    assert views[2:] == ["26.41", "27.30", "27.50", "23.14", "26.32", "24.50", "±", "0.71"]
     lpips = next(line.split() for line in small.splitlines() if "LPIPS   " in line)
     assert lpips[-1] == "–" == lpips[4] and "LPIPS: no weights given." in small
     offsets = next(line.split() for line in small.splitlines() if line.split()[:2] == ["tennis", "13.355"])
-    assert offsets[-4:] == ["0.500", "–", "0.100", "0.700"]
-    assert "w/o spline" in small and "2 seeds" in small and "27.50" not in large and "w/o spline" not in large
+    assert offsets[-8:] == ["0.500", "±", "0.000", "–", "0.100", "±", "0.000", "0.700"]
+    ablations = [line.split() for line in small.splitlines() if line.startswith(("full", "w/o spline"))]
+    assert ablations[-2][:5] == ["full", "27.30", "0.880", "0.142", "27.50"]  # the paper's, and ours, at true time
+    assert ablations[-1][:6] == ["w/o", "spline", "27.57", "0.889", "0.139", "27.25"]
+    assert "26.50" in small and "2 seeds" in small and "27.50" not in large and "w/o spline" not in large
     assert paper_tables([row("ours", lpips=0.123)], "kitchen").count("0.123") == 1
+
+
+def test_figures_have_a_spread_where_they_were_measured_several_times():
+    several = summary([row("ours", psnr=p, max=m) for p, m in ((24.0, 0.2), (25.0, 0.7), (29.0, 0.1))])
+    assert several["psnr"] == 26.0 and several["psnr_spread"] == pytest.approx(np.std([24.0, 25, 29], ddof=1))
+    assert several["max"] == 0.7 and several["seeds"] == 3 and several["lpips"] is None is several["lpips_spread"]
+    once = summary([row("fixed")])
+    assert once["psnr"] == 25.0 and once["psnr_spread"] is None
+    lines = row_table({"ours": several, "fixed": once}).splitlines()
+    assert "26.00 ± 2.65" in lines[1] and "0.100 ± 0.000" in lines[1] and "±" not in lines[2]
+    assert lines[1].split()[:4] == ["ours", "3", "5000", "100"]
+    one_without = summary([row("ours", psnr=24.0), row("ours", psnr=None)])
+    assert one_without["psnr"] == 24.0 and one_without["psnr_spread"] is None
 
 
 def test_the_plot_has_a_line_a_configuration_and_a_point_a_length(tmp_path):
@@ -323,7 +431,20 @@ def test_tables_hold_the_longest_fits():
     rows = [
         row("ours", steps=300, psnr=11.11),
         row("ours", steps=900, psnr=22.22),
-        row("w/o spline", psnr=33.33, steps=300),
+        row("w/o scaffold", psnr=33.33, steps=300),
     ]
     told = paper_tables(rows, "tennis")
     assert "22.22" in told and "33.33" in told and "11.11" not in told
+
+
+@pytest.mark.slow
+def test_the_gate_is_passed_and_repeats_itself_and_its_rows_are_what_the_page_says():
+    """On a simulated world: what was measured stands beside each bar."""
+    found = gate.measured()
+    assert gate.figures_of(gate.measured()) == gate.figures_of(found)
+    assert record.gate("recon", gate.figures_of(found), gate.worse) == 0
+    rows = {r["configuration"]: r for r in found}
+    ours, fixed, without = (rows[name] for name in ("ours", "fixed", "w/o scaffold"))
+    assert ours["mean"] < 0.3 * ours["start"]  # .13
+    assert ours["mask_psnr"] > fixed["mask_psnr"] + 0.5  # 1.1 dB
+    assert without["neighbour_change"] > 3 * ours["neighbour_change"]  # 6.7 times

@@ -19,7 +19,8 @@ from recon.fit.run import Run
 from recon.fit.verb import fit
 from recon.losses.image import Depth, Feature, Sightings, Track
 from recon.losses.motion import RotationAcceleration, RotationVelocity
-from recon.motion import PerGaussian, ScaffoldOptions, Static, build_scaffold
+from recon.losses.rigidity import Isometry, Rigidity, RotationSimilarity
+from recon.motion import ScaffoldOptions, Static, build_scaffold
 from recon.observe.effects import Gain, MotionBlur
 from recon.pipeline.plan import Plan
 from recon.raster import Rendering, Splats, gsplat_backend
@@ -29,6 +30,7 @@ from recon.scene.device import device_of
 from recon.simulate.capture import synthetic
 from tests.recon.elsewhere import ELSEWHERE, Far, elsewhere
 from tests.recon.fit.test_fit import believed, same, true_scene
+from tests.recon.motion.worlds import following
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +103,14 @@ def dual_quaternions(capture, scene):
 
 
 def per_gaussian(capture, scene):
-    return replace(scene, motion=PerGaussian.following(scene.motion, scene.dynamic.means)), capture.footage, {}
+    return replace(scene, motion=following(scene.motion, scene.dynamic.means)), capture.footage, {}
+
+
+def rigid(capture, scene):
+    """Gaussians that move and turn by themselves, held together by their neighbours."""
+    motion = following(scene.motion, scene.dynamic.means).turning().tied(scene.dynamic.means, 0.0)
+    losses = (*DEFAULT_LOSSES, Rigidity(every=1), RotationSimilarity(every=1), Isometry(every=1))
+    return replace(scene, motion=motion), capture.footage, {"losses": losses, "densify": Densify((0.5,), share=0.2)}
 
 
 def static(capture, scene):
@@ -150,6 +159,7 @@ def given(capture, scene):
         turning,
         pytest.param(dual_quaternions, marks=pytest.mark.slow),
         per_gaussian,
+        rigid,
         static,
         per_video,
         view_dependent,

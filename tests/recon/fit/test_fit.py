@@ -25,7 +25,7 @@ from recon.fit.verb import fit
 from recon.losses import ImageLoss
 from recon.losses.image import Mask, Photometric
 from recon.losses.motion import Velocity
-from recon.motion import HermiteSpline, PerGaussian, Scaffold, Static, build_scaffold
+from recon.motion import HermiteSpline, Scaffold, Static, build_scaffold
 from recon.observe.cameras import Clip, observer
 from recon.observe.effects import Gain, MotionBlur, RollingShutter, Shot
 from recon.observe.recorded import with_declared
@@ -34,6 +34,7 @@ from recon.rotations import rotation_matrices
 from recon.scene.gaussians import Gaussians
 from recon.scene.gaussians4d import Gaussians4D
 from recon.simulate.capture import synthetic
+from tests.recon.motion.worlds import following
 
 ROOT = Path(__file__).parents[3]
 
@@ -271,7 +272,7 @@ def test_a_change_of_units_changes_nothing_but_the_units(capture):
 
 @pytest.mark.parametrize("motion", ["per-gaussian", "static"])
 def test_other_motions_stand_in_the_slot(capture, scene, motion):
-    other = Static() if motion == "static" else PerGaussian.following(scene.motion, scene.dynamic.means)
+    other = Static() if motion == "static" else following(scene.motion, scene.dynamic.means)
     result = fit(replace(scene, motion=other), capture.footage, believed(capture), steps=3)
     assert isinstance(result.scene.motion, type(other)) and result.history.loss[-1] > 0
 

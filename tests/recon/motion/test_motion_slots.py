@@ -8,10 +8,28 @@ import numpy as np
 import pytest
 import torch
 
-from recon.motion import HermiteSpline, PerGaussian, Sampled, Static, build_scaffold, density, motion_from_arrays
+from otsync.types import TrackSet
+from recon.motion import (
+    HermiteSpline,
+    PerGaussian,
+    Sampled,
+    Static,
+    TrackCurves,
+    build_scaffold,
+    density,
+    motion_from_arrays,
+)
 from recon.motion.solve import FRAME
 from recon.rotations import rotation_matrices, unit
-from tests.recon.motion.worlds import FOOTPRINT, Bodies, filmed, leaves, random_gaussians, random_scaffold
+from tests.recon.motion.worlds import (
+    FOOTPRINT,
+    Bodies,
+    filmed,
+    following,
+    leaves,
+    random_gaussians,
+    random_scaffold,
+)
 
 
 @pytest.fixture(scope="module")
@@ -28,16 +46,106 @@ def carried():
 # --- motions per Gaussian, and none
 
 
-def test_paths_of_their_own_start_where_the_scaffold_carries(carried):
+def test_paths_of_their_own_are_the_same_on_another_path(carried):
     scaffold, means, quats, _ = carried
-    apart = PerGaussian.following(scaffold, means)
-    for t in scaffold.path.times[[1, 4, 7]]:
-        assert torch.allclose(apart.warp(means, quats, t)[0], scaffold.warp(means, quats, t)[0], atol=1e-5)
-    # between knots both are splines, of the places here and of the nodes' poses there
-    x, q = apart.warp(means, quats, 0.5)
-    assert (x - scaffold.warp(means, quats, 0.5)[0]).norm(dim=1).max() < 5e-3 and torch.equal(q, quats)
-    sampled = PerGaussian.following(scaffold, means, Sampled.of(0.0, 1.2, FRAME))
-    assert torch.allclose(sampled.warp(means, quats, 0.5)[0], scaffold.warp(means, quats, 0.5)[0], atol=1e-4)
+    apart = following(scaffold, means).turning()
+    sampled = apart.on(Sampled.of(0.0, 1.2, FRAME))
+    for t in (0.0, 0.5, 1.2):
+        found, wanted = sampled.warp(means, quats, t), apart.warp(means, quats, t)
+        assert all(torch.allclose(a, b, atol=1e-6) for a, b in zip(found, wanted, strict=True))
+    between = sampled.warp(means, quats, 0.5 + 0.4 * FRAME)[0]
+    assert torch.equal(between, sampled.warp(means, quats, 0.5)[0])  # held
+
+
+def test_gaussians_turn_in_front_of_their_own_orientation():
+    means, quats = random_gaussians(4, torch.float64)
+    motion = PerGaussian.at_rest(HermiteSpline(0.0, 0.1, 8), 4)
+    assert motion.turns(0.3) is None and motion.warp(means, quats, 0.3)[1] is quats
+    motion = motion.with_parameters({"own_knots": motion.own_knots.double()}).turning()
+    assert torch.allclose(motion.warp(means, quats, 0.3)[1], quats, atol=1e-12)
+    q = torch.tensor([0.8, 0.6, 0.0, 0.0], dtype=torch.float64)
+    turned = motion.with_parameters({"own_knots": motion.own_knots, "own_quats": (3 * q).repeat(8, 4, 1)})
+    found = rotation_matrices(unit(turned.warp(means, quats, 0.3)[1]))
+    assert torch.allclose(found, rotation_matrices(q) @ rotation_matrices(unit(quats)), atol=1e-12)
+    assert turned.warp(means, quats, torch.tensor([0.1, 0.3]))[1].shape == (2, 4, 4)
+
+
+def test_neighbours_are_the_nearest_and_stay_with_their_gaussians():
+    means = torch.tensor([[0.0, 0, 0], [1, 0, 0], [3, 0, 0], [7, 0, 0]])
+    path = HermiteSpline(0.0, 0.1, 8)
+    motion = PerGaussian(path, 0 * means.repeat(8, 1, 1)).tied(means, 0.0, neighbours=2)
+    assert motion.near.tolist() == [[1, 2], [0, 2], [1, 0], [2, 1]]
+    part = motion.take(torch.tensor([3, 1, 1, 2]))  # without the first; the second twice
+    assert part.near.tolist() == [[3, 1], [1, 3], [2, 3], [1, 3]]
+    assert motion.take(torch.tensor([True, False, True, True])).near.tolist() == [[0, 1], [1, 0], [1, 2]]
+    few = PerGaussian.at_rest(path, 2).tied(means[:2], 0.0, neighbours=3)
+    assert few.near.tolist() == [[1, 0, 0], [0, 1, 1]]  # there are no more: the Gaussian itself
+    moved = PerGaussian(path, -means.repeat(8, 1, 1) + torch.tensor([[5.0], [1], [0], [4]]))
+    assert moved.tied(means, 0.4, neighbours=1).near.tolist() == [[3], [2], [1], [0]]
+
+
+def lines(speeds, frames=30, seen=None) -> TrackSet:
+    """Tracks that begin one unit apart along x and go straight along y."""
+    t = np.arange(frames) * FRAME
+    xyz = np.zeros((len(speeds), frames, 3))
+    xyz[..., 0] = np.arange(len(speeds))[:, None]
+    xyz[..., 1] = np.array(speeds)[:, None] * t
+    return TrackSet(xyz, visible=seen, fps=30.0, name="a")
+
+
+def curves_of(*sets, offsets=None, span=(0.0, 1.0)) -> TrackCurves:
+    offsets = np.zeros(len(sets)) if offsets is None else np.array(offsets)
+    path = HermiteSpline.of(*span, 4 * FRAME, 4 * FRAME)
+    return TrackCurves.of(sets, offsets, path, robust=0.03, acceleration=0.02)
+
+
+def test_gaussians_go_with_the_tracks_beside_them():
+    """At their moment they are where they were put, and elsewhere where the track near them is."""
+    curves = curves_of(lines([1.0, 1.0, 1.0, -2.0, -2.0, -2.0]))
+    points = np.array([[0.1, 0.5, 0.0], [4.9, -1.0, 0.3]])
+    motion = PerGaussian.from_tracks(curves, points, 0.5)
+    means = torch.from_numpy(points).float()
+    assert torch.allclose(motion.warp(means, means, 0.5)[0], means, atol=1e-6)
+    for t in (0.1, 0.9):
+        moved = (motion.warp(means, means, t)[0] - means).numpy()
+        np.testing.assert_allclose(moved, [[0, t - 0.5, 0], [0, -2 * (t - 0.5), 0]], atol=5e-3)
+    both = motion.joined(PerGaussian.from_tracks(curves, points[:1], 0.2))
+    assert torch.allclose(both.warp(means[[0, 1, 0]], means, 0.2)[0][2], means[0], atol=1e-6)
+    with pytest.raises(ValueError, match="other: expected a motion like"):
+        motion.joined(motion.turning())
+
+
+def test_a_track_that_went_astray_is_not_followed():
+    curves = curves_of(lines([1.0, 30.0, 1.0]))
+    points = np.array([[1.0, 15.0, 0.0]])  # on the wild one
+    far = PerGaussian.from_tracks(curves, points, 0.5).warp(torch.zeros(1, 3), torch.zeros(1, 4), 0.9)[0]
+    assert float(far[0, 1]) == pytest.approx(0.4, abs=0.02)
+
+
+def test_beyond_its_ends_a_track_comes_to_rest():
+    seen = np.zeros((3, 30), bool)
+    seen[:, 8:20] = True
+    curves = curves_of(lines([1.0] * 3, seen=seen))
+    assert curves.first == pytest.approx(8 * FRAME) and curves.last == pytest.approx(19 * FRAME)
+    motion = PerGaussian.from_tracks(curves, np.zeros((1, 3)), 14 * FRAME)
+
+    def speed(t):
+        a, b = (motion.warp(torch.zeros(1, 3), torch.zeros(1, 4), s)[0] for s in (t, t + FRAME))
+        return float((b - a).norm() / FRAME)
+
+    assert speed(14 * FRAME) == pytest.approx(1.0, abs=0.02) and speed(20 * FRAME) > 0.5
+    assert speed(0.0) < 0.5 and speed(1.1) < 0.25  # a third is left after eight frames
+
+
+def test_tracks_of_several_clocks_and_one_that_was_never_seen():
+    late = lines([1.0, 1.0, 1.0])
+    nothing = replace(late, visible=np.zeros((3, 30), bool), name="b")
+    curves = curves_of(late, nothing, offsets=[0.2, 0.0], span=(0.0, 1.2))
+    assert len(curves) == 3 and curves.first == pytest.approx(0.2)
+    before = PerGaussian.from_tracks(curves, np.zeros((1, 3)), 0.0)  # when none is seen, all may be followed
+    assert float(before.warp(torch.zeros(1, 3), torch.zeros(1, 4), 1.0)[0][0, 1]) > 0.7
+    with pytest.raises(ValueError, match="tracks: expected at least one visible sample"):
+        curves_of(nothing)
 
 
 def test_paths_of_their_own_are_learnt_and_taken():
@@ -68,12 +176,17 @@ def test_nothing_moves_and_nothing_is_computed():
 def test_motions_survive_their_arrays(videos, tmp_path):
     scaffold = random_scaffold(videos=videos, blend="dual-quaternion")
     path = HermiteSpline(0.0, 0.1, 8)
-    for motion in (scaffold, scaffold.on(Sampled(0.0, FRAME, 30)), PerGaussian(path, torch.randn(8, 200, 3)), Static()):
+    gaussians = random_gaussians(200)
+    own = PerGaussian(path, torch.randn(8, 200, 3))
+    whole = replace(own.turning().tied(gaussians[0], 0.1), own_quats=torch.randn(8, 200, 4))
+    assert "own_quats" not in own.arrays() and "near" not in own.arrays()  # files of before have neither
+    for motion in (scaffold, scaffold.on(Sampled(0.0, FRAME, 30)), own, whole, Static()):
         np.savez(tmp_path / "motion.npz", **motion.arrays())
         with np.load(tmp_path / "motion.npz", allow_pickle=False) as file:
             again = motion_from_arrays(dict(file))
         assert type(again) is type(motion)
-        gaussians = random_gaussians(200)
+        if motion is whole:
+            assert torch.equal(again.near, whole.near)
         for a, b in zip(again.warp(*gaussians, 0.31), motion.warp(*gaussians, 0.31), strict=True):
             assert torch.equal(a, b)
         if motion is scaffold:

@@ -9,7 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from otsync.types import TrackSet
-from recon.motion import Binding, HermiteSpline, Motion, Scaffold
+from recon.motion import Binding, HermiteSpline, Motion, Path, PerGaussian, Scaffold
 from recon.scene.gaussians import Gaussians
 from recon.scene.gaussians4d import Gaussians4D
 
@@ -70,6 +70,14 @@ def random_scaffold(
             moved = scaffold.knots + 0.02 * torch.from_numpy(rng.normal(size=scaffold.knots.shape)).to(dtype)
             scaffold = replace(scaffold, knots=moved)
     return scaffold
+
+
+def following(scaffold: Scaffold, means: torch.Tensor, path: Path | None = None) -> PerGaussian:
+    """Paths of their own on which a scaffold carries its Gaussians of these `means` [N,3]; exact at the knots."""
+    path = path or scaffold.path
+    upright = means.new_tensor([1.0, 0, 0, 0]).expand(len(means), 4)
+    with torch.no_grad():
+        return PerGaussian(path, torch.stack([scaffold.warp(means, upright, float(t))[0] - means for t in path.times]))
 
 
 def random_gaussians(n: int, dtype: torch.dtype = torch.float32, seed: int = 1) -> tuple[torch.Tensor, torch.Tensor]:

@@ -29,7 +29,8 @@ from recon.footage.footage import footage_of
 from recon.pipeline.intake import only, readable, split
 from recon.pipeline.plan import Plan
 from recon.pipeline.prepare import prepare
-from recon.pipeline.stages import lifted_tracks, world_footprint
+from recon.pipeline.stages import lifted_tracks
+from recon.pipeline.starts import world_footprint
 from recon.pipeline.verb import reconstruct
 from recon.result.folder import clear_parts, load_result
 from recon.scene.gaussians4d import Gaussians4D

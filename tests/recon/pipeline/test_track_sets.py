@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-import recon.pipeline.stages
+import recon.pipeline.starts
 from otsync.files.cache import Cache
 from otsync.files.digest import content_key, sequence_key
 from otsync.io import open_scene
@@ -21,7 +21,8 @@ from recon.motion import ScaffoldOptions
 from recon.pipeline.intake import given_clocks, only, split
 from recon.pipeline.plan import Plan
 from recon.pipeline.prepare import prepare
-from recon.pipeline.stages import lifted_tracks, read_footage, scene_key, seeded
+from recon.pipeline.stages import lifted_tracks, read_footage, scene_key
+from recon.pipeline.starts import Given, OnScaffold
 from recon.pipeline.track_sets import of_every_video, tracks_of
 from recon.scene.gaussians4d import Gaussians4D, scene_arrays
 from recon.scene.seed import cloud_at, shown_at
@@ -45,7 +46,8 @@ def given(world):
 
 def begun(given, tracks, plan=PER_VIDEO, offsets=None) -> Gaussians4D:
     scene, known, footage = given
-    return seeded(scene, offsets or known, tuple(tracks), footage, np.ones((3, 3)), plan, Cache(), map, Progress())
+    gains = np.ones((3, 3))
+    return OnScaffold()(Given(scene, offsets or known, tuple(tracks), footage, gains, plan, Cache(), map, Progress()))
 
 
 def test_the_order_of_the_tracks_is_no_matter(given):
@@ -122,7 +124,7 @@ def test_every_frame_that_seeding_asks_for_has_its_depth(given, monkeypatch, shi
             cloud_at(footage, [of(maps) for maps in depth], offsets, float(t), frame_step)
         return None
 
-    monkeypatch.setattr(recon.pipeline.stages, "seed", watched)
+    monkeypatch.setattr(recon.pipeline.starts, "seed", watched)
     early = replace(offsets, seconds=np.array([0, shift, 0]) * STEP)
     begun(given, capture().tracks, offsets=early)
     assert len(asked) >= 6 and all(z is not None for z in asked)

@@ -20,6 +20,7 @@ MOTIONS = {
     "world": random_scaffold(),
     "videos": random_scaffold(videos=2, blend="dual-quaternion"),
     "own": PerGaussian(PATH, torch.randn(8, 200, 3, generator=torch.Generator().manual_seed(0))),
+    "turning": PerGaussian.at_rest(PATH, 200).turning().tied(torch.arange(600.0).reshape(200, 3), 0.0),
     "none": Static(),
 }
 SCENES = {name: scene_arrays(random_scene(motion, features=True)) for name, motion in MOTIONS.items()}
@@ -77,6 +78,11 @@ def test_scenes_survive_their_files(tmp_path, name):
         ("own", "own_knots", lambda a: a[:, :1]),
         ("own", "own_knots", lambda a: a[:6]),
         ("own", "own_knots", lambda a: a * np.inf),
+        ("turning", "own_quats", lambda a: a[:, :1]),
+        ("turning", "own_quats", lambda a: a.astype(np.float64)),
+        ("turning", "near", lambda a: a + 1),
+        ("turning", "near", lambda a: a[:1]),
+        ("turning", "near", lambda a: a.astype(np.int32)),
     ],
 )
 def test_motions_whose_indices_or_shapes_lead_nowhere_are_refused(tmp_path, scene, name, change):
