@@ -1,7 +1,7 @@
 """What docs/reconstruction.md says of the rows of ``recon bench``, measured again on the real scene by its commands.
 
 Every bar lies between what two rows came to, several times their spread over draws away from either. What was measured
-stands beside it. On two quiet cores this takes some ten minutes, most of it fits.
+stands beside it. On two quiet cores this takes a quarter of an hour, most of it fits.
 """
 
 from __future__ import annotations
