@@ -65,7 +65,7 @@ def main(
             ("given poses", posed, held, given.offsets),
             ("found poses", replace(unposed, videos=tuple(moved)), there, own.offsets),
         ):
-            whole = replace(scene, videos=(*scene.videos, view), masks=(*scene.masks, None))
+            whole = replace(scene, videos=(*scene.videos, view), masks=(*scene.masks, None), labels=())
             folder = out / what.replace(" ", "_")
             outcome = reconstruct(
                 whole,
