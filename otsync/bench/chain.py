@@ -27,6 +27,7 @@ from ..costs.epipolar import EpipolarDistance
 from ..costs.linear import Cosine, Cost
 from ..costs.positions import CurveDistance
 from ..epipolar import EpipolarRefine, EpipolarScan
+from ..files.arrays import read_json
 from ..match import (
     AnchoredFGW,
     Candidates,
@@ -135,19 +136,37 @@ def run(
     ]
     if scene is not None:
         cases += real_cases(scene, cache or out / "stages", (seeds + 1) // 2, first_seed)
-    rows = []
-    with workers(cases) as pool:
-        for found in counted(pool.map(partial(measure, only=only), range(len(cases))), "chains", "case", len(cases)):
-            rows += found
+    about = {
+        "seeds": seeds,
+        "first_seed": first_seed,
+        "scene": None if scene is None else Path(scene).resolve().name,
+        "only": list(only),
+    }
+    rows = continued(out, about)
+    done = {r["n"] for r in rows}
+    left = [n for n in range(len(cases)) if n not in done]
+    if done:
+        say(f"{len(done)} cases are kept from an earlier run; {len(left)} are to be measured")
+    if left:
+        with workers(cases) as pool:
+            for found in counted(pool.map(partial(measure, only=only), left), "chains", "case", len(left)):
+                rows += found
+                write_rows(out, "chain_answers", rows, about)  # a run that is stopped continues here
     summary = summarise(rows)
-    about = {"seeds": seeds, "first_seed": first_seed, "scene": scene is not None}
-    write_rows(out, "chain_answers", rows, about)
     write_rows(out, "chain", summary, about)
     for situation in dict.fromkeys(r["situation"] for r in summary):
         own = [{k: v for k, v in r.items() if k != "situation"} for r in summary if r["situation"] == situation]
         say(f"{situation}: errors in frames\n{table(own)}\n")
     plot(summary, out / "chain.svg")
     return 0
+
+
+def continued(out: Path, about: dict[str, Any]) -> list[dict[str, Any]]:
+    """The answers of an earlier run into ``out`` with the same arguments; none when there was none."""
+    path = out / "chain_answers.json"
+    document = read_json(path) if path.exists() else {}
+    alike = isinstance(document, dict) and all(document.get(k) == v for k, v in about.items())
+    return list(document["rows"]) if alike and isinstance(document.get("rows"), list) else []
 
 
 _cases: list[tuple[str, Callable[[], Case]]] = []
@@ -189,6 +208,7 @@ def measure(index: int, only: tuple[str, ...] = ()) -> list[dict[str, Any]]:
         for v, error in enumerate(case.errors(offsets.seconds), 1):
             rows.append(
                 {
+                    "n": index,
                     "situation": situation,
                     "case": case.name,
                     "video": offsets.names[v],

@@ -20,6 +20,8 @@ def test_rows_on_two_situations(tmp_path, monkeypatch, capsys):
     answers = json.loads((tmp_path / "chain_answers.json").read_text())["rows"]
     assert {(r["situation"], r["matcher"]) for r in answers} == {("mid", "EMD"), ("mid", "paper"), ("no depth", "EMD")}
     assert len(answers) == 3 * 2 + 1 + 2
+    monkeypatch.setattr(chain, "measure", None)  # everything is there: nothing is measured again
+    assert chain.run(tmp_path, seeds=1, first_seed=31, only=("EMD",)) == 0
     case = world(31, preset="mid")
     paper = next(r for r in answers if r["matcher"] == "paper")
     offsets = synchronize([case.a, case.b], method=PAPER)
