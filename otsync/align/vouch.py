@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Int
 
 from ..compute.indices import evenly
+from ..costs.linear import binary_scale
 from ..costs.places import apart
 from ..types import Alignment, Matches, Status, TrackSet, in_order
 from .likelihood import LikelihoodScan
@@ -72,6 +73,7 @@ def drifts(tracks: TrackSet, index: Int[np.ndarray, " M"]) -> bool:
     there = seen.any(1)
     x, seen = x[there], seen[there]
     filled = np.where(seen[..., None], x, 0.0)
+    filled = filled / binary_scale(filled)  # squares of lengths overflow in some units
     rest = filled.sum(1) / seen.sum(1)[:, None]
     extent = float(np.sqrt(((rest - rest.mean(0)) ** 2).sum(1).mean()))
     if not extent > 0:

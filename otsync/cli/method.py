@@ -48,12 +48,15 @@ class MethodOptions:
         if self.method is not None:
             method = available("methods", METHODS)[self.method]
         named_graph: dict[str, Any] = {k: v for k, v in vars(self.graph).items() if v is not None}
+        base = method.graph or graph or Graph()
+        if named_graph.get("extra") == 0:  # a star has no use for the number up to which all pairs are compared
+            base = replace(base, complete=Graph.complete)
         method = method.but(
             matcher=self.matcher,
             aligner=self.aligner,
             refiner=self.refiner,
             rate=self.rate,
             rematch=self.rematch,
-            graph=replace(method.graph or graph or Graph(), **named_graph) if named_graph else None,
+            graph=replace(base, **named_graph) if named_graph else None,
         )
         return method.but(matcher=with_costs(method.matcher, self.costs)) if self.costs else method

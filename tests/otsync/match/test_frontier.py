@@ -105,7 +105,8 @@ def test_poses_take_the_nearest_frame_that_is_seen():
 
 def test_the_front_and_the_gate():
     def row(name, n, p50, cpu, status="ok"):
-        return {"matcher": name, "n": n, "p50": p50, "cpu_seconds": cpu, "seconds": cpu, "status": status}
+        spent = {"cpu_seconds": cpu, "seconds": cpu, "yardstick": 0.5}
+        return {"matcher": name, "n": n, "p50": p50, "status": status} | spent
 
     rows = [
         row("x", 2000, 0.9, 1.0),
@@ -115,9 +116,9 @@ def test_the_front_and_the_gate():
     ]
     bench.mark_front(rows)
     assert [r["front"] for r in rows] == ["*", "", "*", ""]
-    assert bench.figures_of(rows)["x 2000 against POT at 2000"] == 9
+    assert bench.figures_of(rows)["y 2000: speed"] == 0.25
     assert bench.worse("x 200 p50", 0.8, 0.9) and not bench.worse("x 200 p50", 0.88, 0.9)
-    assert bench.worse("x against", 5.0, 9.0) and not bench.worse("x against", 7.0, 9.0)
+    assert bench.worse("x: speed", 5.0, 9.0) and not bench.worse("x: speed", 7.0, 9.0)
 
 
 def test_the_plot_is_written(tmp_path):
