@@ -14,9 +14,9 @@ from ..types import Alignment, Matches, Status, TrackSet, in_order
 from .likelihood import LikelihoodScan
 from .slot import Aligner
 
-AGREES = 3 / 30
-"""Seconds within which an aligner without flags and the likelihood scan are of one opinion (the scan's own limit for
-the disagreement of its parts)."""
+AGREES = 1.5 / 30
+"""Seconds within which an aligner without flags and the likelihood scan are of one opinion: two sigmas of an answer in
+whole frames. Beyond it DTW's answers were wrong more often than the scan's."""
 
 APART = 1.2
 """Median distance of matched tracks at the answer, in units of the median distance between the tracks of one video,

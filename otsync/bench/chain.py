@@ -4,7 +4,8 @@ Every matcher x every way from matches to an offset x matched again or not, each
 a user would call it, in situations that matchers differ in: the simulator's presets, few tracks, tracks of strangers,
 a wide baseline, people who look alike, no depth; and, with a recording, pairs of its cameras. The row "paper" is
 :data:`otsync.sync.method.PAPER`. Matched again means: by the matcher itself where it can be (cheapest partners,
-unbalanced OT), else by mutual nearest neighbours at equal times, by the matcher's own costs. A missing answer counts as the largest error that there can be.
+unbalanced OT), else by mutual nearest neighbours at equal times, by the matcher's own costs. A missing answer counts as
+the largest error that there can be.
 """
 
 from __future__ import annotations
@@ -130,6 +131,8 @@ def run(
     known = {*IN_SPACE, *IN_PIXELS}
     if strange := [name for name in only if name not in known]:
         raise ValueError(f"--only: expected some of {', '.join(sorted(known))}; found {', '.join(strange)}.")
+    if cache is not None and scene is None:
+        raise ValueError(f"--cache: expected with a recording, whose tracks and depth it keeps; found {cache} alone.")
     chosen = range(first_seed, first_seed + seeds)
     cases: list[tuple[str, Callable[[], Case]]] = [
         (name, partial(make, seed)) for name, make in SITUATIONS.items() for seed in chosen
@@ -193,8 +196,9 @@ def warm() -> None:
 
 
 def measure(index: int, only: tuple[str, ...] = ()) -> list[dict[str, Any]]:
-    """Every contender on one case, a line for every video; CPU-seconds of one thread a pair. Of many videos at once the last way alone, and the
-    paper's: the graph of pairs comes after either.
+    """Every contender on one case, a line for every video; CPU-seconds of one thread a pair.
+
+    Of many videos at once the last way alone, and the paper's: the graph of pairs comes after either.
     """
     situation, make = _cases[index]
     case = make()

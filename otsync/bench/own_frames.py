@@ -78,6 +78,8 @@ def run(
         seeds: simulated pairs, and twice as many of the recording. first_seed: where they begin.
         cache: where tracks and depth of the recording are kept; default: stages in ``out``.
     """
+    if cache is not None and scene is None:
+        raise ValueError(f"--cache: expected with a recording, whose tracks and depth it keeps; found {cache} alone.")
     tell: Callable[[str], None] = (lambda text: None) if json else print
     for pair in worlds(0, 1):
         judge(pair, MID)  # compiles what is timed

@@ -12,6 +12,7 @@ all are fitted at once: so distances in the first frame are those of the fit as 
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from dataclasses import dataclass
 
 import torch
@@ -74,24 +75,37 @@ def _step(motion: PerGaussian | Scaffold) -> float:
 
 
 @dataclass(frozen=True)
-class Rigidity(MotionLoss):
-    """A neighbour goes as if it were fixed to the Gaussian, from 1/30 s to the next: mean distance, footprints.
-
-    w ‖(x_j - x_i)(t - 1) - R_i(t - 1) R_i(t)⁻¹ (x_j - x_i)(t)‖. Where nothing turns, R is no turn.
+class _AmongNeighbours(MotionLoss):
+    """A loss over every Gaussian and its neighbours.
 
     Args:
         neighbours: at most, of those that the motion knows. falloff: of w = exp(-falloff d²), per squared footprint.
     """
 
-    weight: float = 0.027
+    weight: float = 1.0
     every: int = 2
     neighbours: int = NEIGHBOURS
     falloff: float = FALLOFF
 
     def __call__(self, motion: Motion, means: Tensor, quats: Tensor, draw: Draw) -> Tensor | None:
         among = _Neighbours.of(motion, means, draw, self.neighbours, self.falloff)
-        if among is None:
-            return None
+        return None if among is None else self.change(among, draw)
+
+    @abstractmethod
+    def change(self, among: _Neighbours, draw: Draw) -> Tensor | None:
+        """What is to be small; None where the motion has nothing to compare."""
+
+
+@dataclass(frozen=True)
+class Rigidity(_AmongNeighbours):
+    """A neighbour goes as if it were fixed to the Gaussian, from 1/30 s to the next: mean distance, footprints.
+
+    w ‖(x_j - x_i)(t - 1) - R_i(t - 1) R_i(t)⁻¹ (x_j - x_i)(t)‖. Where nothing turns, R is no turn.
+    """
+
+    weight: float = 0.027
+
+    def change(self, among: _Neighbours, draw: Draw) -> Tensor | None:
         step = _step(among.motion)
         t = draw.moment(0, step)
         (before, turned_before), (after, turned_after) = among.pose(t), among.pose(t + step)
@@ -103,21 +117,15 @@ class Rigidity(MotionLoss):
 
 
 @dataclass(frozen=True)
-class RotationSimilarity(MotionLoss):
+class RotationSimilarity(_AmongNeighbours):
     """Neighbours turn alike, from 1/30 s to the next: mean difference of quaternions. None where nothing turns.
 
-    w ‖q_j(t) q_j(t - 1)⁻¹ - q_i(t) q_i(t - 1)⁻¹‖; fields as of :class:`Rigidity`.
+    w ‖q_j(t) q_j(t - 1)⁻¹ - q_i(t) q_i(t - 1)⁻¹‖.
     """
 
     weight: float = 4.0
-    every: int = 2
-    neighbours: int = NEIGHBOURS
-    falloff: float = FALLOFF
 
-    def __call__(self, motion: Motion, means: Tensor, quats: Tensor, draw: Draw) -> Tensor | None:
-        among = _Neighbours.of(motion, means, draw, self.neighbours, self.falloff)
-        if among is None:
-            return None
+    def change(self, among: _Neighbours, draw: Draw) -> Tensor | None:
         step = _step(among.motion)
         t = draw.moment(0, step)
         before, after = among.pose(t)[1], among.pose(t + step)[1]
@@ -129,20 +137,14 @@ class RotationSimilarity(MotionLoss):
 
 
 @dataclass(frozen=True)
-class Isometry(MotionLoss):
+class Isometry(_AmongNeighbours):
     """Neighbours stay as far apart as they were in the first frame: mean change of the distance, footprints.
 
-    w |‖x_j - x_i‖(t) - ‖x_j - x_i‖(first)|; fields as of :class:`Rigidity`.
+    w |‖x_j - x_i‖(t) - ‖x_j - x_i‖(first)|.
     """
 
     weight: float = 0.013
-    every: int = 2
-    neighbours: int = NEIGHBOURS
-    falloff: float = FALLOFF
 
-    def __call__(self, motion: Motion, means: Tensor, quats: Tensor, draw: Draw) -> Tensor | None:
-        among = _Neighbours.of(motion, means, draw, self.neighbours, self.falloff)
-        if among is None:
-            return None
+    def change(self, among: _Neighbours, draw: Draw) -> Tensor | None:
         lengths = [soft_norm(among.apart(among.pose(t)[0])) for t in (draw.span[0], draw.moment(0, 0))]
         return among.mean(soft_norm((lengths[0] - lengths[1])[..., None]))

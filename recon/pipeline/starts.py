@@ -128,7 +128,7 @@ class OnTracks(Start):
 
 @dataclass(frozen=True)
 class FromImages(Start):
-    """Gaussians on the visual hull of the masks, each on a spline of its own that follows it: neither tracks nor depth."""
+    """Gaussians on the visual hull of the masks, each on a spline of its own that follows it; no tracks, no depth."""
 
     reads_geometry: ClassVar[bool] = False
     ignores: ClassVar[tuple[str, ...]] = (

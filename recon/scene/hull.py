@@ -103,7 +103,8 @@ def followed(
     """Displacements of points on the hull of the ``middle`` moment that stay on the hulls of P moments.
 
     From each moment to the next a point goes on as before, and from there to what is nearest of the hull; all of its
-    neighbours go the mean of their ways, so that they stay together. Where there is no hull, it goes half as far as before.
+    neighbours go the mean of their ways, so that they stay together. Where there is no hull, it goes half as far as
+    before.
     """
     out = np.zeros((len(hulls), *points.shape))
     near = cKDTree(points).query(points, k=range(1, min(TOGETHER, len(points)) + 1))[1]

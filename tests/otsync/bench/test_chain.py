@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from otsync import PAPER, synchronize
-from otsync.bench import chain
+from otsync.bench import chain, own_frames
 from otsync.bench.chain_worlds import SITUATIONS, world
 
 
@@ -68,3 +68,6 @@ def test_situations_are_what_they_say():
 def test_an_unknown_matcher_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"--only: expected some of .*EMD.*; found nobody"):
         chain.run(tmp_path, only=("nobody",))
+    for suite in (chain, own_frames):
+        with pytest.raises(ValueError, match="--cache: expected with a recording"):
+            suite.run(tmp_path, cache=tmp_path)

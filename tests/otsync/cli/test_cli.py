@@ -194,7 +194,8 @@ def test_a_refused_answer_exits_with_one(tmp_path, capsys):
         ),
         (
             ["bench", "panoptic", "--seeds", "3"],
-            "--seeds: benchmark panoptic does not take it. It takes scene, --gate, --rebase, --first-seed, --json, --cache.",
+            "--seeds: benchmark panoptic does not take it. It takes scene, --gate, --rebase, --first-seed, --json, "
+            "--cache.",
         ),
         (["bench", "sync", "--gate", "--first-seed", "8100"], "--first-seed: expected without --gate and --rebase"),
         (["bench", "panoptic"], "scene: expected a recording"),
