@@ -16,7 +16,8 @@ from .slot import Aligner
 
 AGREES = 1.5 / 30
 """Seconds within which an aligner without flags and the likelihood scan are of one opinion: two sigmas of an answer in
-whole frames. Beyond it DTW's answers were wrong more often than the scan's."""
+whole frames. Of 24 fresh worlds by the paper's method (mid, hard, like people) 14 are trusted, 2 of them off by more
+than a frame; with 3 frames it was 20 and 8. All 12 right ones are trusted either way."""
 
 APART = 1.2
 """Median distance of matched tracks at the answer, in units of the median distance between the tracks of one video,
