@@ -55,6 +55,42 @@ def open_end_path(cost, level):
 
 
 @kernel(fastmath={"contract", "reassoc", "nsz"})
+def common_sums(a, wa, qa, b, wb, qb, m, lo, hi, k, out):
+    """Sums over the frames lo:hi of a in which match m is seen in both; frame i of a meets i - k of b.
+
+    Fills out (10,): frames in common, Σa (3), Σb (3), Σ|a|², Σ|b|², Σa·b.
+    """
+    x, y, z, u, p = a[m, 0, lo:hi], a[m, 1, lo:hi], a[m, 2, lo:hi], wa[m, lo:hi], qa[m, lo:hi]
+    X, Y, Z = b[m, 0, lo - k : hi - k], b[m, 1, lo - k : hi - k], b[m, 2, lo - k : hi - k]
+    U, P = wb[m, lo - k : hi - k], qb[m, lo - k : hi - k]
+    c = sx = sy = sz = SX = SY = SZ = sp = SP = cross = 0.0
+    for i in range(hi - lo):
+        c += u[i] * U[i]
+        sx += x[i] * U[i]
+        sy += y[i] * U[i]
+        sz += z[i] * U[i]
+        SX += X[i] * u[i]
+        SY += Y[i] * u[i]
+        SZ += Z[i] * u[i]
+        sp += p[i] * U[i]
+        SP += P[i] * u[i]
+        cross += x[i] * X[i] + y[i] * Y[i] + z[i] * Z[i]
+    out[0], out[1], out[2], out[3], out[4], out[5] = c, sx, sy, sz, SX, SY
+    out[6], out[7], out[8], out[9] = SZ, sp, SP, cross
+
+
+@kernel(fastmath={"contract", "reassoc", "nsz"})
+def variances(s):
+    """Var(a) + Var(b) and Var(a - b) from :func:`common_sums`."""
+    c = s[0]
+    own = (s[1] * s[1] + s[2] * s[2] + s[3] * s[3] + s[4] * s[4] + s[5] * s[5] + s[6] * s[6]) / c
+    dx, dy, dz = s[1] - s[4], s[2] - s[5], s[3] - s[6]
+    both = s[7] + s[8]
+    rest = both - 2 * s[9] - (dx * dx + dy * dy + dz * dz) / c
+    return max((both - own) / c, 0.0), max(rest / c, 0.0)
+
+
+@kernel(fastmath={"contract", "reassoc", "nsz"})
 def lag_statistics(a, wa, qa, b, wb, qb, lags, least, count, power, residual):
     """Variances of every match over its common frames at every lag; the mean over exactly these frames is removed.
 
@@ -63,83 +99,49 @@ def lag_statistics(a, wa, qa, b, wb, qb, lags, least, count, power, residual):
     """
     M, _, Ta = a.shape
     Tb = b.shape[2]
+    s = np.empty(10)
     for m in range(M):
         for n in range(len(lags)):
             k = lags[n]
             lo, hi = max(0, k), min(Ta, Tb + k)
             if hi - lo < least:
                 continue
-            x, y, z, u, p = a[m, 0, lo:hi], a[m, 1, lo:hi], a[m, 2, lo:hi], wa[m, lo:hi], qa[m, lo:hi]
-            X, Y, Z = b[m, 0, lo - k : hi - k], b[m, 1, lo - k : hi - k], b[m, 2, lo - k : hi - k]
-            U, P = wb[m, lo - k : hi - k], qb[m, lo - k : hi - k]
-            c = sx = sy = sz = SX = SY = SZ = sp = SP = cross = 0.0
-            for i in range(hi - lo):
-                c += u[i] * U[i]
-                sx += x[i] * U[i]
-                sy += y[i] * U[i]
-                sz += z[i] * U[i]
-                SX += X[i] * u[i]
-                SY += Y[i] * u[i]
-                SZ += Z[i] * u[i]
-                sp += p[i] * U[i]
-                SP += P[i] * u[i]
-                cross += x[i] * X[i] + y[i] * Y[i] + z[i] * Z[i]
-            if c < least:
+            common_sums(a, wa, qa, b, wb, qb, m, lo, hi, k, s)
+            if s[0] < least:
                 continue
-            count[m, n] = c
-            own = (sx * sx + sy * sy + sz * sz + SX * SX + SY * SY + SZ * SZ) / c
-            dx, dy, dz = sx - SX, sy - SY, sz - SZ
-            power[m, n] = max((sp + SP - own) / c, 0.0)
-            residual[m, n] = max((sp + SP - 2 * cross - (dx * dx + dy * dy + dz * dz) / c) / c, 0.0)
+            count[m, n] = s[0]
+            power[m, n], residual[m, n] = variances(s)
 
 
 @kernel(fastmath={"contract", "reassoc", "nsz"})
-def windowed_evidence(a, wa, qa, b, wb, qb, lags, block, least, floor, weight, out):
+def windowed_evidence(a, wa, qa, b, wb, qb, lags, begin, block, least, floor, weight, out):
     """Sum over matches and windows of n/2 log((Var a + Var b + floor) / (Var(a - b) + floor)) at every lag.
 
     Matches count by their ``weight``. Arrays as for :func:`lag_statistics`. Windows are two blocks of ``block`` frames
-    long and start every block, counted from the first common frame, which treats a and b alike; the first and last
-    block are windows of their own too. Adds to out (K,), each window with weight 1/2, since every sample is in two.
+    long and start every block, counted from frame ``begin`` (K,) of a; the first and last block are windows of their
+    own too. Adds to out (W,K), where W = 1 for the sum of all windows, or one row a window; each counts 1/2, since
+    every sample is in two.
     """
     M, _, Ta = a.shape
     Tb = b.shape[2]
     sums = np.empty((2, 10))
+    whole = np.empty(10)
     for m in range(M):
         for n in range(len(lags)):
             k = lags[n]
             first, end = max(0, k), min(Ta, Tb + k)
-            blocks = (end - first + block - 1) // block
+            blocks = (end - begin[n] + block - 1) // block
             sums[:] = 0.0
             for j in range(blocks + 1):
                 now, before = sums[j % 2], sums[1 - j % 2]
                 now[:] = 0.0
-                if j < blocks:
-                    lo, hi = first + j * block, min(first + (j + 1) * block, end)
-                    x, y, z, u, p = a[m, 0, lo:hi], a[m, 1, lo:hi], a[m, 2, lo:hi], wa[m, lo:hi], qa[m, lo:hi]
-                    X, Y, Z = b[m, 0, lo - k : hi - k], b[m, 1, lo - k : hi - k], b[m, 2, lo - k : hi - k]
-                    U, P = wb[m, lo - k : hi - k], qb[m, lo - k : hi - k]
-                    c = sx = sy = sz = SX = SY = SZ = sp = SP = cross = 0.0
-                    for i in range(hi - lo):
-                        c += u[i] * U[i]
-                        sx += x[i] * U[i]
-                        sy += y[i] * U[i]
-                        sz += z[i] * U[i]
-                        SX += X[i] * u[i]
-                        SY += Y[i] * u[i]
-                        SZ += Z[i] * u[i]
-                        sp += p[i] * U[i]
-                        SP += P[i] * u[i]
-                        cross += x[i] * X[i] + y[i] * Y[i] + z[i] * Z[i]
-                    now[0], now[1], now[2], now[3], now[4], now[5] = c, sx, sy, sz, SX, SY
-                    now[6], now[7], now[8], now[9] = SZ, sp, SP, cross
-                c = now[0] + before[0]
-                if c < least:
+                lo, hi = max(first, begin[n] + j * block), min(begin[n] + (j + 1) * block, end)
+                if hi > lo:
+                    common_sums(a, wa, qa, b, wb, qb, m, lo, hi, k, now)
+                for q in range(10):
+                    whole[q] = now[q] + before[q]
+                if whole[0] < least:
                     continue
-                sx, sy, sz = now[1] + before[1], now[2] + before[2], now[3] + before[3]
-                SX, SY, SZ = now[4] + before[4], now[5] + before[5], now[6] + before[6]
-                both = now[7] + before[7] + now[8] + before[8]
-                own = (sx * sx + sy * sy + sz * sz + SX * SX + SY * SY + SZ * SZ) / c
-                dx, dy, dz = sx - SX, sy - SY, sz - SZ
-                rest = both - 2 * (now[9] + before[9]) - (dx * dx + dy * dy + dz * dz) / c
-                power, residual = max((both - own) / c, 0.0), max(rest / c, 0.0)
-                out[n] += weight[m] * (0.25 * c * np.log((power + floor) / (residual + floor)))
+                power, residual = variances(whole)
+                row = j if len(out) > 1 else 0
+                out[row, n] += weight[m] * (0.25 * whole[0] * np.log((power + floor) / (residual + floor)))

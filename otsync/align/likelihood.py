@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -13,6 +13,7 @@ from ..costs.linear import binary_scale, velocity
 from ..types import Alignment, Matches, Status, TrackSet, in_order
 from ..types.checks import positive
 from ..types.trust import Trust
+from .breaks import find_breaks
 from .peaks import separate_peaks, vertex
 from .slot import Aligner
 
@@ -93,7 +94,8 @@ class LikelihoodScan(Aligner):
         offset = float(pair.seconds(vertex(lags, score, tops[0])))
         stats = self._stats(pair, lags, curves, tops) | {"matches": float(len(matches))}
         stats["other_rate"], stats["other_rate_gain"] = other_rate(a, b, pair, matches, scale, self.max_lag)
-        flags = self._flags(stats)
+        parts, stats["parts_gain"] = find_breaks(pair, lags, score, curves.floor, matches.shares)
+        flags = (*self._flags(stats), *((Status.BROKEN_CLOCK,) if len(parts) else ()))
         return Alignment(
             offset,
             hypotheses=np.array([[pair.seconds(vertex(lags, score, i)), score[i]] for i in tops]),
@@ -101,6 +103,7 @@ class LikelihoodScan(Aligner):
             fps=pair.fps,
             flags=flags,
             stats=stats,
+            parts=parts,
         )
 
     def _stats(
@@ -152,6 +155,7 @@ class Curves:
         total: what is maximised. slow: of ±5-frame velocities. windows: of windowed positions.
         observed: matches seen long enough at each lag.
         motion: at each lag, the rms motion that both videos share, relative to the rms extent of the scene.
+        floor: e² of the positions.
     """
 
     total: Float[np.ndarray, " K"]
@@ -159,6 +163,7 @@ class Curves:
     windows: Float[np.ndarray, " K"]
     observed: Float[np.ndarray, " K"]
     motion: Float[np.ndarray, " K"]
+    floor: float = 0.0
 
 
 def evidence(pair: CommonClock, lags: Int[np.ndarray, " K"], weight: Float[np.ndarray, " M"] | None = None) -> Curves:
@@ -174,12 +179,13 @@ def evidence(pair: CommonClock, lags: Int[np.ndarray, " K"], weight: Float[np.nd
     least = frames(MIN_FRAMES)
     count, power, residual = statistics(*positions, lags, least)
     floor = noise_floor(count, power, residual)
-    windows = np.zeros(len(lags))
+    total = np.zeros((1, len(lags)))
+    begin, (block, few) = np.maximum(lags, 0), (frames(BLOCK), frames(MIN_WINDOW))  # treats a and b alike
     kernels.windowed_evidence(
-        *positions[0].arrays, *positions[1].arrays, lags, frames(BLOCK), frames(MIN_WINDOW), floor, weight, windows
+        *positions[0].arrays, *positions[1].arrays, lags, begin, block, few, floor, weight, total
     )
     observed = (count > 0).sum(0).astype(float)
-    windows = np.where(observed > 0, windows / len(pair.a), -np.inf)
+    windows = np.where(observed > 0, total[0] / len(pair.a), -np.inf)
     fast, slow = (velocity_score(pair, lags, frames(half), least, weight) for half in (FAST, SLOW))
     shared = 0.5 * (count * (power - residual)).sum(0) / np.maximum(count.sum(0), 1)
     extent = 0.5 * (positions[0].extent + positions[1].extent)
@@ -189,6 +195,7 @@ def evidence(pair: CommonClock, lags: Int[np.ndarray, " K"], weight: Float[np.nd
         windows=windows,
         observed=observed,
         motion=np.sqrt(np.maximum(shared, 0)) / extent if extent > 0 else np.zeros(len(lags)),
+        floor=floor,
     )
 
 
@@ -296,4 +303,4 @@ def unanswered(
 def normalised(pair: CommonClock) -> tuple[CommonClock, float]:
     """The same in units of a power of two near its size, and that unit: squares neither overflow nor vanish."""
     scale = max(binary_scale(pair.a), binary_scale(pair.b))
-    return CommonClock(pair.a / scale, pair.b / scale, pair.fps, pair.origin), scale
+    return replace(pair, a=pair.a / scale, b=pair.b / scale), scale

@@ -7,6 +7,7 @@ chain.py   matchers x aligners x rematching, to frames of the offset; chain_worl
 hard_cases/  the catalogue of hard cases, and running it
 panoptic.py  the paper's protocol on a truly synchronised recording
 own_frames.py  clock and pose without a common frame, on worlds and on a truly synchronised recording
+trust/  whether "ok" is right: classes of worlds, claims and errors
 record.py  tables on disk, machine and versions, the gate against a committed baseline
 """
 
@@ -28,6 +29,7 @@ OWN = {
     "panoptic": "panoptic",
     "chain": "chain",
     "own-frames": "own_frames",
+    "trust": "trust.run",
 }
 """Our own suites, and where they are."""
 

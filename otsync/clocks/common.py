@@ -29,13 +29,14 @@ class CommonClock:
 
     Args:
         a: (M,Ta,3), b: (M,Tb,3): positions in world units, nan where unobserved.
-        fps: of both. origin: the offset in seconds that lag 0 means.
+        fps: of both. origin: the offset in seconds that lag 0 means. start: of a's clock, s, at its first sample.
     """
 
     a: Float[np.ndarray, "M Ta 3"]
     b: Float[np.ndarray, "M Tb 3"]
     fps: float
     origin: float
+    start: float = 0.0
 
     def seconds(self, lag: Float[np.ndarray, " K"] | float) -> Float[np.ndarray, " K"] | float:
         """offset(a, b) of a lag in frames."""
@@ -62,7 +63,7 @@ def common_clock(a: TrackSet, b: TrackSet, matches: Matches) -> CommonClock:
     i, j = matches.pairs.T
     fps = min(nominal_fps(a), nominal_fps(b))
     xa, xb = (on_clock(tracks, tracks.positions(), fps) for tracks in (a.take(i), b.take(j)))
-    return CommonClock(xa, xb, fps, float(a.times[0] - b.times[0]))
+    return CommonClock(xa, xb, fps, float(a.times[0] - b.times[0]), float(a.times[0]))
 
 
 def strongest(matches: Matches, limit: int) -> Matches:

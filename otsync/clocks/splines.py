@@ -90,6 +90,13 @@ class TrackSplines:
         part.coefficients = self.coefficients.reshape(self.n, -1, 3)[:, index].reshape(self.n, -1)
         return part
 
+    def within(self, begin: float, end: float) -> TrackSplines:
+        """The same splines, taken as seen only from ``begin`` to ``end``, s."""
+        part = object.__new__(TrackSplines)
+        part.__dict__ |= self.__dict__
+        part.seen = self.seen & ((self.times >= begin) & (self.times <= end))
+        return part
+
     def value(self, t: Float[np.ndarray, " S"]) -> Float[np.ndarray, "M S 3"]:
         """Positions at seconds ``t``; outside the clip the end values."""
         flat = self._design(self._inside(t), DEGREE) @ self.coefficients

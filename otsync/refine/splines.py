@@ -27,8 +27,14 @@ COMMON_ERRORS = 4.0
 """Seconds; blur²/COMMON_ERRORS joins sigma: errors that whole videos share (drifting depth, limbs, smoothing) grow with
 the square of the noise, and neither residuals nor other windows show them."""
 
-LONG = 600 / 30
+LONG = 60 / 30
 """Seconds of overlap from which a rate can be told from an offset."""
+
+LEAST_DRIFT = 0.1 / 30
+"""Seconds by which a rate must move the ends of the overlap to be worth telling."""
+
+DECLARED = 1e-4
+"""Relative error of a frame rate that a file declares: what quartz clocks differ by."""
 
 VELOCITY = 5 / 30
 """Half window, s, of the velocities whose correlation judges the fit."""
@@ -47,20 +53,21 @@ class SplineRefine(Refiner):
     slowly drifting errors drop out and exchanging a and b flips the sign to rounding. Samples and whole matches that
     fit badly lose weight; matches with a ``weight`` of their own begin with it. Sigma adds the scatter over
     neighbourhoods of matches or blocks of one second, the ``spread`` of the answers with the other windows (the largest
-    difference, so its square counts half), and what blur predicts: errors of the model that no residual shows.
+    difference, so its square counts half), and what blur predicts: errors of the model that no residual shows. It holds
+    at both ends of the overlap: the uncertainty of the rate grows with the distance from the middle.
 
     Args:
         windows: half windows of detrending in seconds: the answer's, and those that it is compared with.
         smoothing: of the splines, see :class:`otsync.splines.TrackSplines`.
-        rate: ``fixed`` takes the clocks as declared; ``fit`` frees the rate for overlaps of 20 s and more and keeps it
-            when it is significant. With ``fixed`` a significant rate on such clips raises RATE_MISMATCH.
+        rate: ``fit`` frees the rate and keeps it where it is significant and moves the ends of the overlap;
+            ``fixed`` takes the clocks as declared, and such a rate raises RATE_MISMATCH.
         limit: of more matches only so many are used, the best by score.
         trust: limits behind the flags.
     """
 
     windows: tuple[float, ...] = (14 / 30, 10 / 30, 28 / 30)
     smoothing: float = SMOOTHING
-    rate: Rate = "fixed"
+    rate: Rate = "fit"
     limit: int = 500
     trust: Trust = field(default_factory=Trust)
 
@@ -75,11 +82,12 @@ class SplineRefine(Refiner):
         if fit is None:
             flags = in_order((*alignment.flags, Status.NO_OVERLAP))
             return replace(alignment, flags=flags)
-        fit, rate_flag, rate_stats = self._rate(curves, fit, weight)
+        fit, free, rate_flag, rate_stats = self._rate(curves, fit, weight)
         others = [fit_clock(*curves, fit.clock, w, weight=weight, iterations=10) for w in self.windows[1:]]
         spread = max((self._apart(o, fit, curves) for o in others), default=0.0)
         fps = min(nominal_fps(a), nominal_fps(b))
-        variance = float(fit.covariance[0, 0])
+        shared = spread**2 / 2 + (fit.blur**2 / COMMON_ERRORS) ** 2 + LEAST_SIGMA**2
+        ends = self._ends(curves, fit, free, shared)
         stats = (
             alignment.stats
             | rate_stats
@@ -92,6 +100,8 @@ class SplineRefine(Refiner):
                 "correlation": velocity_correlation(*curves, fit, VELOCITY),
                 "overlap": overlap_seconds(*curves, fit.clock),
                 "iterations": float(fit.iterations),
+                "sigma_begin": ends[0],
+                "sigma_end": ends[1],
             }
         )
         flags = in_order((*alignment.flags, *self._flags(stats), *rate_flag))
@@ -99,7 +109,7 @@ class SplineRefine(Refiner):
             alignment,
             offset=fit.clock.offset,
             rate=fit.clock.rate,
-            sigma=math.sqrt(variance + spread**2 / 2 + (fit.blur**2 / COMMON_ERRORS) ** 2 + LEAST_SIGMA**2),
+            sigma=max(ends),
             fps=fps,
             flags=flags,
             stats=stats,
@@ -133,18 +143,40 @@ class SplineRefine(Refiner):
 
     def _rate(
         self, curves: tuple[TrackSplines, TrackSplines], fit: Fit, weight: Float[np.ndarray, " M"] | None
-    ) -> tuple[Fit, tuple[Status, ...], dict[str, float]]:
-        """The fit with a free rate where that is significant, or a warning that it would be."""
-        if overlap_seconds(*curves, fit.clock) < LONG - 1e-9:
-            return fit, (), {}
+    ) -> tuple[Fit, Fit | None, tuple[Status, ...], dict[str, float]]:
+        """The fit to keep, the one with a free rate, a warning where that one is right and not kept, and statistics."""
+        overlap = overlap_seconds(*curves, fit.clock)
+        if overlap < LONG - 1e-9:
+            return fit, None, (), {}
         free = fit_clock(*curves, fit.clock, self.windows[0], weight=weight, fit_rate=True)
         if free is None:
-            return fit, (), {}
-        sigma = math.sqrt(float(free.covariance[1, 1]))
+            return fit, None, (), {}
+        # errors that a whole video shares move either end by themselves
+        common = (free.blur**2 / COMMON_ERRORS) ** 2 + LEAST_SIGMA**2
+        sigma = math.sqrt(float(free.covariance[1, 1]) + 2 * common / overlap**2)
         stats = {"fitted_rate": free.clock.rate, "rate_sigma": sigma}
-        if abs(free.clock.rate - fit.clock.rate) <= self.trust.rate_sigmas * sigma:
-            return fit, (), stats
-        return (free, (), stats) if self.rate == "fit" else (fit, (Status.RATE_MISMATCH,), stats)
+        off = abs(free.clock.rate - fit.clock.rate)
+        if off <= self.trust.rate_sigmas * sigma or off * overlap / 2 <= LEAST_DRIFT:
+            return fit, free, (), stats
+        kept = free if self.rate == "fit" else fit
+        return kept, free, () if self.rate == "fit" else (Status.RATE_MISMATCH,), stats
+
+    def _ends(
+        self, curves: tuple[TrackSplines, TrackSplines], fit: Fit, free: Fit | None, shared: float
+    ) -> tuple[float, float]:
+        """One sigma at the beginning and at the end of the overlap; shared: variance of errors that both have."""
+        a, b = curves
+        own = fit.clock.own(a.times[[0, -1]])
+        begin, end = max(float(own[0]), float(b.times[0])), min(float(own[1]), float(b.times[-1]))
+        fitted = free is not None and (len(fit.covariance) > 1 or fit.clock.rate != 1.0)
+        if fitted:
+            assert free is not None
+            C = free.covariance
+            variance = [float(C[0, 0] + 2 * t * C[0, 1] + t * t * C[1, 1]) for t in (begin, end)]
+        else:
+            drift = DECLARED * (end - begin) / 2
+            variance = [float(fit.covariance[0, 0]) + drift**2] * 2
+        return math.sqrt(max(variance[0], 0) + shared), math.sqrt(max(variance[1], 0) + shared)
 
     def _flags(self, stats: dict[str, float]) -> tuple[Status, ...]:
         t = self.trust

@@ -5,6 +5,7 @@ the effects of a preset; :class:`Truth` knows the answers. :func:`matching_world
 """
 
 from . import effects
+from .adversaries import ADVERSARIES
 from .features import FeatureModel
 from .matching import matching_world
 from .mocap import Mocap
@@ -15,6 +16,7 @@ from .truth import Truth
 from .world import Rig, simulate
 
 __all__ = [
+    "ADVERSARIES",
     "MOTIONS",
     "PRESETS",
     "FeatureModel",

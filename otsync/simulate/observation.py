@@ -55,6 +55,9 @@ class Observation:
         size: of the scene, m.
         at: world times (T,) -> true world positions (N,T,3).
         facing: world times (T,) -> cosine (N,T) between the surface normals and the directions to the camera.
+        late: (T,) seconds of world time by which every frame shows something else than the clock says (a freeze, a
+            cut); None: nothing of the kind.
+        video: index of the video.
     """
 
     xyz: Float[np.ndarray, "N T 3"]
@@ -71,10 +74,14 @@ class Observation:
     size: float
     at: Callable[[Float[np.ndarray, " T"]], Float[np.ndarray, "N T 3"]]
     facing: Callable[[Float[np.ndarray, " T"]], Float[np.ndarray, "N T"]]
+    late: Float[np.ndarray, " T"] | None = None
+    video: int = 0
 
     @property
     def world_times(self) -> Float[np.ndarray, " T"]:
-        return self.rate * self.times + self.offset
+        """What every frame shows, in seconds of the world."""
+        told = self.rate * self.times + self.offset
+        return told if self.late is None else told + self.late
 
     def rays(self) -> Float[np.ndarray, "N T 3"]:
         """From the camera centre to every sample: its length is the depth that depth errors are relative to."""

@@ -29,6 +29,8 @@ class Truth:
         size: of the scene, m.
         wrong, n_matches: the preset's, for :meth:`matches`.
         seed: of the world.
+        shown: per video (T,) what its frames show, in seconds of the world: where an effect freezes or cuts a video,
+            ``rate * t + offset`` is not the whole truth.
     """
 
     offsets: Float[np.ndarray, " V"]
@@ -40,6 +42,7 @@ class Truth:
     wrong: float
     n_matches: int
     seed: int
+    shown: tuple[Float[np.ndarray, " T"], ...] = ()
 
     def offset(self, a: int, b: int) -> float:
         """Seconds by which video b started after video a: ``offset_b - offset_a``."""

@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 
 from ..progress import counted
 from ..types import Camera, TrackSet
+from .adversaries import ADVERSARIES
 from .body import sample_surface
 from .effects import Effect, OwnFrame
 from .features import FeatureModel
@@ -92,7 +93,8 @@ def simulate(
 
     Args:
         motion: a class of :data:`MOTIONS` ("boxes", "juggle", "softball", "tennis", "basketball", "football",
-            "static"), ``"mocap:FILE"`` or a :class:`Mocap`, or a :class:`Scene` (or what draws one) of your own.
+            "static"), a motion that misleads (:data:`ADVERSARIES`: "canon", "unison", "loop", "carousel", "belt",
+            "flock"), ``"mocap:FILE"`` or a :class:`Mocap`, or a :class:`Scene` (or what draws one) of your own.
         preset: "clean", "mid", "hard", "brutal", or a :class:`Preset`.
         videos: how many; video 0 is the reference, with offset 0 and rate 1 unless given otherwise.
         frames: of every video, or one entry a video: a count, or the timestamps (T,) in seconds of a video whose frames
@@ -196,6 +198,7 @@ def observe(
         scene_size(xyz),
         at,
         facing,
+        video=video,
     )
 
 
@@ -284,6 +287,7 @@ def as_truth(scene: Scene, made: list[Observation], level: Preset, seed: int) ->
         wrong=level.wrong,
         n_matches=level.matches,
         seed=seed,
+        shown=tuple(obs.world_times for obs in made),
     )
 
 
@@ -301,9 +305,10 @@ def _scene(motion: Motion, seed: int) -> Scene:
     if isinstance(motion, str) and motion.startswith("mocap:"):
         motion = Mocap(motion.removeprefix("mocap:"))
     if isinstance(motion, str):
-        if motion not in MOTIONS:
-            raise ValueError(f"motion: expected one of {', '.join(MOTIONS)}, mocap:FILE, or a Scene; found {motion!r}.")
-        motion = MOTIONS[motion]
+        known = MOTIONS | ADVERSARIES
+        if motion not in known:
+            raise ValueError(f"motion: expected one of {', '.join(known)}, mocap:FILE, or a Scene; found {motion!r}.")
+        motion = known[motion]
     return motion(stream(seed, "motion"))
 
 

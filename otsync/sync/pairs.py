@@ -92,11 +92,5 @@ def run_refit(job: Refit) -> Alignment:
 
 
 def with_rate(refiner: Refiner, rate: Rate | None) -> Refiner:
-    """The refiner told how to treat rates; None: as it is. ValueError where it cannot, or was told otherwise."""
-    if rate is None or rate == refiner.rate:
-        return refiner
-    if rate == "fixed":
-        raise ValueError(
-            f"rate, refiner: expected one answer; found rate='fixed' and {refiner}. Leave one of them out."
-        )
-    return refiner.with_rate(rate)
+    """The refiner told how to treat rates; None: as it is. ValueError where it cannot fit them."""
+    return refiner if rate is None or rate == refiner.rate else refiner.with_rate(rate)

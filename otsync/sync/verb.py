@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Literal
 
 import numpy as np
 
 from ..align.likelihood import LikelihoodScan
 from ..align.slot import Aligner, AlignerLike
+from ..clocks.common import nominal_fps
 from ..clocks.shutter import at_frame_times
 from ..compute.threads import MapLike
 from ..costs.epipolar import EpipolarDistance
@@ -22,12 +23,13 @@ from ..match.synchronous import SynchronousMatching
 from ..match.unbalanced import UnbalancedOT
 from ..refine.slot import Rate, Refiner, RefinerLike
 from ..refine.splines import SplineRefine
-from ..types import Alignment, Clock, Matches, Offsets, TrackSet
+from ..types import Alignment, Break, Clock, Matches, Offsets, TrackSet
+from .breaks import MOST, culprit, mended, suspects
 from .graph import Graph, Pair
 from .method import Method, with_costs
 from .own_frames import Frames, refuse_common, solver_from, synchronize_own
 from .pairs import Job, Refit, run, run_refit, with_rate
-from .verdict import Answer, Verdict, judge
+from .verdict import NOTHING_COMMON, Answer, Verdict, judge
 
 
 def synchronize(
@@ -94,6 +96,7 @@ def synchronize(
             t.check(f"tracks[{v}]", xyz=False, features=True)
     started = time.perf_counter()
     tracks = [at_frame_times(t) for t in tracks]
+    original = list(tracks)
     graph = chosen_method.graph or Graph()
     centre = most_seen(tracks) if chosen is None else chosen
     pairs = given_pairs(matches, tracks) if matches is not None else graph.pairs(len(tracks), centre)
@@ -109,13 +112,58 @@ def synchronize(
         return judge(len(tracks), answers, chosen, centre, graph, refining.trust, refit)
 
     verdict = judged(list(map(run, jobs)))
+    broken: dict[int, tuple[Break, ...]] = {}
+    jobs, verdict, broken = mend_clocks(jobs, verdict, tracks, judged, map)
     for _ in range(times if matches is None else 0):
         again = rematching(jobs, verdict)
         if not again:
             break
         fresh = {answer.pair: answer for answer in map(run, again)}
         verdict = judged([fresh.get(a.pair, a) for a in verdict.answers])
-    return to_offsets(tracks, verdict, time.perf_counter() - started)
+    return to_offsets(original, verdict, time.perf_counter() - started, broken)
+
+
+def mend_clocks(
+    jobs: list[Job],
+    verdict: Verdict,
+    tracks: list[TrackSet],
+    judged: Callable[[Sequence[Answer]], Verdict],
+    map: MapLike,
+) -> tuple[list[Job], Verdict, dict[int, tuple[Break, ...]]]:
+    """Videos whose clocks break are put on the clock that they had before, one break after the other.
+
+    ``tracks`` is changed in place. A mend is kept where it adds to the evidence of the video's pairs.
+    """
+    broken: dict[int, tuple[Break, ...]] = {}
+    fps = [nominal_fps(t) for t in tracks]
+    for _ in range(MOST):
+        doubtful = [a for a in verdict.answers if len(a.scanned.parts) and not NOTHING_COMMON & set(a.scanned.flags)]
+        named = [s for a in doubtful for s in suspects(a, tracks[a.pair[0]], tracks[a.pair[1]], fps)]
+        one = culprit(named)
+        if one is None:
+            break
+        v = one.video
+        better = mended(tracks[v], (one.found,))
+        sets = [better if k == v else t for k, t in enumerate(tracks)]
+        again = [dataclasses.replace(j, a=sets[j.pair[0]], b=sets[j.pair[1]]) for j in jobs]
+        fresh = {a.pair: a for a in map(run, [j for j in again if v in j.pair])}
+        if _evidence(fresh.values()) <= _evidence(a for a in verdict.answers if a.pair in fresh):
+            break
+        earlier = broken.get(v, ())
+        broken[v] = (*earlier, _on_own_clock(one.found, earlier))
+        tracks[v], jobs = better, again
+        verdict = judged([fresh.get(a.pair, a) for a in verdict.answers])
+    return jobs, verdict, broken
+
+
+def _evidence(answers: Iterable[Answer]) -> float:
+    return sum(a.scanned.stats.get("evidence", 0.0) for a in answers)
+
+
+def _on_own_clock(found: Break, earlier: Sequence[Break]) -> Break:
+    """A break that was found on a mended clock, told in the video's own time."""
+    late = sum(b.jump for b in earlier if b.at + b.jump <= found.at)
+    return dataclasses.replace(found, at=found.at - late)
 
 
 def _without_common_frame(
@@ -183,7 +231,9 @@ def at_known_times(matcher: Matcher | None, clock: Clock, flat: bool = False) ->
     return SynchronousMatching(clock.offset, clock.rate, costs)
 
 
-def to_offsets(tracks: Sequence[TrackSet], verdict: Verdict, seconds: float) -> Offsets:
+def to_offsets(
+    tracks: Sequence[TrackSet], verdict: Verdict, seconds: float, broken: Mapping[int, tuple[Break, ...]] | None = None
+) -> Offsets:
     return Offsets(
         names=unique_names(tracks),
         fps=np.array([t.fps for t in tracks], float),
@@ -196,6 +246,7 @@ def to_offsets(tracks: Sequence[TrackSet], verdict: Verdict, seconds: float) -> 
         alignments={a.pair: a.refined for a in verdict.answers},
         matches={a.pair: a.matches for a in verdict.answers},
         stats=verdict.stats | {"seconds": seconds},
+        breaks=tuple((broken or {}).get(v, ()) for v in range(len(tracks))),
     )
 
 

@@ -215,7 +215,7 @@ def _rates(
         if a.finite and math.isfinite(sigma):
             rate = a.refined.stats["fitted_rate"]
             edges.append(Edge(*a.pair, math.log(rate), max(sigma, 1e-9), True))
-    solution = solve(n, edges, anchor, inflation=INFLATION)
+    solution = solve(n, edges, anchor, inflation=1.0)
     significant = np.abs(solution.x) > trust.rate_sigmas * solution.sigma
     rates[significant] = np.exp(solution.x[significant])
     tasks = [(a, a.refined.offset, rates[a.pair[1]] / rates[a.pair[0]]) for a in answers if a.finite]

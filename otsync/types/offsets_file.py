@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..files.arrays import read_json
+from .clock import Break
 from .similarity import Similarity
 from .status import Status, gravest, in_order
 
@@ -23,6 +24,12 @@ FRAMES = (
     "every video has a frame of reference of its own; transform: x_reference = scale * R(quaternion w, x, y, z) * "
     "x_video + translation, in units of the reference (of pairs: from b's frame to a's); covariance: of a small "
     "rotation vector (3, radians), relative scale (1) and translation (3) that act after it"
+)
+
+
+BREAKS = (
+    "a video whose clock breaks: from at_seconds of its own clock on, jump_seconds are added to t_video before rate and "
+    "offset; frames within still_seconds before at_seconds stood still and tell no time"
 )
 
 
@@ -119,8 +126,19 @@ def _fields(data: dict[str, Any]) -> tuple[dict[str, Any], dict[tuple[int, int],
         transforms=tuple(_transform_from(video.get("transform"), f"videos, {video['name']}") for video in videos)
         if any("transform" in video for video in videos)
         else (),
+        breaks=tuple(_breaks(video.get("breaks", []), f"videos, {video['name']}: breaks") for video in videos),
     )
     return fields, alignments
+
+
+def _breaks(data: Any, what: str) -> tuple[Break, ...]:
+    if not isinstance(data, list):
+        raise ValueError(f"{what}: expected a list; found {data!r}")
+    found = []
+    for one in data:
+        at, jump, sigma = (_float(one[f"{n}_seconds"], f"{what}: {n}_seconds") for n in ("at", "jump", "sigma"))
+        found.append(Break(at, jump, _float(one["still_seconds"], f"{what}: still_seconds", least=0), sigma))
+    return tuple(found)
 
 
 def _transform_from(data: Any, what: str) -> Similarity | None:

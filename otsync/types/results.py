@@ -14,8 +14,8 @@ from jaxtyping import Float, Int
 from ..files.arrays import write_json
 from . import drawing
 from .camera import Video
-from .clock import Clock
-from .offsets_file import FORMAT, FRAMES, SIGN, VERSION, read_offsets
+from .clock import Break, Clock, mended_times
+from .offsets_file import BREAKS, FORMAT, FRAMES, SIGN, VERSION, read_offsets
 from .similarity import Similarity
 from .status import Status, gravest, in_order
 from .tracks import TrackSet
@@ -140,6 +140,8 @@ class Alignment:
         flags: what there is to know about the answer, gravest first. ``status`` is the gravest, OK without any.
         stats: seconds, matches, evidence, ...
         transform: from b's frame of reference to a's, where the videos share none (``frames="own"``); else None.
+        parts: (P,2) where one offset does not suit the whole overlap: seconds of a's clock from which on, offset in
+            seconds. Empty where one does.
     """
 
     offset: float
@@ -153,6 +155,7 @@ class Alignment:
     flags: tuple[Status, ...] = ()
     stats: Stats = field(default_factory=dict)
     transform: Similarity | None = None
+    parts: Float[np.ndarray, "P 2"] = field(default_factory=lambda: _NO_PEAKS)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "flags", in_order(self.flags))
@@ -206,6 +209,8 @@ class Offsets:
         flags: per video, gravest first; ``status`` has the gravest of each. stats: of the whole.
         transforms: per video, from its own frame of reference to that of its component's reference, None where it
             could not be found; empty where all videos share one frame.
+        breaks: per video, in order of time, where its clock breaks; ``seconds`` is of the clock before the first one,
+            and :meth:`times` undoes them. Empty where none was looked for.
     """
 
     names: tuple[str, ...]
@@ -220,8 +225,14 @@ class Offsets:
     matches: Mapping[tuple[int, int], Matches] = field(default_factory=dict)
     stats: Stats = field(default_factory=dict)
     transforms: tuple[Similarity | None, ...] = ()
+    breaks: tuple[tuple[Break, ...], ...] = ()
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "breaks", self.breaks or ((),) * len(self.names))
+        if len(self.breaks) != len(self.names):
+            raise ValueError(
+                f"Offsets.breaks: expected a tuple for each of {len(self.names)} videos; found {len(self.breaks)}."
+            )
         object.__setattr__(self, "flags", tuple(in_order(flags) for flags in self.flags))
         if self.transforms and len(self.transforms) != len(self.names):
             raise ValueError(
@@ -266,6 +277,17 @@ class Offsets:
     def clock(self, v: int) -> Clock:
         """The clock of video v against its reference's."""
         return Clock(float(self.seconds[v]), float(self.rates[v]))
+
+    def times(self, v: int, own: Float[np.ndarray, " T"]) -> Float[np.ndarray, " T"]:
+        """What the frames of video v show, in seconds of its reference's clock, breaks undone.
+
+        Args:
+            own: (T,) seconds of the frames on the video's own clock.
+
+        Frames that stood still have nan.
+        """
+        shown, tells = mended_times(own, self.breaks[v])
+        return np.where(tells, self.clock(v).world(shown), np.nan)
 
     @property
     def frames(self) -> Float[np.ndarray, " V"]:
@@ -319,6 +341,7 @@ class Offsets:
                 "status": self.status[v].code,
                 "flags": [f.code for f in self.flags[v]],
                 **({"transform": _transform(self.transforms[v])} if self.transforms else {}),
+                **({"breaks": [_break(b) for b in self.breaks[v]]} if self.breaks[v] else {}),
             }
             for v in range(len(self))
         ]
@@ -345,6 +368,7 @@ class Offsets:
             "unit": "seconds",
             "sign": SIGN,
             **({"frames": FRAMES} if self.transforms else {}),
+            **({"breaks": BREAKS} if any(self.breaks) else {}),
             "reference": self.names[self.reference],
             "videos": videos,
             "pairs": pairs,
@@ -360,6 +384,11 @@ class Offsets:
         """
         fields, pairs = read_offsets(path)
         return cls(**fields, alignments={pair: Alignment(**one) for pair, one in pairs.items()})
+
+
+def _break(found: Break) -> dict[str, float | None]:
+    told = {"at": found.at, "jump": found.jump, "still": found.still, "sigma": found.sigma}
+    return {f"{name}_seconds": _number(value) for name, value in told.items()}
 
 
 def _transform(found: Similarity | None) -> dict[str, Any] | None:

@@ -22,33 +22,46 @@ from .noise import (
     LateralJitter,
     LimbDrift,
     PositionNoise,
+    SharedDrift,
     SlowDrift,
+    Transient,
 )
+from .timing import Cut, Drop, Freeze, In, Loop, Repeats, Reverse, SlowMotion
 from .tracker import Gaps, Hallucination, IdentitySwitch, Occlusion, Outliers, RayCompression, Smoothing
 
 __all__ = [
     "CameraDepthDrift",
     "CameraFrame",
     "ClockDrift",
+    "Cut",
     "DepthBias",
     "DepthDrift",
     "DepthJitter",
+    "Drop",
     "DroppedFrames",
     "Effect",
+    "Freeze",
     "Gaps",
     "Hallucination",
     "IdentitySwitch",
+    "In",
     "LateralJitter",
     "LimbDrift",
+    "Loop",
     "Occlusion",
     "Outliers",
     "OwnFrame",
     "PositionNoise",
     "RayCompression",
+    "Repeats",
+    "Reverse",
     "RigidFrame",
     "RollingShutter",
+    "SharedDrift",
     "SlowDrift",
+    "SlowMotion",
     "Smoothing",
+    "Transient",
 ]
 
 

@@ -117,4 +117,6 @@ class DroppedFrames:
     def __call__(self, obs: Observation, rng: np.random.Generator) -> Observation:
         stays = rng.random(len(obs.times)) >= self.share
         stays[0] = True
-        return replace(obs, xyz=obs.xyz[:, stays], visible=obs.visible[:, stays], times=obs.times[stays], regular=False)
+        late = None if obs.late is None else obs.late[stays]
+        xyz, visible = obs.xyz[:, stays], obs.visible[:, stays]
+        return replace(obs, xyz=xyz, visible=visible, times=obs.times[stays], late=late, regular=False)

@@ -129,3 +129,40 @@ class LimbDrift:
         drift = smooth_noise((parts, 3), obs.times, self.correlation, rng, dtype_of(obs)) * dtype_of(obs)(self.size)
         drift[-1] = 0
         return replace(obs, xyz=obs.xyz + drift.swapaxes(1, 2)[obs.surface.part])
+
+
+@dataclass(frozen=True)
+class SharedDrift:
+    """All tracks drift together, as a calibration does that slowly loses its hold: smooth noise of ``size`` m in each
+    direction, from 0 at the first frame on.
+
+    Args:
+        seed: of the drift, for videos that all drift alike, each in its own clock; None: every video its own.
+    """
+
+    size: float = 0.2
+    correlation: float = 1.5
+    seed: int | None = None
+
+    def __call__(self, obs: Observation, rng: np.random.Generator) -> Observation:
+        rng = rng if self.seed is None else np.random.default_rng(self.seed)
+        drift = smooth_noise((3,), obs.times, self.correlation, rng, np.float64).T
+        return replace(obs, xyz=obs.xyz + (self.size * (drift - drift[0])).astype(obs.xyz.dtype))
+
+
+@dataclass(frozen=True)
+class Transient:
+    """Trackers settle: all tracks begin ``size`` m beside their place and come there within a few ``settle`` s.
+
+    The direction is the same in all videos, as of one tracker with one bias.
+    """
+
+    size: float = 0.2
+    settle: float = 0.3
+    seed: int = 0
+
+    def __call__(self, obs: Observation, rng: np.random.Generator) -> Observation:
+        aside = np.random.default_rng(self.seed).standard_normal(3)
+        fade = np.exp(-(obs.times - obs.times[0]) / self.settle)
+        moved = self.size * fade[:, None] * aside / np.linalg.norm(aside)
+        return replace(obs, xyz=obs.xyz + moved.astype(obs.xyz.dtype))

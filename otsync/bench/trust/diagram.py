@@ -1,0 +1,67 @@
+"""Claimed against found: sigma against the error that it stands for, over all trusted answers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ...files.arrays import atomic_write
+from ..record import Row
+
+BINS = 8
+
+
+def reliability(rows: Sequence[Row]) -> list[Row]:
+    """Trusted answers with a true answer, in bins of as many by sigma: claimed and found rms, and coverage."""
+    ok = [r for r in rows if r["trusted"] and np.isfinite(r["error"]) and np.isfinite(r["sigma"])]
+    if len(ok) < BINS:
+        return []
+    e, s = (np.array([r[k] for r in ok]) for k in ("error", "sigma"))
+    out: list[Row] = []
+    for part in np.array_split(np.argsort(s), BINS):
+        out.append(
+            {
+                "sigma from": float(s[part].min()),
+                "to": float(s[part].max()),
+                "answers": len(part),
+                "claimed rms": float(np.sqrt((s[part] ** 2).mean())),
+                "found rms": float(np.sqrt((e[part] ** 2).mean())),
+                "within 1 sigma": float((e[part] <= s[part]).mean()),
+                "within 2 sigmas": float((e[part] <= 2 * s[part]).mean()),
+            }
+        )
+    return out
+
+
+def draw(rows: Sequence[Row], path: Path) -> None:
+    """Left: claimed against found. Right: share of trusted and of wrong answers by class."""
+    import matplotlib
+
+    matplotlib.use("agg")
+    import matplotlib.pyplot as plt
+
+    ours = [r for r in rows if r["method"] == "default"]
+    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 6.5), layout="constrained", width_ratios=(1, 1.1))
+    told = reliability(ours)
+    if told:
+        claimed, found = (np.array([r[k] for r in told]) for k in ("claimed rms", "found rms"))
+        ok = [r for r in ours if r["trusted"] and np.isfinite(r["error"])]
+        left.scatter([r["sigma"] for r in ok], [r["error"] for r in ok], s=6, color="#9db7c9", label="answers")
+        left.plot(claimed, found, "o-", color="#00527a", label="rms in eighths")
+        ends = np.array([0.5 * min(claimed), 2 * max(claimed)])
+        left.plot(ends, ends, color="#777", lw=0.8, ls="--", label="claimed = found")
+        left.set(xscale="log", yscale="log", xlabel="sigma that is claimed, frames", ylabel="error, frames")
+        left.legend(fontsize=8)
+    names = list(dict.fromkeys(r["class"] for r in ours))[::-1]
+    trusted = [float(np.mean([r["trusted"] for r in ours if r["class"] == n])) for n in names]
+    bad = [float(np.mean([r["trusted"] and not r["error"] <= 1 for r in ours if r["class"] == n])) for n in names]
+    right.barh(names, trusted, color="#7fb58a", label="trusted")
+    right.barh(names, bad, color="#b3261e", label="trusted and wrong by over a frame")
+    right.set(xlim=(0, 1), xlabel="share of answers")
+    right.tick_params(axis="y", labelsize=7)
+    right.legend(fontsize=8, loc="lower right")
+    with atomic_write(path, "wb") as stream:
+        figure.savefig(stream, format="png", dpi=130)
+    plt.close(figure)

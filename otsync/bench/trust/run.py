@@ -1,0 +1,172 @@
+"""``otsync bench trust``: whether an answer that says "ok" is right, within the sigma that it says.
+
+Every class of :mod:`otsync.bench.trust.worlds` is synchronised by the defaults. An answer is wrong where it is off by
+more than a frame at either end of what two videos share; where there is no true answer, every trusted one is wrong.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...align.warping import DTW
+from ...progress import counted
+from ...sync.method import PAPER, Method
+from ...sync.verb import synchronize
+from ..record import Row, table, write_rows
+from ..sync_acceptance import WRONG, Check, at_least, at_most
+from ..sync_worlds import FPS
+from .diagram import draw, reliability
+from .worlds import CLASSES
+
+FIRST_SEED = 20_000
+"""Thresholds were chosen on seeds below 10,000 (see :mod:`otsync.types.trust`)."""
+
+METHODS: dict[str, Method | None] = {"default": None, "paper": PAPER, "DTW": Method("DTW", aligner=DTW())}
+
+SHORT = ("mid", "hard")
+"""Classes that other methods than the default are asked, too."""
+
+
+def run(
+    out: Path,
+    *,
+    seeds: int = 20,
+    first_seed: int = FIRST_SEED,
+    only: tuple[str, ...] = (),
+    promises: bool = False,
+) -> int:
+    """Measure, print tables, write CSV, JSON and the diagram; with ``promises`` 1 when one is not kept.
+
+    Args:
+        seeds: worlds a class. first_seed: where they begin. only: names of classes.
+    """
+    unknown = set(only) - set(CLASSES)
+    if unknown:
+        raise ValueError(f"--only: expected classes among {', '.join(CLASSES)}; found {', '.join(sorted(unknown))}.")
+    chosen = tuple(only) or tuple(CLASSES)
+    jobs = [(name, "default", first_seed + k) for name in chosen for k in range(seeds)]
+    if not only:
+        jobs += [(n, m, first_seed + k) for n in SHORT for m in METHODS if m != "default" for k in range(seeds)]
+    rows = list(measured(jobs))
+    about = {"seeds": seeds, "first_seed": first_seed}
+    write_rows(out, "trust", rows, about)
+    summary = summarise(rows)
+    write_rows(out, "trust_classes", summary, about)
+    print(table(summary), flush=True)
+    told = reliability([r for r in rows if r["method"] == "default"])
+    print("\n" + table(told), flush=True)
+    write_rows(out, "trust_reliability", told, about)
+    draw(rows, out / "trust.png")
+    checks = list(acceptance(rows))
+    print("\n" + table([c.row() for c in checks]), flush=True)
+    write_rows(out, "trust_acceptance", [c.row() for c in checks], about)
+    return 0 if all(c.met for c in checks) or not promises else 1
+
+
+def measured(jobs: Sequence[tuple[str, str, int]]) -> Iterator[Row]:
+    """A row a video; the jobs are done by a process a core."""
+    import multiprocessing
+
+    workers = len(os.sched_getaffinity(0))
+    with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+        for rows in counted(pool.map(one, jobs, chunksize=2), "trust", "world", total=len(jobs)):
+            yield from rows
+
+
+def one(job: tuple[str, str, int]) -> list[dict[str, Any]]:
+    """Answers and errors of one world, a row a video."""
+    name, method, seed = job
+    world = CLASSES[name](seed)
+    offsets = synchronize(list(world.tracks), method=METHODS[method], **world.options)
+    ends, worst = world.errors(offsets)
+    rows = []
+    for v in range(1, len(world.tracks)):
+        sigma = float(offsets.sigma[v]) * FPS
+        rows.append(
+            {
+                "class": name,
+                "method": method,
+                "seed": seed,
+                "video": v,
+                "error": float(ends[v - 1]),
+                "anywhere": float(worst[v - 1]),
+                "sigma": sigma,
+                "trusted": bool(offsets.status[v].ok and np.isfinite(offsets.seconds[v])),
+                "rate": float(offsets.rates[v]),
+                "breaks": "; ".join(f"video {u}: {b}" for u, bs in enumerate(offsets.breaks) for b in bs),
+                "flags": " ".join(f.code for f in offsets.flags[v]),
+            }
+        )
+    return rows
+
+
+def wrong(row: Row) -> bool:
+    """Trusted, and off by more than a frame; no answer is nan, and never wrong."""
+    return bool(row["trusted"] and not row["error"] <= WRONG)
+
+
+def summarise(rows: Sequence[Row]) -> list[Row]:
+    """By class and method."""
+    summary: list[Row] = []
+    for key in dict.fromkeys((r["class"], r["method"]) for r in rows):
+        own = [r for r in rows if (r["class"], r["method"]) == key]
+        ok = [r for r in own if r["trusted"]]
+        e, s = (np.array([r[k] for r in ok]) for k in ("error", "sigma"))
+        refused = np.array([r["error"] for r in own if not r["trusted"]])
+        refused = refused[np.isfinite(refused)]
+        summary.append(
+            {
+                "class": key[0],
+                "method": key[1],
+                "answers": len(own),
+                "trusted": len(ok) / len(own),
+                "wrong": sum(wrong(r) for r in own),
+                "median": float(np.median(e)) if len(e) else None,
+                "p90": float(np.quantile(e, 0.9)) if len(e) else None,
+                "worst": float(e.max()) if len(e) else None,
+                "1 sigma": float((e <= s).mean()) if len(e) else None,
+                "2 sigma": float((e <= 2 * s).mean()) if len(e) else None,
+                "median refused": float(np.median(refused)) if len(refused) else None,
+            }
+        )
+    return summary
+
+
+def acceptance(rows: Sequence[Row]) -> Iterator[Check]:
+    """What is promised of trusted answers by the default method."""
+    ours = [r for r in rows if r["method"] == "default"]
+    ok = [r for r in ours if r["trusted"]]
+    bad = [r for r in ok if wrong(r)]
+    yield at_most("confident and wrong, in 500 trusted", 500 * len(bad) / max(len(ok), 1), 1)
+    low, high = interval(len(bad), len(ok))
+    yield Check("  95 % interval of that share", high, f"{low:.2%} - {high:.2%} of {len(ok)}", True)
+    by_class = [sum(r["class"] == c for r in bad) for c in dict.fromkeys(r["class"] for r in rows)]
+    yield at_most("most in one class", max(by_class, default=0), 1)
+    for preset, share in (("mid", 0.97), ("hard", 0.8), ("brutal", 0.4)):
+        own = [r for r in ours if r["class"] == preset]
+        if own:
+            yield at_least(f"{preset}: share trusted", float(np.mean([r["trusted"] for r in own])), share)
+    for preset in ("mid", "hard"):
+        own = [r for r in ok if r["class"].startswith(preset)]
+        if own:
+            e, s = (np.array([r[k] for r in own]) for k in ("error", "sigma"))
+            one_sigma = float((e <= s).mean())
+            yield Check(f"{preset}: within one sigma", one_sigma, "0.63 - 0.75", 0.63 <= one_sigma <= 0.75)
+            yield at_least(f"{preset}: within two sigmas", float((e <= 2 * s).mean()), 0.93)
+
+
+def interval(bad: int, of: int) -> tuple[float, float]:
+    """95 % interval of a share (Clopper and Pearson 1934)."""
+    from scipy.stats import beta
+
+    if of == 0:
+        return 0.0, 1.0
+    low = float(beta.ppf(0.025, bad, of - bad + 1)) if bad else 0.0
+    return low, float(beta.ppf(0.975, bad + 1, of - bad)) if bad < of else 1.0

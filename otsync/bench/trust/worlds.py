@@ -1,0 +1,209 @@
+"""Worlds to be trusted or not: classes by name, each ``seed -> World``, with the error of any answer to them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from ...simulate import PRESETS, Truth, simulate
+from ...simulate.effects import (
+    ClockDrift,
+    Cut,
+    Drop,
+    Effect,
+    Freeze,
+    In,
+    LimbDrift,
+    Loop,
+    Repeats,
+    Reverse,
+    SharedDrift,
+    SlowMotion,
+    Transient,
+)
+from ...types import Offsets, TrackSet
+from ..sync_worlds import FPS, MOVING
+
+BESIDE = 8 / 30
+"""Seconds beside a break in which frames are not asked for: nobody can tell which of them is which."""
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """Videos, and what their frames show.
+
+    Args:
+        tracks: of every video. shown: per video (T,) seconds of the world; None where there is no true answer, so that
+            every answer that is trusted is wrong.
+        options: of :func:`otsync.synchronize`, beside its defaults.
+    """
+
+    tracks: tuple[TrackSet, ...]
+    shown: tuple[np.ndarray, ...] | None
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+    def errors(self, offsets: Offsets) -> tuple[np.ndarray, np.ndarray]:
+        """Per video but the first: error in frames at the beginning and the end of what it shares with the first, the
+        larger one; and the largest anywhere. Infinite where there is no true answer, nan without an answer.
+        """
+        n = len(self.tracks)
+        ends, worst = np.full(n - 1, np.nan), np.full(n - 1, np.nan)
+        for v in range(1, n):
+            if not np.isfinite(offsets.seconds[v]) or offsets.component[v] != offsets.component[0]:
+                continue
+            if self.shown is None:
+                ends[v - 1] = worst[v - 1] = np.inf
+                continue
+            first, own = self.shown[0], self.shown[v]
+            found = offsets.times(v, self.tracks[v].times)
+            # what the reference showed when its clock, breaks undone, said so
+            clock = offsets.times(0, self.tracks[0].times)
+            known = np.isfinite(clock)
+            order = np.argsort(clock[known], kind="stable")
+            true = np.interp(found, clock[known][order], first[known][order], left=np.nan, right=np.nan)
+            asked = np.isfinite(found) & np.isfinite(true) & steady(own, self.tracks[v].times)
+            asked &= ~near(found, clock, ~steady(first, self.tracks[0].times))
+            if not asked.any():
+                ends[v - 1] = worst[v - 1] = np.inf  # nothing that is claimed to be common is
+                continue
+            error = np.abs(true - own)[asked] * FPS
+            ends[v - 1], worst[v - 1] = max(error[0], error[-1]), error.max()
+        return ends, worst
+
+
+def steady(shown: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """(T,) frames around which a video's time runs on: what it shows beside what its clock says hardly changes."""
+    late = shown - times
+    low, high = np.searchsorted(times, times - BESIDE), np.searchsorted(times, times + BESIDE, side="right")
+    return np.array([np.ptp(late[i:j]) < 1.5 / FPS for i, j in zip(low, high, strict=True)])
+
+
+def near(found: np.ndarray, clock: np.ndarray, doubtful: np.ndarray) -> np.ndarray:
+    """Which of the moments ``found`` lie where the reference's frames are doubtful."""
+    if not doubtful.any():
+        return np.zeros(len(found), bool)
+    index = np.clip(np.searchsorted(clock, found), 0, len(clock) - 1)
+    return doubtful[index]
+
+
+def drawn(
+    seed: int,
+    *,
+    motion: str | None = None,
+    classes: Sequence[str] = MOVING,
+    preset: str = "mid",
+    videos: int = 2,
+    frames: Any = 150,
+    first: tuple[Effect, ...] = (),
+    last: tuple[Effect, ...] = (),
+    rates: Sequence[float] | None = None,
+    within: float = 40.0,
+    alike: bool = False,
+    tracks: int | None = None,
+) -> tuple[tuple[TrackSet, ...], Truth]:
+    """A world of a class drawn from the seed; effects ``first`` go before the preset's, ``last`` behind them."""
+    rng = np.random.default_rng([seed, 901])
+    level = PRESETS[preset]
+    if alike and level.features is not None:
+        level = replace(level, features=replace(level.features, person=0.0))
+    late = [0.0, *(rng.uniform(-within, within, videos - 1) / FPS)]
+    sets, truth = simulate(
+        classes[int(rng.integers(len(classes)))] if motion is None else motion,
+        preset=level,
+        videos=videos,
+        frames=frames,
+        offsets=late,
+        tracks=tracks,
+        rates=rates,
+        effects=(*first, *level.effects, *last),
+        seed=int(rng.integers(2**31)),
+    )
+    return tuple(sets), truth
+
+
+def plain(seed: int, **options: Any) -> World:
+    tracks, truth = drawn(seed, **options)
+    return World(tracks, truth.shown)
+
+
+def untrue(seed: int, **options: Any) -> World:
+    """A world whose videos share no time."""
+    tracks, _ = drawn(seed, **options)
+    return World(tracks, None)
+
+
+def rated(seed: int, *, rate: float, frames: int, preset: str = "mid") -> World:
+    """One video's clock runs by ``rate``, up or down, and nobody says so."""
+    up = np.random.default_rng([seed, 902]).choice([1 + rate, 1 / (1 + rate)])
+    return plain(seed, rates=[1.0, float(up)], frames=frames, preset=preset)
+
+
+def performers(seed: int, *, motion: str, sees: Sequence[Sequence[int]]) -> World:
+    """Like performers: video v sees those of ``sees[v]`` alone."""
+    tracks, truth = drawn(seed, motion=motion, videos=len(sees), alike=True, within=15)
+    each = (max(int(s.object.max()) for s in truth.surfaces) + 1) // 2
+    chosen = []
+    for t, surface, who in zip(tracks, truth.surfaces, sees, strict=True):
+        mine = np.isin(surface.object // each, who) & (surface.object >= 0)
+        chosen.append(t.take(np.flatnonzero(mine)))
+    return World(tuple(chosen), truth.shown)
+
+
+def takes(seed: int, freedom: float = 0.03) -> World:
+    """Two takes of one choreography at one place: nobody moves twice alike to better than a tenth of a second."""
+    return untrue(seed, first=(In(1, ClockDrift(0.1, correlation=1.0)), In(1, LimbDrift(freedom, correlation=0.8))))
+
+
+def strangers(seed: int) -> World:
+    """Two scenes that have nothing in common."""
+    (a, _), _ = drawn(seed)
+    (_, b), _ = drawn(seed + 100_003)
+    return World((a, b), None)
+
+
+CLASSES: dict[str, Callable[[int], World]] = {
+    "mid": partial(plain, preset="mid"),
+    "hard": partial(plain, preset="hard"),
+    "brutal": partial(plain, preset="brutal"),
+    "mid, four videos": partial(plain, preset="mid", videos=4),
+    "hard, four videos": partial(plain, preset="hard", videos=4),
+    "few tracks": partial(plain, preset="hard", tracks=24),
+    "like people": partial(plain, preset="hard", classes=("basketball", "football")),
+    "short clips": partial(plain, preset="mid", frames=75, within=20),
+    "canon, one each": partial(performers, motion="canon", sees=((0,), (1,))),
+    "canon, one sees both": partial(performers, motion="canon", sees=((0,), (0, 1))),
+    "canon, two and two": partial(performers, motion="canon", sees=((0,), (0,), (1,), (1,))),
+    "unison, one each": partial(performers, motion="unison", sees=((0,), (1,))),
+    "two takes": takes,
+    "two scenes": strangers,
+    "static": partial(untrue, motion="static"),
+    "static, trackers settle": partial(untrue, motion="static", last=(Transient(0.2),)),
+    "static, one drift for all": partial(untrue, motion="static", last=(SharedDrift(0.2, seed=5),)),
+    "one drift for all": partial(plain, preset="mid", last=(SharedDrift(0.05, seed=5),)),
+    "freeze of 15": partial(plain, first=(In(1, Freeze(15)),)),
+    "freeze of 30": partial(plain, first=(In(1, Freeze(30)),)),
+    "freeze of 30, four videos": partial(plain, videos=4, first=(In(2, Freeze(30)),)),
+    "freeze that catches up": partial(plain, first=(In(1, Freeze(30, catches_up=True)),)),
+    "freeze of the first": partial(plain, first=(In(0, Freeze(20)),)),
+    "ten frames dropped": partial(plain, first=(In(1, Drop(10 / 30)),)),
+    "a second missing": partial(plain, first=(In(1, Drop(1.0)),), within=15),
+    "halves exchanged": partial(plain, first=(In(1, Cut()),), within=15),
+    "24 as 30": partial(plain, first=(In(1, Repeats(24.0)),)),
+    "looped file": partial(untrue, first=(In(1, Loop()),)),
+    "played backwards": partial(untrue, first=(In(1, Reverse()),)),
+    "slow motion": partial(plain, first=(In(1, SlowMotion(2.0)),)),
+    "rate 1 %, 10 s": partial(rated, rate=0.01, frames=300),
+    "rate 1 %, 20 s": partial(rated, rate=0.01, frames=600),
+    "rate .1 %, 20 s": partial(rated, rate=0.001, frames=600),
+    "rate .1 %, 30 s": partial(rated, rate=0.001, frames=900),
+    "rate 1 %, 5 s": partial(rated, rate=0.01, frames=150),
+    "exact loop": partial(plain, motion="loop"),
+    "carousel": partial(plain, motion="carousel", alike=True),
+    "belt": partial(plain, motion="belt", alike=True),
+    "flock": partial(plain, motion="flock", alike=True),
+}
+"""Classes by name: those of the benchmark first, then those that mislead."""

@@ -1,0 +1,205 @@
+"""Breaks of clocks in a set of videos: which video froze, lost frames or was cut, where, and by how much.
+
+A pair says that its offset jumps, not whose clock it is. A video that stands still where the other moves is the one that
+froze; among three and more the video that most pairs name is the one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..clocks.common import strongest
+from ..clocks.splines import TrackSplines
+from ..refine.gauss_newton import fit_clock
+from ..refine.splines import SplineRefine
+from ..types import Break, Clock, TrackSet, mended_times
+from .verdict import Answer
+
+LIMIT = 200
+"""Matches that a break is located by."""
+
+WINDOW = 14 / 30
+"""Half window, s, of the detrending in the fits of the parts."""
+
+MARGIN = 3 / 30
+"""Seconds beside a break that the fits of its parts leave out: curves are smoothed across it."""
+
+STILL = 0.35
+"""A video stands still where its speed is below this share of what it is around, and moves around."""
+
+AROUND = 20 / 30
+"""Seconds on either side of a pause that tell the usual speed."""
+
+SAME_MOMENT, SAME_JUMP = 0.5, 0.1
+"""Seconds within which two pairs tell of the same break."""
+
+MOVING, RESTING = 0.6, 0.4
+"""Votes of a pair whose break could be either's: frames are lost more often than videos go back in time."""
+
+SNAP = 0.3
+"""Frames within which the length of a freeze is a whole number of frames."""
+
+MOST = 4
+"""Breaks that are mended, at most."""
+
+
+@dataclass(frozen=True)
+class Suspect:
+    """One reading of a pair's jump: this video's clock broke. votes: how much the pair believes it."""
+
+    video: int
+    found: Break
+    votes: float
+
+
+def mended(tracks: TrackSet, breaks: Sequence[Break]) -> TrackSet:
+    """The tracks on the clock that the video had before its first break; frames that tell no time are left out."""
+    if not breaks:
+        return tracks
+    shown, tells = mended_times(tracks.times, breaks)
+    keep = np.flatnonzero(tells)
+    keep = keep[np.argsort(shown[keep], kind="stable")]
+    keep = keep[np.concatenate([[True], np.diff(shown[keep]) > 1e-6])]
+    fields = ("xyz", "visible", "uv", "sigma")
+    taken = {f: v[:, keep] for f in fields if (v := getattr(tracks, f)) is not None}
+    camera = tracks.camera
+    if camera is not None and camera.w2c.ndim == 3:
+        camera = replace(camera, w2c=camera.w2c[keep])
+    return replace(tracks, **taken, timestamps=shown[keep], fps=None, camera=camera)
+
+
+def suspects(answer: Answer, a: TrackSet, b: TrackSet, fps: Sequence[float]) -> list[Suspect]:
+    """Both readings of every jump of a pair's offset, located to a frame and measured below it."""
+    matches = strongest(answer.matches, LIMIT)
+    curves = SplineRefine().splines(a, b, matches)
+    found = []
+    parts = answer.scanned.parts
+    for k in range(len(parts) - 1):
+        begin = parts[k][0] if k else -math.inf
+        end = parts[k + 2][0] if k + 2 < len(parts) else math.inf
+        found += _readings(answer, curves, parts[k][1], parts[k + 1], (begin, end), fps)
+    return found
+
+
+def _readings(
+    answer: Answer,
+    curves: tuple[TrackSplines, TrackSplines],
+    before: float,
+    after: np.ndarray,
+    limits: tuple[float, float],
+    fps: Sequence[float],
+) -> list[Suspect]:
+    a, b = curves
+    when, later = float(after[0]), float(after[1])
+    low, high = limits
+    first, second = float(before), later
+    for margin in (2 * AROUND / 3, MARGIN):
+        one = fit_clock(a.within(low, when - margin), b, Clock(first), WINDOW)
+        gap = max(second - first, 0.0)
+        two = fit_clock(a.within(when + gap * (margin == MARGIN) + margin, high), b, Clock(second), WINDOW)
+        first = one.clock.offset if one is not None and abs(one.clock.offset - first) < AROUND else first
+        second = two.clock.offset if two is not None and abs(two.clock.offset - second) < AROUND else second
+        when = _moment(a, b, first, second, when, limits)
+    jump = second - first
+    sigma = math.hypot(*(math.sqrt(float(f.covariance[0, 0])) if f is not None else math.nan for f in (one, two)))
+    i, j = answer.pair
+    at_b = when - first
+    if jump > 0:  # a's frames from `when` on for `jump` s have no partner: a stood still, or b lost them
+        froze, lost = (i, when, a), (j, at_b)
+    else:
+        froze, lost = (j, at_b, b), (i, when)
+    video, start, own = froze
+    length = abs(jump)
+    frame = 1 / fps[video]
+    if abs(length / frame - round(length / frame)) < SNAP:
+        length = round(length / frame) * frame
+    stands = stood_still(own, start, abs(jump))
+    there = own_extent(b if jump < 0 else a)
+    fits = start + abs(jump) < there[1]
+    back = Break(start + length, -length, length, sigma) if stands else Break(start, -abs(jump), 0.0, sigma)
+    gone = Break(lost[1], abs(jump), 0.0, sigma)
+    if stands:
+        votes = (1.0, 0.0)
+    else:
+        votes = (RESTING, MOVING) if fits else (MOVING, RESTING)
+    return [Suspect(video, back, votes[0]), Suspect(lost[0], gone, votes[1])]
+
+
+def own_extent(curves: TrackSplines) -> tuple[float, float]:
+    return float(curves.times[0]), float(curves.times[-1])
+
+
+def _moment(
+    a: TrackSplines, b: TrackSplines, first: float, second: float, near: float, limits: tuple[float, float]
+) -> float:
+    """The time of a's clock up to which the first offset suits the velocities better, the second one behind it."""
+    reach = AROUND + abs(second - first)
+    t = a.times[(a.times > max(limits[0], near - reach)) & (a.times < min(limits[1], near + reach))]
+    if len(t) < 3:
+        return near
+    scores = [_suits(a, b, offset, t) for offset in (first, second)]
+    gap = int(round(max(second - first, 0.0) / a.frame))
+    one = np.concatenate([[0.0], np.cumsum(scores[0])])
+    two = np.concatenate([np.cumsum(scores[1][::-1])[::-1], [0.0]])
+    total = one + two[np.minimum(np.arange(len(t) + 1) + gap, len(t))]
+    best = int(np.argmax(total))
+    return float(t[best] if best < len(t) else t[-1] + a.frame)
+
+
+def _suits(a: TrackSplines, b: TrackSplines, offset: float, t: np.ndarray) -> np.ndarray:
+    """(S,) how well velocities agree at a's times ``t`` and an offset: log-likelihood against "unrelated", a match."""
+    seen = a.support(t) & b.support(t - offset)
+    u, v = a.velocity(t), b.velocity(t - offset)
+    power = np.where(seen, (u**2).sum(2) + (v**2).sum(2), 0.0)
+    left = np.where(seen, ((u - v) ** 2).sum(2), 0.0)
+    floor = 0.05 * float(power[seen].mean()) if seen.any() else 1.0
+    gain = np.where(seen, np.log((power + floor) / (left + floor)), 0.0)
+    return np.asarray(gain.sum(0) / np.maximum(seen.sum(0), 1))
+
+
+def stood_still(curves: TrackSplines, start: float, length: float) -> bool:
+    """Whether all tracks rest from ``start`` on for ``length`` s, and move before and behind."""
+    inner = min(0.25 * length, MARGIN)
+    during = _speed(curves, start + inner, start + length - inner)
+    around = [_speed(curves, start - AROUND, start - MARGIN), _speed(curves, start + length + MARGIN, start + length + AROUND)]
+    known = [s for s in around if math.isfinite(s)]
+    return bool(known) and math.isfinite(during) and during < STILL * float(np.mean(known))
+
+
+def _speed(curves: TrackSplines, begin: float, end: float) -> float:
+    """Median over tracks of the rms speed within a span; nan where nothing is seen."""
+    t = curves.times[(curves.times >= begin) & (curves.times <= end)]
+    if len(t) == 0:
+        return math.nan
+    seen = curves.support(t)
+    power = np.where(seen, (curves.velocity(t) ** 2).sum(2), 0.0).sum(1)
+    there = seen.any(1)
+    return float(np.sqrt(np.median(power[there] / seen.sum(1)[there]))) if there.any() else math.nan
+
+
+def culprit(found: Sequence[Suspect]) -> Suspect | None:
+    """The reading with most votes from all pairs, its jump the median of theirs."""
+    best, most = None, 0.0
+    for one in found:
+        same = [
+            s
+            for s in found
+            if s.video == one.video
+            and abs(s.found.at - one.found.at) < SAME_MOMENT
+            and abs(s.found.jump - one.found.jump) < SAME_JUMP
+        ]
+        votes = sum(s.votes for s in same)
+        if votes > most + 1e-9:
+            still = float(np.median([s.found.still for s in same]))
+            middle = Break(
+                float(np.median([s.found.at for s in same])),
+                float(np.median([s.found.jump for s in same])),
+                still,
+                float(np.median([s.found.sigma for s in same])) / math.sqrt(len(same)),
+            )
+            best, most = Suspect(one.video, middle, votes), votes
+    return best
