@@ -40,6 +40,9 @@ SAME_MOMENT, SAME_JUMP = 0.5, 0.1
 MOVING, RESTING = 0.6, 0.4
 """Votes of a pair whose break could be either's: frames are lost more often than videos go back in time."""
 
+SEARCH = 2.0
+"""Seconds around a break's coarse place in which it is looked for, at most, beside :data:`AROUND`."""
+
 SNAP = 0.3
 """Frames within which the length of a freeze is a whole number of frames."""
 
@@ -97,16 +100,19 @@ def _readings(
     when, later = float(after[0]), float(after[1])
     low, high = limits
     first, second = float(before), later
+    gap = 0.0
+    one = two = None
     for margin in (2 * AROUND / 3, MARGIN):
         one = fit_clock(a.within(low, when - margin), b, Clock(first), WINDOW)
-        gap = max(second - first, 0.0)
-        two = fit_clock(a.within(when + gap * (margin == MARGIN) + margin, high), b, Clock(second), WINDOW)
+        two = fit_clock(a.within(when + gap + margin, high), b, Clock(second), WINDOW)
         first = one.clock.offset if one is not None and abs(one.clock.offset - first) < AROUND else first
         second = two.clock.offset if two is not None and abs(two.clock.offset - second) < AROUND else second
-        when = _moment(a, b, first, second, when, limits)
+        when, gap = _moment(a, b, first, second, when, limits)
     jump = second - first
     sigma = math.hypot(*(math.sqrt(float(f.covariance[0, 0])) if f is not None else math.nan for f in (one, two)))
     i, j = answer.pair
+    if jump > 0 and gap == 0:  # a's frames run on, b's go back: its parts are in the other order
+        return [Suspect(j, Break(_turn(a, b, second, first), -jump, 0.0, sigma), 1.0)]
     at_b = when - first
     if jump > 0:  # a's frames from `when` on for `jump` s have no partner: a stood still, or b lost them
         froze, lost = (i, when, a), (j, at_b)
@@ -118,36 +124,56 @@ def _readings(
     if abs(length / frame - round(length / frame)) < SNAP:
         length = round(length / frame) * frame
     stands = stood_still(own, start, abs(jump))
-    there = own_extent(b if jump < 0 else a)
-    fits = start + abs(jump) < there[1]
     back = Break(start + length, -length, length, sigma) if stands else Break(start, -abs(jump), 0.0, sigma)
     gone = Break(lost[1], abs(jump), 0.0, sigma)
-    if stands:
-        votes = (1.0, 0.0)
-    else:
-        votes = (RESTING, MOVING) if fits else (MOVING, RESTING)
+    votes = (1.0, 0.0) if stands else (RESTING, MOVING)
     return [Suspect(video, back, votes[0]), Suspect(lost[0], gone, votes[1])]
-
-
-def own_extent(curves: TrackSplines) -> tuple[float, float]:
-    return float(curves.times[0]), float(curves.times[-1])
 
 
 def _moment(
     a: TrackSplines, b: TrackSplines, first: float, second: float, near: float, limits: tuple[float, float]
-) -> float:
-    """The time of a's clock up to which the first offset suits the velocities better, the second one behind it."""
-    reach = AROUND + abs(second - first)
+) -> tuple[float, float]:
+    """The time of a's clock up to which the first offset suits the velocities better, and how many seconds later the
+    second one begins to.
+    """
+    reach = AROUND + min(abs(second - first), SEARCH)
     t = a.times[(a.times > max(limits[0], near - reach)) & (a.times < min(limits[1], near + reach))]
     if len(t) < 3:
-        return near
-    scores = [_suits(a, b, offset, t) for offset in (first, second)]
-    gap = int(round(max(second - first, 0.0) / a.frame))
+        return near, max(second - first, 0.0)
+    scores = _above_neutral(*(_suits(a, b, offset, t) for offset in (first, second)))
     one = np.concatenate([[0.0], np.cumsum(scores[0])])
     two = np.concatenate([np.cumsum(scores[1][::-1])[::-1], [0.0]])
-    total = one + two[np.minimum(np.arange(len(t) + 1) + gap, len(t))]
-    best = int(np.argmax(total))
-    return float(t[best] if best < len(t) else t[-1] + a.frame)
+    found = {}
+    for gap in {0.0, max(second - first, 0.0)}:
+        total = one + two[np.minimum(np.arange(len(t) + 1) + round(gap / a.frame), len(t))]
+        best = int(np.argmax(total))
+        found[gap] = float(total[best]), float(t[best] if best < len(t) else t[-1] + a.frame)
+    gap = max(found)
+    # frames within the gap that suit the second offset all the same add half of a typical score each
+    typical = 2 * float(np.median(np.max(scores, 0)))
+    if gap > 0 and found[0.0][0] > found[gap][0] + 0.25 * max(typical, 0.0) * min(gap / a.frame, 15):
+        gap = 0.0
+    return found[gap][1], gap
+
+
+def _turn(a: TrackSplines, b: TrackSplines, first: float, second: float) -> float:
+    """The time of b's own clock from which on it has the second offset, where its parts are not in a's order.
+
+    Frames that neither offset brings into a's clip count for neither.
+    """
+    t = b.times
+    scores = _above_neutral(*(_suits(b, a, -offset, t) for offset in (first, second)))
+    one = np.concatenate([[0.0], np.cumsum(scores[0])])
+    two = np.concatenate([np.cumsum(scores[1][::-1])[::-1], [0.0]])
+    best = int(np.argmax(one + two))
+    return float(t[best] if best < len(t) else t[-1] + b.frame)
+
+
+def _above_neutral(*scores: np.ndarray) -> list[np.ndarray]:
+    """Scores less half of what frames typically have that suit one of them; 0 stays where nothing is seen."""
+    best = np.max(scores, 0)
+    level = 0.5 * float(np.median(best[best != 0])) if (best != 0).any() else 0.0
+    return [np.where(s != 0, s - level, 0.0) for s in scores]
 
 
 def _suits(a: TrackSplines, b: TrackSplines, offset: float, t: np.ndarray) -> np.ndarray:
@@ -203,3 +229,15 @@ def culprit(found: Sequence[Suspect]) -> Suspect | None:
             )
             best, most = Suspect(one.video, middle, votes), votes
     return best
+
+
+def remeasured(answer: Answer, a: TrackSet, b: TrackSet, moment: float) -> tuple[float, float]:
+    """What is left of a jump after it was mended, s, and one sigma of it; ``moment``: of the break, on a's clock."""
+    curves = SplineRefine().splines(a, b, strongest(answer.matches, LIMIT))
+    start = Clock(answer.refined.offset, answer.refined.rate)
+    one = fit_clock(curves[0].within(-math.inf, moment - MARGIN), curves[1], start, WINDOW)
+    two = fit_clock(curves[0].within(moment + MARGIN, math.inf), curves[1], start, WINDOW)
+    if one is None or two is None:
+        return 0.0, math.nan
+    sigma = math.hypot(*(math.sqrt(float(f.covariance[0, 0])) for f in (one, two)))
+    return two.clock.offset - one.clock.offset, sigma

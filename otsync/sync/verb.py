@@ -24,7 +24,7 @@ from ..match.unbalanced import UnbalancedOT
 from ..refine.slot import Rate, Refiner, RefinerLike
 from ..refine.splines import SplineRefine
 from ..types import Alignment, Break, Clock, Matches, Offsets, TrackSet
-from .breaks import MOST, culprit, mended, suspects
+from .breaks import MOST, culprit, mended, remeasured, suspects
 from .graph import Graph, Pair
 from .method import Method, with_costs
 from .own_frames import Frames, refuse_common, solver_from, synchronize_own
@@ -143,17 +143,56 @@ def mend_clocks(
         if one is None:
             break
         v = one.video
-        better = mended(tracks[v], (one.found,))
+        tried = with_break(jobs, tracks, v, one.found, verdict, map)
+        if tried is None:
+            break
+        jobs, tracks[v], fresh, exact = tried
+        earlier = broken.get(v, ())
+        broken[v] = (*earlier, _on_own_clock(exact, earlier))
+        verdict = judged([fresh.get(a.pair, a) for a in verdict.answers])
+    return jobs, verdict, broken
+
+
+def with_break(
+    jobs: list[Job], tracks: Sequence[TrackSet], v: int, found: Break, verdict: Verdict, map: MapLike
+) -> tuple[list[Job], TrackSet, dict[Pair, Answer], Break] | None:
+    """The pairs of video v done anew with its clock mended, twice: what is left of the jump is measured in between.
+
+    None where that adds nothing to the evidence.
+    """
+    before = _evidence(a for a in verdict.answers if v in a.pair)
+    best = None
+    for _ in range(2):
+        better = mended(tracks[v], (found,))
         sets = [better if k == v else t for k, t in enumerate(tracks)]
         again = [dataclasses.replace(j, a=sets[j.pair[0]], b=sets[j.pair[1]]) for j in jobs]
         fresh = {a.pair: a for a in map(run, [j for j in again if v in j.pair])}
-        if _evidence(fresh.values()) <= _evidence(a for a in verdict.answers if a.pair in fresh):
+        if _evidence(fresh.values()) <= before:
             break
-        earlier = broken.get(v, ())
-        broken[v] = (*earlier, _on_own_clock(one.found, earlier))
-        tracks[v], jobs = better, again
-        verdict = judged([fresh.get(a.pair, a) for a in verdict.answers])
-    return jobs, verdict, broken
+        best = again, better, fresh, found
+        left = remeasured_jump(fresh, sets, v, found)
+        if left is None or found.still > 0:  # a freeze lasts whole frames
+            break
+        found = left
+    return best
+
+
+def remeasured_jump(fresh: Mapping[Pair, Answer], tracks: Sequence[TrackSet], v: int, found: Break) -> Break | None:
+    """The break with what all pairs say is left of its jump; None where none can."""
+    told, sigmas = [], []
+    for (i, j), answer in fresh.items():
+        if not np.isfinite(answer.refined.offset) or not answer.sound:
+            continue
+        clock = Clock(answer.refined.offset, answer.refined.rate)
+        shown = found.at + found.jump
+        left, sigma = remeasured(answer, tracks[i], tracks[j], shown if v == i else clock.world(shown))
+        if np.isfinite(sigma):
+            told.append(left if v == j else -left)
+            sigmas.append(sigma)
+    if not told:
+        return None
+    sigma = float(np.median(sigmas)) / np.sqrt(len(sigmas))
+    return dataclasses.replace(found, jump=found.jump + float(np.median(told)), sigma=sigma)
 
 
 def _evidence(answers: Iterable[Answer]) -> float:

@@ -383,7 +383,10 @@ def _flags(
     vouching = [ok for a, ok in own if a.refined.status.ok]
     contradicted = len(vouching) > 0 and sum(vouching) <= len(vouching) / 2
     mismatch = sum(Status.RATE_MISMATCH in a.refined.flags for a, _ in own) > len(own) / 2
+    broken = sum(Status.BROKEN_CLOCK in a.refined.flags for a, _ in own) >= max(len(own) / 2, 1)
     flags: list[Status] = []
+    if broken:
+        flags.append(Status.BROKEN_CLOCK)
     if contradicted:
         flags.append(Status.INCONSISTENT)
     if mismatch:

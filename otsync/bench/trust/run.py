@@ -56,9 +56,9 @@ def run(
         jobs += [(n, m, first_seed + k) for n in SHORT for m in METHODS if m != "default" for k in range(seeds)]
     rows = list(measured(jobs))
     about = {"seeds": seeds, "first_seed": first_seed}
-    write_rows(out, "trust", rows, about)
+    write_rows(out, "trust", [written(r) for r in rows], about)
     summary = summarise(rows)
-    write_rows(out, "trust_classes", summary, about)
+    write_rows(out, "trust_classes", [written(r) for r in summary], about)
     print(table(summary), flush=True)
     told = reliability([r for r in rows if r["method"] == "default"])
     print("\n" + table(told), flush=True)
@@ -105,6 +105,17 @@ def one(job: tuple[str, str, int]) -> list[dict[str, Any]]:
             }
         )
     return rows
+
+
+def written(row: Row) -> Row:
+    """The row for a file: JSON knows neither nan (null) nor infinity ("inf")."""
+
+    def plain(x: Any) -> Any:
+        if isinstance(x, float) and not np.isfinite(x):
+            return None if np.isnan(x) else "inf"
+        return x
+
+    return {k: plain(v) for k, v in row.items()}
 
 
 def wrong(row: Row) -> bool:
