@@ -18,8 +18,29 @@ PRICE, SHARE = 7.0, 0.08
 """Nats a match, and share of the whole evidence, that a jump must gain to be told. Clean pairs (mid to brutal) gain up to
 7, freezes of 15 frames and ten lost frames 10 to 25."""
 
-DOUBT, DOUBT_SHARE = 3.5, 0.12
-"""The same for a jump that only makes the answer doubtful."""
+LOW_PRICE, LOW_SHARE = 3.5, 0.05
+"""The same where part of the overlap is not explained by the best offset."""
+
+UNEXPLAINED, UNEXPLAINED_LONG = 0.5, 0.4
+"""Share of its motion that a window of 20 frames, and two in a row, must have in common at the best offset, for the best
+quarter of the matches. The least window of clean pairs has .73 and more (mid), .49 (hard, like people .67); of freezes
+and a missing second .43 and less; of ten lost frames .06 to .9."""
+
+ODD, UNUSUAL, LEAST_MISSING = 3.0, 4.5, 0.15
+"""How many times more than usual may be missing in two windows in a row: clean pairs 1.5 (mid), 4.3 (hard), 4.2 (brutal)
+at most, of ten lost frames half have 4.6 to 7; and what counts as missing at all."""
+
+MOVES = 6.0
+"""Variance of a match within a window, in units of the noise floor, above which it moves there."""
+
+BEST_QUARTER, LEAST_MOVING = 0.75, 5
+
+BEYOND = 0.35
+"""Share of a usual window's evidence that windows must have which lie beyond the overlap at the best offset: some offset
+suits them by chance. Clean pairs have up to .4 there, parts that are real .5 and more."""
+
+AS_A_RATE = 2.0
+"""Nats a match that parts must add beyond what an even change of the offset adds."""
 
 SLOPES = 0.05
 """Largest relative difference of rates that is weighed against jumps."""
@@ -96,23 +117,82 @@ def find_breaks(
     if windows < 4 or not len(lags):
         return NONE, 0.0, False
     curves = local_curves(pair, lags, floor, weight)
-    straight = float(curves.sum(0).max())
-    price = max(PRICE, SHARE * straight)
-    path, gain = _parts(curves, straight, price, pair.fps)
-    edges = np.flatnonzero(np.diff(path)) + 1
-    if not len(edges) or gain < price * len(edges):
-        low = max(DOUBT, DOUBT_SHARE * straight)
-        path, less = _parts(curves, straight, low, pair.fps)
-        jumps = int((np.diff(path) != 0).sum())
-        doubtful = jumps > 0 and less >= low * jumps and less > _rate_gain(curves, straight) + low
-        return NONE, max(gain, less, 0.0), doubtful
-    if gain <= _rate_gain(curves, straight) + price:
-        return NONE, gain, False  # a rate explains it as well, with one number
+    best = int(np.argmax(curves.sum(0)))
+    straight = float(curves[:, best].sum())
+    curves = without_chance(curves, best, pair, int(lags[best]), step)
+    least, least_long, ratio = explained(pair, int(lags[best]), floor, step)
+    doubtful = least_long < UNEXPLAINED_LONG or ratio > UNUSUAL
+    prices = [max(PRICE, SHARE * straight)]
+    if least < UNEXPLAINED or ratio > ODD:
+        prices.append(max(LOW_PRICE, LOW_SHARE * straight))
+    for price in prices:
+        path, gain = _parts(curves, straight, price, pair.fps)
+        edges = np.flatnonzero(np.diff(path)) + 1
+        if len(edges) and gain >= price * len(edges):
+            break
+    else:
+        return NONE, max(gain, 0.0), doubtful
+    if gain <= _rate_gain(curves, straight) + AS_A_RATE:
+        return NONE, gain, doubtful  # a rate explains it as well, with one number
     spans = np.split(np.arange(windows), edges)
     offsets = [float(pair.seconds(vertex(lags, c := curves[p].sum(0), int(np.argmax(c))))) for p in spans]
     begin = pair.start + (np.concatenate([[0], edges]) - 0.5) * step / pair.fps
     begin[0] = pair.start
     return np.stack([begin, offsets], 1), gain, False
+
+
+def explained(pair: CommonClock, lag: int, floor: float, step: int) -> tuple[float, float, float]:
+    """How much of the motion within a window both videos have in common at a lag, in the least window and the least two
+    in a row: 1 - Var(a - b) / (Var a + Var b) of the best quarter of the matches that move there; 1 where none does.
+    And what is missing to 1 in the least two in a row, as a multiple of what is usually missing.
+    """
+    first, end = max(0, lag), min(pair.a.shape[1], pair.b.shape[1] + lag)
+    shares = []
+    for begin in range(first, end - 2 * step + 1, step):
+        x, y = pair.a[:, begin : begin + 2 * step], pair.b[:, begin - lag : begin - lag + 2 * step]
+        seen = np.isfinite(x[..., 0]) & np.isfinite(y[..., 0])
+        use = seen.sum(1) >= LEAST_WINDOW * pair.fps
+        if use.sum() < LEAST_MOVING:
+            continue
+        x, y, seen = x[use], y[use], seen[use]
+        power = _variance(x, seen) + _variance(y, seen)
+        moves = power > MOVES * floor
+        if moves.sum() >= LEAST_MOVING:
+            common = 1 - _variance(x - y, seen)[moves] / power[moves]
+            shares.append(float(np.quantile(common, BEST_QUARTER)))
+        else:
+            shares.append(1.0)
+    if not shares:
+        return 1.0, 1.0, 1.0
+    pairs = np.maximum(shares[:-1], shares[1:]) if len(shares) > 1 else np.array(shares)
+    missing = 1 - float(pairs.min())
+    ratio = missing / max(1 - float(np.median(shares)), 1e-3) if missing > LEAST_MISSING else 1.0
+    return min(shares), float(pairs.min()), ratio
+
+
+def _variance(x: Float[np.ndarray, "M T 3"], seen: np.ndarray) -> Float[np.ndarray, " M"]:
+    """Over the samples that are seen, all three coordinates together."""
+    filled, count = np.where(seen[..., None], x, 0.0), seen.sum(1)
+    mean = filled.sum(1) / count[:, None]
+    return np.asarray((np.where(seen[..., None], x - mean[:, None], 0.0) ** 2).sum((1, 2)) / count)
+
+
+def without_chance(
+    curves: Float[np.ndarray, "W K"], best: int, pair: CommonClock, lag: int, step: int
+) -> Float[np.ndarray, "W K"]:
+    """The curves of windows beyond the overlap at the best lag, less what some offset has by chance."""
+    W = len(curves)
+    low, high = (np.arange(W) - 1) * step, (np.arange(W) + 1) * step
+    begin, end = max(0, lag), min(pair.a.shape[1], pair.b.shape[1] + lag)
+    common = np.minimum(high, end) - np.maximum(low, begin)
+    beyond = common < LEAST_WINDOW * pair.fps
+    if beyond.all() or not beyond.any():
+        return curves
+    usual = BEYOND * float(curves[~beyond, best].mean())
+    curves = curves.copy()
+    others = np.arange(curves.shape[1]) != best
+    curves[np.ix_(beyond, others)] -= usual
+    return curves
 
 
 def _parts(

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from ..compute.indices import evenly
 from ..costs.linear import binary_scale
 from ..costs.places import apart
 from ..types import Alignment, Matches, Status, TrackSet, in_order
 from .likelihood import LikelihoodScan
+from .rivals import rival
 from .slot import Aligner
 
 AGREES = 1.5 / 30
@@ -31,8 +32,19 @@ more of the one and less of the other is how a calibration or a tracker drifts, 
 m over a static scene: share .96 to .997, size .02 to .1; the moving classes, all presets: a share of .8 is reached with
 sizes of .6 and more (a box that flies), sizes below .3 with shares of .1 to .55."""
 
+RIVAL = 1.03
+"""Distance of all tracks at another time, over that at the answer, below which that time is as good: carousels .5 to 1.1,
+exact loops 1; presets mid 1.8 and more, hard 1.2, like people 1.2, brutal .9 to 1.25 (12 pairs each)."""
+
 LOOKS, ENOUGH = 30, 6
 """Moments at which the common motion is taken, and tracks that must be seen at one."""
+
+MOMENTS, STEP = 200, 5 / 30
+"""Moments at which velocities are compared after the common motion is taken out, and half the seconds they are over."""
+
+CORRELATED, RATHER_LITTLE = 0.1, 0.45
+"""Correlation of what is left, and size of what was taken out, below which only a drift is shared. Static scenes with
+drifts of .2 m have at most .03 and .36; what moves has .2 and more (hard), or moves by more (brutal)."""
 
 
 def vouch(alignment: Alignment, a: TrackSet, b: TrackSet, matches: Matches, aligner: Aligner) -> Alignment:
@@ -54,38 +66,89 @@ def vouch(alignment: Alignment, a: TrackSet, b: TrackSet, matches: Matches, alig
             flags.append(Status.DISAGREE)
     if all(drifts(tracks, index) for tracks, index in zip((a, b), matches.pairs.T, strict=True)):
         flags.append(Status.STATIC)
+    elif only_drift(a, b, matches, alignment.offset):
+        flags.append(Status.STATIC)
     if a.frame is not None and a.frame == b.frame:
         distance = apart(a, b, matches, alignment.offset)
         if distance > APART:
             flags.append(Status.AMBIGUOUS)
-        alignment = replace(alignment, stats=alignment.stats | {"apart": distance})
+        told = {"apart": distance}
+        if a.features is not None and b.features is not None:
+            told["rival"] = rival(a, b, alignment.offset)
+            if told["rival"] < RIVAL:
+                flags.append(Status.AMBIGUOUS)
+        alignment = replace(alignment, stats=alignment.stats | told)
     return replace(alignment, flags=in_order(flags))
 
 
 def drifts(tracks: TrackSet, index: Int[np.ndarray, " M"]) -> bool:
     """Whether the tracks move as one rigid body, all of them, and by little: evidence of a drift, not of a time."""
-    x = tracks.positions()[np.unique(index)]
-    x = x[:, evenly(x.shape[1], LOOKS)]
+    taken = tracks.positions()[np.unique(index)]
+    body = as_one_body(taken[:, evenly(taken.shape[1], LOOKS)])
+    return body is not None and body.share > AS_ONE and body.size < LITTLE
+
+
+def only_drift(a: TrackSet, b: TrackSet, matches: Matches, offset: float) -> bool:
+    """Whether two videos have nothing in common but a little motion that all tracks of each share.
+
+    That motion is taken out of both; what is left must correlate at the answer, or nothing but a drift was aligned.
+    """
+    times = a.times[(a.times >= offset + b.times[0]) & (a.times <= offset + b.times[-1])]
+    if len(times) < 3:
+        return False
+    times = times[evenly(len(times), MOMENTS)]
+    left, seen = [], []
+    for tracks, column, t in ((a, 0, times), (b, 1, times - offset)):
+        ends = [np.abs(tracks.times[:, None] - (t + s * STEP)[None]).argmin(0) for s in (-1, 1)]
+        body = as_one_body(tracks.positions()[matches.pairs[:, column]][:, np.concatenate(ends)])
+        if body is None or body.size > RATHER_LITTLE:
+            return False
+        n = len(t)
+        step = body.left[:, n:] - body.left[:, :n]
+        known = np.isfinite(step[..., 0])
+        left.append(np.where(known[..., None], step, 0.0))
+        seen.append(known)
+    both = (seen[0] & seen[1])[..., None]
+    u, v = left[0] * both, left[1] * both
+    power = float(np.sqrt((u**2).sum() * (v**2).sum()))
+    return not power > 0 or float((u * v).sum()) < CORRELATED * power
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """Tracks taken for one rigid body.
+
+    Args:
+        left: (M,S,3) what its motion does not explain, in a unit of a power of two; nan where not seen.
+        share: of the motion that it explains. size: rms of what it explains, in units of the extent.
+    """
+
+    left: Float[np.ndarray, "M S 3"]
+    share: float
+    size: float
+
+
+def as_one_body(x: Float[np.ndarray, "M S 3"]) -> Body | None:
+    """The rigid motion that all tracks share, moment by moment; None where too few are seen."""
     seen = np.isfinite(x[..., 0])
-    use = seen.sum(0) >= ENOUGH
-    if not use.any():
-        return False
-    x, seen = x[:, use], seen[:, use]
-    there = seen.any(1)
-    x, seen = x[there], seen[there]
-    filled = np.where(seen[..., None], x, 0.0)
+    use = seen & (seen.sum(0) >= ENOUGH)
+    there = use.any(1)
+    if there.sum() < ENOUGH:
+        return None
+    filled = np.where(use[..., None], x, 0.0)
     filled = filled / binary_scale(filled)  # squares of lengths overflow in some units
-    rest = filled.sum(1) / seen.sum(1)[:, None]
-    extent = float(np.sqrt(((rest - rest.mean(0)) ** 2).sum(1).mean()))
+    rest = filled.sum(1) / np.maximum(use.sum(1), 1)[:, None]
+    extent = float(np.sqrt(((rest[there] - rest[there].mean(0)) ** 2).sum(1).mean()))
     if not extent > 0:
-        return False
-    weight = seen.T[..., None] / seen.sum(0)[:, None, None]  # (S,M,1)
+        return None
+    weight = use.T[..., None] / np.maximum(use.sum(0), 1)[:, None, None]  # (S,M,1)
     p, q = np.broadcast_to(rest, (x.shape[1], *rest.shape)), filled.transpose(1, 0, 2)
     p, q = p - (weight * p).sum(1, keepdims=True), q - (weight * q).sum(1, keepdims=True)
     U, _, Vt = np.linalg.svd((weight * p).transpose(0, 2, 1) @ q)
     Vt[:, 2] *= np.sign(np.linalg.det(U @ Vt))[:, None]
-    left = np.where(seen.T[..., None], q - p @ U @ Vt, 0.0)
-    moved = np.where(seen.T[..., None], filled.transpose(1, 0, 2) - rest, 0.0)
+    left = np.where(use.T[..., None], q - p @ U @ Vt, 0.0)
+    moved = np.where(use.T[..., None], filled.transpose(1, 0, 2) - rest, 0.0)
     power, rest_of_it = float((moved**2).sum()), float((left**2).sum())
-    common = power - rest_of_it
-    return common > AS_ONE * power and np.sqrt(common / seen.sum()) < LITTLE * extent
+    common = max(power - rest_of_it, 0.0)
+    told = np.where(use[..., None], left.transpose(1, 0, 2), np.nan)
+    return Body(told, common / power if power > 0 else 0.0, float(np.sqrt(common / use.sum())) / extent)

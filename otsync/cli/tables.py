@@ -127,7 +127,7 @@ def table(offsets: Offsets, truth: Any = None) -> str:
         cells = [f"{x:{w}.3f}" if np.isfinite(x) else "–".rjust(w) for x, w in zip(values, (9, 8, 9, 8), strict=True)]
         status = "reference" if v == offsets.reference else offsets.status[v].code
         lines.append(f"{name:{width}}  {' '.join(cells)}  {status}")
-    return "\n".join([*lines, *frame_lines(offsets, width)])
+    return "\n".join([*lines, *offsets.clock_notes(), *frame_lines(offsets, width)])
 
 
 def frame_lines(offsets: Offsets, width: int) -> list[str]:

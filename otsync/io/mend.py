@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..types import Video
+from ..types import Offsets, Video, mended_frames
 from .frames import FrameRange, LazyFrames
 from .scene import Scene
 
@@ -28,11 +28,11 @@ def cut(scene: Scene, first: int, stop: int) -> Scene:
 
 
 def keep_frames(scene: Scene, index: Sequence[Sequence[int]]) -> Scene:
-    """The frames at ``index`` (rising) of every video, with their masks, labels, depth, poses and times."""
+    """The frames at ``index`` of every video, with their masks, labels, depth, poses and times."""
     videos, masks, labels = [], [], []
     labels_of = scene.labels or (None,) * len(scene.videos)
     for video, mask, label, picks in zip(scene.videos, scene.masks, labels_of, index, strict=True):
-        whole = len(picks) == len(video.frames)
+        whole = np.array_equal(picks, np.arange(len(video.frames)))
         masks.append(mask if whole or mask is None else _some(mask, picks))
         labels.append(label if whole or label is None else _some(label, picks))
         if whole:
@@ -43,11 +43,30 @@ def keep_frames(scene: Scene, index: Sequence[Sequence[int]]) -> Scene:
             camera = replace(camera, w2c=camera.w2c[at])
         depth = None if video.depth is None else _some(video.depth, picks)
         times = video.times[at]
+        rising = len(at) < 2 or bool((np.diff(at) > 0).all())
         # few frames that are left of many have another rate than the video: then their times alone tell it
         thinned = video.fps is not None and len(at) > 1 and float(np.median(np.diff(times))) > 1.5 / video.fps
         frames, fps = _some(video.frames, picks), None if thinned else video.fps
-        videos.append(replace(video, frames=frames, camera=camera, fps=fps, timestamps=times, depth=depth))
+        told = times if rising else np.sort(times)  # of frames in another order the caller tells the times
+        videos.append(replace(video, frames=frames, camera=camera, fps=fps, timestamps=told, depth=depth))
     return replace(scene, videos=tuple(videos), masks=tuple(masks), labels=tuple(labels) if scene.labels else ())
+
+
+def on_mended_clocks(scene: Scene, offsets: Offsets) -> Scene:
+    """The scene with every video's breaks undone: frames in the order of what they show, at the times they show.
+
+    Frames that stood still are left out. The offsets then hold for the whole of every video.
+    """
+    known = dict(zip(offsets.names, offsets.breaks, strict=True))
+    if not any(known.get(name) for name in scene.names):
+        return scene
+    told = [mended_frames(v.times, known.get(v.name, ())) for v in scene.videos]
+    kept = keep_frames(scene, [index.tolist() for index, _ in told])
+    videos = [
+        replace(v, timestamps=times, fps=None) if known.get(v.name) else v
+        for v, (_, times) in zip(kept.videos, told, strict=True)
+    ]
+    return replace(kept, videos=tuple(videos))
 
 
 def unreadable(video: Video, masks: Sequence[Any] | None = None) -> dict[int, str]:

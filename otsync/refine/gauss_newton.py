@@ -84,6 +84,7 @@ class Fit:
         clock: the answer. covariance: (P,P) of offset (and rate), jackknifed over matches or over time, the larger.
         weights: (M,) of the matches. iterations: done.
         blur: rms residual over rms speed, s: how far off a single sample of a typical match tells the time.
+        wander: rms over blocks of a second, by their information, of what each says the offset is off by, s.
     """
 
     clock: Clock
@@ -91,6 +92,7 @@ class Fit:
     weights: Float[np.ndarray, " M"]
     iterations: int
     blur: float
+    wander: float = 0.0
 
     @property
     def effective_matches(self) -> float:
@@ -138,7 +140,7 @@ def fit_clock(
         # from the offset at the centre of the overlap to that at b's time zero
         move = np.array([[1.0, -centre], [0.0, 1.0]])
         covariance = move @ covariance @ move.T
-    return Fit(clock, covariance, system.match_weights, n, system.blur)
+    return Fit(clock, covariance, system.match_weights, n, system.blur, system.wander())
 
 
 def _centre(a: TrackSplines, b: TrackSplines, clock: Clock) -> float:
@@ -182,6 +184,12 @@ class System:
             ]
             found.append(moved.T @ moved)
         return max(found, key=lambda c: float(c[0, 0]))
+
+    def wander(self) -> float:
+        """See :class:`Fit`."""
+        H, g = self.by_time[0][:, 0, 0], self.by_time[1][:, 0]
+        told = H > 1e-9 * max(float(H.sum()), 1e-300)
+        return float(np.sqrt((g[told] ** 2 / H[told]).sum() / max(float(H[told].sum()), 1e-300)))
 
 
 def _regular(H: np.ndarray) -> np.ndarray:

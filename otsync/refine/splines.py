@@ -30,8 +30,14 @@ the square of the noise, and neither residuals nor other windows show them."""
 LONG = 60 / 30
 """Seconds of overlap from which a rate can be told from an offset."""
 
+LEAST_WANDER = 0.2 / 30
+"""Seconds by which the parts of the overlap may differ, however well the tracks agree."""
+
 LEAST_DRIFT = 0.1 / 30
 """Seconds by which a rate must move the ends of the overlap to be worth telling."""
+
+MOST_RATE = 0.03
+"""Relative difference of rates beyond which a fit from one offset is not to be believed."""
 
 DECLARED = 1e-4
 """Relative error of a frame rate that a file declares: what quartz clocks differ by."""
@@ -40,7 +46,7 @@ VELOCITY = 5 / 30
 """Half window, s, of the velocities whose correlation judges the fit."""
 
 
-READS = ("moved", "spread", "correlation", "blur", "overlap", "matches", "rate_sigmas")
+READS = ("moved", "spread", "correlation", "blur", "wander", "overlap", "matches", "rate_sigmas")
 """The limits of :class:`otsync.Trust` that the fit's flags are raised by."""
 
 
@@ -97,6 +103,7 @@ class SplineRefine(Refiner):
                 "moved": abs(fit.clock.offset - alignment.offset),
                 "spread": spread,
                 "blur": fit.blur,
+                "wander": fit.wander,
                 "correlation": velocity_correlation(*curves, fit, VELOCITY),
                 "overlap": overlap_seconds(*curves, fit.clock),
                 "iterations": float(fit.iterations),
@@ -158,8 +165,9 @@ class SplineRefine(Refiner):
         off = abs(free.clock.rate - fit.clock.rate)
         if off <= self.trust.rate_sigmas * sigma or off * overlap / 2 <= LEAST_DRIFT:
             return fit, free, (), stats
-        kept = free if self.rate == "fit" else fit
-        return kept, free, () if self.rate == "fit" else (Status.RATE_MISMATCH,), stats
+        if self.rate == "fixed" or abs(free.clock.rate - 1) > MOST_RATE:
+            return fit, free, (Status.RATE_MISMATCH,), stats
+        return free, free, (), stats
 
     def _ends(
         self, curves: tuple[TrackSplines, TrackSplines], fit: Fit, free: Fit | None, shared: float
@@ -184,6 +192,7 @@ class SplineRefine(Refiner):
             Status.WEAK: stats["blur"] > t.blur,
             Status.MOVED: stats["moved"] > t.moved,
             Status.SPREAD: stats["spread"] > t.spread,
+            Status.BROKEN_CLOCK: stats["wander"] > max(t.wander * stats["blur"], LEAST_WANDER),
             Status.SHORT_OVERLAP: stats["overlap"] < t.overlap - 1e-9,
             Status.FEW_MATCHES: stats["effective_matches"] < t.matches,
             Status.POOR_FIT: stats["correlation"] < t.correlation,

@@ -107,7 +107,9 @@ def _offset_table(offsets: Offsets, truth: Sequence[float] | None) -> str:
         if truth is not None:
             cells += [f"<td>{number(truth[v] * fps, 3)}", f"<td>{number((offsets.seconds[v] - truth[v]) * fps, 3)}"]
         rows.append("<tr>" + "".join(cells) + f"<td class=t>{status_words(offsets.status[v], offsets.flags[v])}")
-    return f"<div class=scroll><table><tr>{''.join(head)}<th class=t>status{''.join(rows)}</table></div>"
+    notes = "".join(f"<li>{escape(note)}" for note in offsets.clock_notes())
+    told = f"<ul>{notes}</ul>" if notes else ""
+    return f"<div class=scroll><table><tr>{''.join(head)}<th class=t>status{''.join(rows)}</table></div>{told}"
 
 
 def _frames_table(offsets: Offsets) -> str:

@@ -16,7 +16,7 @@ from ..clocks.common import strongest
 from ..clocks.splines import TrackSplines
 from ..refine.gauss_newton import fit_clock
 from ..refine.splines import SplineRefine
-from ..types import Break, Clock, TrackSet, mended_times
+from ..types import Break, Clock, TrackSet, mended_frames
 from .verdict import Answer
 
 LIMIT = 200
@@ -43,6 +43,12 @@ MOVING, RESTING = 0.6, 0.4
 SEARCH = 2.0
 """Seconds around a break's coarse place in which it is looked for, at most, beside :data:`AROUND`."""
 
+ENOUGH = 15
+"""Frames that tell where a match's own constant difference lies."""
+
+BACK = 1.5
+"""Seconds that a video must go back by to be taken for cut; less is lost frames."""
+
 SNAP = 0.3
 """Frames within which the length of a freeze is a whole number of frames."""
 
@@ -63,34 +69,33 @@ def mended(tracks: TrackSet, breaks: Sequence[Break]) -> TrackSet:
     """The tracks on the clock that the video had before its first break; frames that tell no time are left out."""
     if not breaks:
         return tracks
-    shown, tells = mended_times(tracks.times, breaks)
-    keep = np.flatnonzero(tells)
-    keep = keep[np.argsort(shown[keep], kind="stable")]
-    keep = keep[np.concatenate([[True], np.diff(shown[keep]) > 1e-6])]
+    keep, shown = mended_frames(tracks.times, breaks)
     fields = ("xyz", "visible", "uv", "sigma")
     taken = {f: v[:, keep] for f in fields if (v := getattr(tracks, f)) is not None}
     camera = tracks.camera
     if camera is not None and camera.w2c.ndim == 3:
         camera = replace(camera, w2c=camera.w2c[keep])
-    return replace(tracks, **taken, timestamps=shown[keep], fps=None, camera=camera)
+    return replace(tracks, **taken, timestamps=shown, fps=None, camera=camera)
 
 
 def suspects(answer: Answer, a: TrackSet, b: TrackSet, fps: Sequence[float]) -> list[Suspect]:
     """Both readings of every jump of a pair's offset, located to a frame and measured below it."""
     matches = strongest(answer.matches, LIMIT)
     curves = SplineRefine().splines(a, b, matches)
+    raw = Raw.of(a, matches.pairs[:, 0]), Raw.of(b, matches.pairs[:, 1])
     found = []
     parts = answer.scanned.parts
     for k in range(len(parts) - 1):
         begin = parts[k][0] if k else -math.inf
         end = parts[k + 2][0] if k + 2 < len(parts) else math.inf
-        found += _readings(answer, curves, parts[k][1], parts[k + 1], (begin, end), fps)
+        found += _readings(answer, curves, raw, parts[k][1], parts[k + 1], (begin, end), fps)
     return found
 
 
 def _readings(
     answer: Answer,
     curves: tuple[TrackSplines, TrackSplines],
+    raw: tuple[Raw, Raw],
     before: float,
     after: np.ndarray,
     limits: tuple[float, float],
@@ -107,12 +112,12 @@ def _readings(
         two = fit_clock(a.within(when + gap + margin, high), b, Clock(second), WINDOW)
         first = one.clock.offset if one is not None and abs(one.clock.offset - first) < AROUND else first
         second = two.clock.offset if two is not None and abs(two.clock.offset - second) < AROUND else second
-        when, gap = _moment(a, b, first, second, when, limits)
+        when, gap = _moment(*raw, first, second, when, limits)
     jump = second - first
     sigma = math.hypot(*(math.sqrt(float(f.covariance[0, 0])) if f is not None else math.nan for f in (one, two)))
     i, j = answer.pair
     if jump > 0 and gap == 0:  # a's frames run on, b's go back: its parts are in the other order
-        return [Suspect(j, Break(_turn(a, b, second, first), -jump, 0.0, sigma), 1.0)]
+        return [Suspect(j, Break(_turn(*raw, second, first), -jump, 0.0, sigma), 1.0)]
     at_b = when - first
     if jump > 0:  # a's frames from `when` on for `jump` s have no partner: a stood still, or b lost them
         froze, lost = (i, when, a), (j, at_b)
@@ -130,61 +135,92 @@ def _readings(
     return [Suspect(video, back, votes[0]), Suspect(lost[0], gone, votes[1])]
 
 
+@dataclass(frozen=True, eq=False)
+class Raw:
+    """Matched tracks as they were seen: curves are smoothed across a break, samples are not.
+
+    Args:
+        times: (T,) s. x: (M,T,3), nan where not seen.
+    """
+
+    times: np.ndarray
+    x: np.ndarray
+
+    @classmethod
+    def of(cls, tracks: TrackSet, index: np.ndarray) -> Raw:
+        return cls(tracks.times, tracks.positions()[index])
+
+    def at(self, t: np.ndarray) -> np.ndarray:
+        """(M,S,3) between two samples on a line; nan outside."""
+        right = np.clip(np.searchsorted(self.times, t), 1, len(self.times) - 1)
+        step = self.times[right] - self.times[right - 1]
+        share = ((t - self.times[right - 1]) / step)[None, :, None]
+        x = (1 - share) * self.x[:, right - 1] + share * self.x[:, right]
+        outside = (t < self.times[0]) | (t > self.times[-1])
+        return np.where(outside[None, :, None], np.nan, x)
+
+
 def _moment(
-    a: TrackSplines, b: TrackSplines, first: float, second: float, near: float, limits: tuple[float, float]
+    a: Raw, b: Raw, first: float, second: float, near: float, limits: tuple[float, float]
 ) -> tuple[float, float]:
-    """The time of a's clock up to which the first offset suits the velocities better, and how many seconds later the
+    """The time of a's clock up to which the first offset suits the positions better, and how many seconds later the
     second one begins to.
     """
     reach = AROUND + min(abs(second - first), SEARCH)
     t = a.times[(a.times > max(limits[0], near - reach)) & (a.times < min(limits[1], near + reach))]
+    gap = max(second - first, 0.0)
     if len(t) < 3:
-        return near, max(second - first, 0.0)
-    scores = _above_neutral(*(_suits(a, b, offset, t) for offset in (first, second)))
+        return near, gap
+    frame = float(np.median(np.diff(a.times)))
+    # the coarse place may lie at either end of a gap
+    sides = [t < near - gap - MARGIN, t > near + gap + MARGIN]
+    for k, wide in enumerate((t < near - MARGIN, t > near + MARGIN)):
+        if sides[k].sum() < ENOUGH:
+            sides[k] = wide
+    scores = [_suits(a, b, o, t, inside) for o, inside in zip((first, second), sides, strict=True)]
     one = np.concatenate([[0.0], np.cumsum(scores[0])])
     two = np.concatenate([np.cumsum(scores[1][::-1])[::-1], [0.0]])
     found = {}
-    for gap in {0.0, max(second - first, 0.0)}:
-        total = one + two[np.minimum(np.arange(len(t) + 1) + round(gap / a.frame), len(t))]
+    for g in {0.0, gap}:
+        total = one + two[np.minimum(np.arange(len(t) + 1) + round(g / frame), len(t))]
         best = int(np.argmax(total))
-        found[gap] = float(total[best]), float(t[best] if best < len(t) else t[-1] + a.frame)
-    gap = max(found)
-    # frames within the gap that suit the second offset all the same add half of a typical score each
-    typical = 2 * float(np.median(np.max(scores, 0)))
-    if gap > 0 and found[0.0][0] > found[gap][0] + 0.25 * max(typical, 0.0) * min(gap / a.frame, 15):
+        found[g] = float(total[best]), float(t[best] if best < len(t) else t[-1] + frame)
+    # frames within the gap that suit the second offset all the same add up to 1 each
+    if gap >= BACK and found[0.0][0] > found[gap][0] + 0.5 * min(gap / frame, 15):
         gap = 0.0
     return found[gap][1], gap
 
 
-def _turn(a: TrackSplines, b: TrackSplines, first: float, second: float) -> float:
+def _turn(a: Raw, b: Raw, first: float, second: float) -> float:
     """The time of b's own clock from which on it has the second offset, where its parts are not in a's order.
 
     Frames that neither offset brings into a's clip count for neither.
     """
     t = b.times
-    scores = _above_neutral(*(_suits(b, a, -offset, t) for offset in (first, second)))
+    scores = [_suits(b, a, -offset, t, np.ones(len(t), bool)) for offset in (first, second)]
     one = np.concatenate([[0.0], np.cumsum(scores[0])])
     two = np.concatenate([np.cumsum(scores[1][::-1])[::-1], [0.0]])
     best = int(np.argmax(one + two))
-    return float(t[best] if best < len(t) else t[-1] + b.frame)
+    return float(t[best] if best < len(t) else t[-1] + np.median(np.diff(t)))
 
 
-def _above_neutral(*scores: np.ndarray) -> list[np.ndarray]:
-    """Scores less half of what frames typically have that suit one of them; 0 stays where nothing is seen."""
-    best = np.max(scores, 0)
-    level = 0.5 * float(np.median(best[best != 0])) if (best != 0).any() else 0.0
-    return [np.where(s != 0, s - level, 0.0) for s in scores]
+def _suits(a: Raw, b: Raw, offset: float, t: np.ndarray, inside: np.ndarray) -> np.ndarray:
+    """(S,) how well positions agree at a's times ``t`` and an offset, in (-inf, 1]: 0 is undecided, or nothing seen.
 
-
-def _suits(a: TrackSplines, b: TrackSplines, offset: float, t: np.ndarray) -> np.ndarray:
-    """(S,) how well velocities agree at a's times ``t`` and an offset: log-likelihood against "unrelated", a match."""
-    seen = a.support(t) & b.support(t - offset)
-    u, v = a.velocity(t), b.velocity(t - offset)
-    power = np.where(seen, (u**2).sum(2) + (v**2).sum(2), 0.0)
-    left = np.where(seen, ((u - v) ** 2).sum(2), 0.0)
-    floor = 0.05 * float(power[seen].mean()) if seen.any() else 1.0
-    gain = np.where(seen, np.log((power + floor) / (left + floor)), 0.0)
-    return np.asarray(gain.sum(0) / np.maximum(seen.sum(0), 1))
+    Every match has a constant difference of its own, its median ``inside`` (S,) the part where the offset holds.
+    """
+    apart = a.at(t) - b.at(t - offset)
+    seen = np.isfinite(apart[..., 0])
+    known = seen & inside
+    use = known.sum(1) >= 5
+    if not use.any():
+        return np.zeros(len(t))
+    apart, seen, known = apart[use], seen[use], known[use]
+    middle = np.nanmedian(np.where(known[..., None], apart, np.nan), 1)
+    off = np.where(seen, ((apart - middle[:, None]) ** 2).sum(2), 0.0)
+    usual = float(np.median(off[known])) + 1e-300
+    level = np.where(seen, 1 - np.log1p(off / (4 * usual)), 0.0)
+    return np.asarray(level.sum(0) / np.maximum(seen.sum(0), 1))
 
 
 def stood_still(curves: TrackSplines, start: float, length: float) -> bool:
@@ -207,8 +243,12 @@ def _speed(curves: TrackSplines, begin: float, end: float) -> float:
     return float(np.sqrt(np.median(power[there] / seen.sum(1)[there]))) if there.any() else math.nan
 
 
-def culprit(found: Sequence[Suspect]) -> Suspect | None:
-    """The reading with most votes from all pairs, its jump the median of theirs."""
+def culprit(found: Sequence[Suspect], sound: Sequence[tuple[int, int]]) -> Suspect | None:
+    """The reading with most votes from all pairs, its jump the median of theirs.
+
+    Args:
+        sound: pairs that answer without any doubt: each is a vote for the clocks of both its videos.
+    """
     best, most = None, 0.0
     for one in found:
         same = [
@@ -218,7 +258,7 @@ def culprit(found: Sequence[Suspect]) -> Suspect | None:
             and abs(s.found.at - one.found.at) < SAME_MOMENT
             and abs(s.found.jump - one.found.jump) < SAME_JUMP
         ]
-        votes = sum(s.votes for s in same)
+        votes = sum(s.votes for s in same) - sum(one.video in pair for pair in sound)
         if votes > most + 1e-9:
             still = float(np.median([s.found.still for s in same]))
             middle = Break(

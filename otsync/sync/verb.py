@@ -23,7 +23,7 @@ from ..match.synchronous import SynchronousMatching
 from ..match.unbalanced import UnbalancedOT
 from ..refine.slot import Rate, Refiner, RefinerLike
 from ..refine.splines import SplineRefine
-from ..types import Alignment, Break, Clock, Matches, Offsets, TrackSet
+from ..types import Alignment, Break, Clock, Matches, Offsets, Status, TrackSet
 from .breaks import MOST, culprit, mended, remeasured, suspects
 from .graph import Graph, Pair
 from .method import Method, with_costs
@@ -119,8 +119,17 @@ def synchronize(
         if not again:
             break
         fresh = {answer.pair: answer for answer in map(run, again)}
-        verdict = judged([fresh.get(a.pair, a) for a in verdict.answers])
+        verdict = judged([_still_broken(fresh.get(a.pair, a), a) for a in verdict.answers])
     return to_offsets(original, verdict, time.perf_counter() - started, broken)
+
+
+def _still_broken(fresh: Answer, first: Answer) -> Answer:
+    """Matches that were made at one offset agree with it: they do not lift the doubt whether there is only one."""
+    if Status.BROKEN_CLOCK not in first.refined.flags:
+        return fresh
+    return dataclasses.replace(
+        fresh, refined=dataclasses.replace(fresh.refined, flags=(*fresh.refined.flags, Status.BROKEN_CLOCK))
+    )
 
 
 def mend_clocks(
@@ -139,7 +148,7 @@ def mend_clocks(
     for _ in range(MOST):
         doubtful = [a for a in verdict.answers if len(a.scanned.parts) and not NOTHING_COMMON & set(a.scanned.flags)]
         named = [s for a in doubtful for s in suspects(a, tracks[a.pair[0]], tracks[a.pair[1]], fps)]
-        one = culprit(named)
+        one = culprit(named, [a.pair for a in verdict.answers if a.refined.status.ok])
         if one is None:
             break
         v = one.video
@@ -160,14 +169,15 @@ def with_break(
 
     None where that adds nothing to the evidence.
     """
-    before = _evidence(a for a in verdict.answers if v in a.pair)
+    own = [a for a in verdict.answers if v in a.pair]
+    before, doubts = _evidence(own), _broken(own)
     best = None
     for _ in range(2):
         better = mended(tracks[v], (found,))
         sets = [better if k == v else t for k, t in enumerate(tracks)]
         again = [dataclasses.replace(j, a=sets[j.pair[0]], b=sets[j.pair[1]]) for j in jobs]
         fresh = {a.pair: a for a in map(run, [j for j in again if v in j.pair])}
-        if _evidence(fresh.values()) <= before:
+        if _evidence(fresh.values()) <= before or _broken(fresh.values()) >= doubts:
             break
         best = again, better, fresh, found
         left = remeasured_jump(fresh, sets, v, found)
@@ -197,6 +207,10 @@ def remeasured_jump(fresh: Mapping[Pair, Answer], tracks: Sequence[TrackSet], v:
 
 def _evidence(answers: Iterable[Answer]) -> float:
     return sum(a.scanned.stats.get("evidence", 0.0) for a in answers)
+
+
+def _broken(answers: Iterable[Answer]) -> int:
+    return sum(Status.BROKEN_CLOCK in a.refined.flags for a in answers)
 
 
 def _on_own_clock(found: Break, earlier: Sequence[Break]) -> Break:
@@ -273,19 +287,24 @@ def at_known_times(matcher: Matcher | None, clock: Clock, flat: bool = False) ->
 def to_offsets(
     tracks: Sequence[TrackSet], verdict: Verdict, seconds: float, broken: Mapping[int, tuple[Break, ...]] | None = None
 ) -> Offsets:
+    found = tuple((broken or {}).get(v, ()) for v in range(len(tracks)))
+    # a jump that was measured adds its error behind it
+    loose = [sum(b.sigma**2 for b in breaks if b.still == 0 and np.isfinite(b.sigma)) for breaks in found]
+    loose = [total + loose[verdict.reference] for total in loose]
+    sigma = np.where(np.arange(len(tracks)) == verdict.reference, 0.0, np.hypot(verdict.sigma, np.sqrt(loose)))
     return Offsets(
         names=unique_names(tracks),
         fps=np.array([t.fps for t in tracks], float),
         seconds=verdict.x,
         rates=verdict.rates,
-        sigma=verdict.sigma,
+        sigma=sigma,
         reference=verdict.reference,
         component=verdict.component,
         flags=verdict.flags,
         alignments={a.pair: a.refined for a in verdict.answers},
         matches={a.pair: a.matches for a in verdict.answers},
         stats=verdict.stats | {"seconds": seconds},
-        breaks=tuple((broken or {}).get(v, ()) for v in range(len(tracks))),
+        breaks=found,
     )
 
 

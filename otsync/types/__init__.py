@@ -1,7 +1,7 @@
 """The nouns: frozen dataclasses of arrays. Files freeze them, so they change only with a version."""
 
 from .camera import Camera, Video
-from .clock import Break, Clock, mended_times
+from .clock import Break, Clock, mended_frames, mended_times
 from .results import Alignment, Matches, Offsets, Stats
 from .similarity import Similarity
 from .status import Refused, Status, gravest, in_order
@@ -9,8 +9,8 @@ from .tracks import TrackSet, check_same_world
 
 __all__ = [
     "Alignment",
-    "Camera",
     "Break",
+    "Camera",
     "Clock",
     "Matches",
     "Offsets",
@@ -23,5 +23,6 @@ __all__ = [
     "check_same_world",
     "gravest",
     "in_order",
+    "mended_frames",
     "mended_times",
 ]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 Source = Literal["given", "found", "fitted"]
 """Where a clock comes from: given by the user, found on the frozen scene, or refined by the fit."""
@@ -82,3 +82,14 @@ def mended_times(
         shown[times >= b.at - ROUNDING] += b.jump
         tells &= ~((times >= b.at - b.still - ROUNDING) & (times < b.at - ROUNDING))
     return shown, tells
+
+
+def mended_frames(
+    times: Float[np.ndarray, " T"], breaks: Sequence[Break]
+) -> tuple[Int[np.ndarray, " S"], Float[np.ndarray, " S"]]:
+    """Which frames tell a time, in the order of what they show, and when that is; of two at one moment the first."""
+    shown, tells = mended_times(times, breaks)
+    keep = np.flatnonzero(tells)
+    keep = keep[np.argsort(shown[keep], kind="stable")]
+    keep = keep[np.concatenate([[True], np.diff(shown[keep]) > ROUNDING])]
+    return keep, shown[keep]

@@ -289,6 +289,15 @@ class Offsets:
         shown, tells = mended_times(own, self.breaks[v])
         return np.where(tells, self.clock(v).world(shown), np.nan)
 
+    def clock_notes(self) -> list[str]:
+        """In words what is unusual about the videos' clocks: rates that are not the declared ones, and breaks."""
+        notes = [
+            f"{name}: a second of its clock lasts {rate:.5f} s of the reference's; its declared frame rate is wrong"
+            for name, rate in zip(self.names, self.rates, strict=True)
+            if np.isfinite(rate) and rate != 1
+        ]
+        return notes + [f"{n}: {b}" for n, breaks in zip(self.names, self.breaks, strict=True) for b in breaks]
+
     @property
     def frames(self) -> Float[np.ndarray, " V"]:
         """Offsets in frames of each video's reference."""

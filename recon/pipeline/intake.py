@@ -106,6 +106,7 @@ def only(offsets: Offsets, names: Sequence[str]) -> Offsets:
         reference=reference,
         component=np.full(len(at), reference),
         flags=tuple(offsets.flags[v] for v in at),
+        breaks=tuple(offsets.breaks[v] for v in at),
         alignments={(new[i], new[j]): a for (i, j), a in pairs.items()},
         matches={},
     )

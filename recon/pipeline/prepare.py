@@ -11,7 +11,8 @@ import numpy as np
 from otsync.clocks.shutter import at_frame_times
 from otsync.compute.threads import MapLike
 from otsync.io import Scene
-from otsync.io.mend import cut
+from otsync.io.mend import cut, on_mended_clocks
+from otsync.sync.breaks import mended
 from otsync.progress import Deadline, Progress
 from otsync.types import Clock, Offsets, TrackSet
 from recon.backdrop.fit import StaticFit, with_backdrop
@@ -90,6 +91,7 @@ def prepare(
         check_effects(plan.effects, video.times)
     if plan.frames is not None:
         scene = cut(scene, *plan.frames)
+    scene = on_mended_clocks(scene, offsets)
     with progress.stage("reading"):
         scene = readable(scene, cache, map, progress)
         train, others, offsets, clocks = split(scene, offsets, held_out, progress)
@@ -106,7 +108,8 @@ def prepare(
         with progress.stage("tracks"):
             tracks = lifted_tracks(train, offsets, cache, map, progress)
     else:
-        tracks = tuple(at_frame_times(t) for t in tracks_of(train, tracks, held_out, progress.note))
+        own = [at_frame_times(t) for t in tracks_of(train, tracks, held_out, progress.note)]
+        tracks = tuple(mended(t, offsets.breaks[offsets.names.index(t.name)]) for t in own)
     with progress.stage("footage"):
         footage = read_footage(train, plan.width, cache, map, progress)
         held = () if others is None else read_footage(others, plan.width, cache, map, progress)

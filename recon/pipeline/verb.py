@@ -16,7 +16,7 @@ from otsync.compute.indices import evenly
 from otsync.compute.threads import MapLike
 from otsync.files.arrays import write_json
 from otsync.io import Scene
-from otsync.io.mend import cut
+from otsync.io.mend import cut, on_mended_clocks
 from otsync.metrics import offset_error
 from otsync.progress import Deadline, Progress
 from otsync.types import Clock, Offsets, TrackSet
@@ -268,6 +268,8 @@ def evaluate(
     frames = result.options.get("frames")
     if frames is not None:
         part = cut(part, int(frames[0]), int(frames[1]))
+    if offsets is not None:
+        part = on_mended_clocks(part, offsets)
     part = readable(part, cache, map, progress)
     known = {v.name: v for v in result.videos}
     scores = []
