@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -23,6 +24,10 @@ log = logging.getLogger("otsync")
 
 DOUBTS = frozenset({Status.NO_MATCH, Status.AMBIGUOUS})
 """Doubts about matches: the pair's answer carries them, so that nobody trusts it, and is there to be looked at."""
+
+
+PLACED, CLEAR = 1.05, 40.0
+"""How much further apart the tracks must be at any other time, and nats a match, that answer a doubt about features."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,11 +58,26 @@ def run(job: Job) -> Answer:
         refined = scanned
         if np.isfinite(scanned.offset):
             refined = refine(job.a, job.b, matches, scanned, job.refiner, throw=False)
+            refined = without_answered_doubt(refined)
         return Answer(job.pair, matches, scanned, refined)
     except Exception as error:
         log.warning("pair %s: %s: %s", job.pair, type(error).__name__, error)
         failed = Alignment(float("nan"), flags=(Status.FAILED,))
         return Answer(job.pair, matches, failed, failed)
+
+
+def without_answered_doubt(refined: Alignment) -> Alignment:
+    """Features that look unrelated do not count against an answer in space that leaves no other doubt.
+
+    Noisy features of one scene match little better than strangers' do; that one motion explains both videos, that the
+    tracks are at one place at the answer, and that no other time suits them as well, is the stronger evidence.
+    """
+    stats = refined.stats
+    placed = stats.get("rival", 0.0) > PLACED and stats.get("apart", math.inf) < 1.0
+    told = placed and stats.get("evidence", 0.0) > CLEAR
+    if refined.flags == (Status.NO_MATCH,) and told:
+        return dataclasses.replace(refined, flags=())
+    return refined
 
 
 @dataclass(frozen=True, eq=False)
