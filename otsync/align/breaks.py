@@ -30,12 +30,15 @@ ODD, UNUSUAL, LEAST_MISSING = 3.0, 4.5, 0.15
 """How many times more than usual may be missing in two windows in a row: clean pairs 1.5 (mid), 4.3 (hard), 4.2 (brutal)
 at most, of ten lost frames half have 4.6 to 7; and what counts as missing at all."""
 
+AGREES = 0.5
+"""Share of its motion that the median match must have in common over a part, at the part's own offset."""
+
 MOVES = 6.0
 """Variance of a match within a window, in units of the noise floor, above which it moves there."""
 
 BEST_QUARTER, LEAST_MOVING = 0.75, 5
 
-BEYOND = 0.35
+BEYOND = 0.5
 """Share of a usual window's evidence that windows must have which lie beyond the overlap at the best offset: some offset
 suits them by chance. Clean pairs have up to .4 there, parts that are real .5 and more."""
 
@@ -135,6 +138,10 @@ def find_breaks(
     if gain <= _rate_gain(curves, straight) + AS_A_RATE:
         return NONE, gain, doubtful  # a rate explains it as well, with one number
     spans = np.split(np.arange(windows), edges)
+    tops = [int(np.argmax(curves[p].sum(0))) for p in spans]
+    for span, top in zip(spans, tops, strict=True):
+        if top != best and agreement(pair, span, int(lags[top]), floor, step) < AGREES:
+            return NONE, gain, doubtful  # some offset suits a few of the matches by chance
     offsets = [float(pair.seconds(vertex(lags, c := curves[p].sum(0), int(np.argmax(c))))) for p in spans]
     begin = pair.start + (np.concatenate([[0], edges]) - 0.5) * step / pair.fps
     begin[0] = pair.start
@@ -168,6 +175,25 @@ def explained(pair: CommonClock, lag: int, floor: float, step: int) -> tuple[flo
     missing = 1 - float(pairs.min())
     ratio = missing / max(1 - float(np.median(shares)), 1e-3) if missing > LEAST_MISSING else 1.0
     return min(shares), float(pairs.min()), ratio
+
+
+def agreement(pair: CommonClock, span: Int[np.ndarray, " P"], lag: int, floor: float, step: int) -> float:
+    """The share of its motion that the median match has in common with its partner over a part, at the part's lag."""
+    begin = max(0, lag, int(span[0]) * step - step // 2)
+    end = min(pair.a.shape[1], pair.b.shape[1] + lag, int(span[-1]) * step + step // 2)
+    if end - begin < LEAST_WINDOW * pair.fps:
+        return 0.0
+    x, y = pair.a[:, begin:end], pair.b[:, begin - lag : end - lag]
+    seen = np.isfinite(x[..., 0]) & np.isfinite(y[..., 0])
+    use = seen.sum(1) >= LEAST_WINDOW * pair.fps
+    if use.sum() < LEAST_MOVING:
+        return 0.0
+    x, y, seen = x[use], y[use], seen[use]
+    power = _variance(x, seen) + _variance(y, seen)
+    moves = power > MOVES * floor
+    if moves.sum() < LEAST_MOVING:
+        return 0.0
+    return float(np.median(1 - _variance(x - y, seen)[moves] / power[moves]))
 
 
 def _variance(x: Float[np.ndarray, "M T 3"], seen: np.ndarray) -> Float[np.ndarray, " M"]:

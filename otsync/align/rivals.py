@@ -7,19 +7,23 @@ belt, a motion that repeats) fit as well at another one, with other partners.
 from __future__ import annotations
 
 import math
+import warnings
 
 import numpy as np
 from jaxtyping import Float
 
 from ..compute.indices import evenly
 from ..costs.linear import cosine_distance, unit_features
-from ..types import TrackSet
+from ..types import Matches, TrackSet
 
 PARTNERS = 10
 """Tracks of the other video whose features are likest: one of them is the partner."""
 
 TRACKS, MOMENTS = 120, 24
 """Tracks of one video that are asked, and moments at which they are compared."""
+
+NEAREST, FEWEST = 0.15, 30
+"""Quantile of the tracks' distances that tells, and of how many tracks at least."""
 
 STEP, REACH = 2 / 30, 4.0
 """Seconds between the offsets that are tried, and how far from the answer they go."""
@@ -31,13 +35,19 @@ LEAST_COMMON, LEAST_SEEN = 40 / 30, 8
 """Seconds that must be common, and moments at which both must be seen."""
 
 
-def rival(a: TrackSet, b: TrackSet, offset: float) -> float:
-    """The least median distance of tracks to their nearest likely partners at any other offset, over that at ``offset``.
+def rival(a: TrackSet, b: TrackSet, matches: Matches, offset: float) -> float:
+    """The least distance of tracks to their nearest likely partners at any other offset, over that at ``offset``.
 
-    Positions are in one declared world frame; both sets have features. 1: another time fits as well; inf: none is far
-    enough to be tried.
+    Distances are those of the nearest :data:`NEAREST` of the tracks in the better half of the matches: others may show
+    what the other video does not see. Positions are in one declared world frame; both sets have features. 1: another
+    time fits as well; inf: none is far enough to be tried.
     """
-    some = evenly(len(a), TRACKS)
+    some = np.unique(matches.best(max((len(matches) + 1) // 2, FEWEST)).pairs[:, 0])
+    with np.errstate(invalid="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # of tracks that are never seen
+        moved = np.nan_to_num(np.nanstd(a.positions()[some], 1).sum(1))
+    some = some[moved >= np.median(moved)]  # what rests is as near at any time
+    some = some[evenly(len(some), TRACKS)]
     assert a.features is not None and b.features is not None
     fa, fb = unit_features(a.features, center=True), unit_features(b.features, center=True)
     likely = np.argsort(cosine_distance(fa[some], fb), 1, kind="stable")[:, :PARTNERS]
@@ -56,8 +66,8 @@ def rival(a: TrackSet, b: TrackSet, offset: float) -> float:
 def _distance(
     xa: np.ndarray, xb: np.ndarray, ta: np.ndarray, tb: np.ndarray, likely: np.ndarray, offset: float
 ) -> float:
-    """Median over a's tracks of the rms distance to the nearest of their likely partners; nan where too little is
-    common.
+    """Rms distance of a's tracks to the nearest of their likely partners, the quantile :data:`NEAREST` of the tracks;
+    nan where too little is common.
     """
     at = np.flatnonzero((ta - offset >= tb[0]) & (ta - offset <= tb[-1]))
     if not len(at) or ta[at[-1]] - ta[at[0]] < LEAST_COMMON:
@@ -71,4 +81,4 @@ def _distance(
     rms = np.sqrt(np.where(seen, square, 0.0).sum(2) / np.maximum(count, 1))
     nearest = np.where(count >= LEAST_SEEN, rms, np.inf).min(1)
     known = nearest[np.isfinite(nearest)]
-    return float(np.median(known)) if len(known) >= LEAST_SEEN else math.nan
+    return float(np.quantile(known, NEAREST)) if len(known) >= LEAST_SEEN else math.nan
