@@ -52,9 +52,23 @@ def read_json(path: str | os.PathLike[str], *, max_bytes: int = 64 * 2**20) -> A
     if path.stat().st_size > max_bytes:
         raise ValueError(f"{path}: expected a JSON file of at most {max_bytes} bytes; found {path.stat().st_size}.")
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+        return json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=_once)
+    except (ValueError, RecursionError) as error:  # a ValueError also for a number of more than 4300 digits
         raise ValueError(f"{path}: expected JSON; {error}. Write it again with otsync.") from None
+    except OSError as error:
+        raise type(error)(error.errno, f"cannot be read ({error.strerror}). Check its permissions", str(path)) from None
+    except MemoryError:
+        raise MemoryError(f"{path}: expected JSON that fits into memory; found too much. Cut the file.") from None
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object of JSON. ValueError for a key that occurs twice, of which one would be dropped in silence."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        names = [name for name, _ in pairs]
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"the key {twice[:80]!r} occurs twice in one object; leave one of them")
+    return found
 
 
 def existing(path: str | os.PathLike[str]) -> Path:

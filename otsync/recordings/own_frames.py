@@ -17,7 +17,9 @@ import numpy as np
 from ..clocks.shutter import check_within_a_frame
 from ..compute.threads import MapLike
 from ..files.cache import Cache
+from ..files.strict import checked
 from ..frames import OwnFrames
+from ..io.layout import SceneFile
 from ..io.scene import Scene, camera_from, read_document, scene_from_document
 from ..progress import Progress, Tell
 from ..sync.method import Method
@@ -36,7 +38,8 @@ def open_without_poses(path: str | os.PathLike[str], *, allow_outside: bool = Fa
     document, root = read_document(path)
     filled = copy.deepcopy(document)
     filled.pop("missing", None)  # what is missing besides poses is named by the field that lacks it
-    for video in filled.get("videos") or ():
+    checked(document, SceneFile, root / "scene.json")
+    for video in filled["videos"]:
         camera = video.get("camera") if isinstance(video, dict) else None
         if isinstance(camera, dict) and camera.get("w2c") is None:
             camera["w2c"] = np.eye(4).tolist()

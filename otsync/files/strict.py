@@ -1,0 +1,187 @@
+"""Strict documents: JSON against one schema, types and fields alike, with errors that name file and field.
+
+A document is a :class:`Document`; what it may hold stands in its annotations, and :func:`json_schema` writes the same as
+JSON Schema. Nothing is converted: true is no number, 160.9 no count of pixels, " 3 " no number.
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+import re
+from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
+
+import msgspec
+
+UNSEEN = r"\x00-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069\ud800-\udfff"
+"""Characters that move a terminal's cursor, turn its text around, or cannot be written: a class of a pattern."""
+
+LONGEST_TEXT = 1000
+"""Characters of a name or a path: file systems take fewer."""
+
+Text = Annotated[str, msgspec.Meta(max_length=LONGEST_TEXT, pattern=rf"^(?![\s\S]*[{UNSEEN}])")]
+"""Text on one line, without control characters."""
+
+Name = Annotated[str, msgspec.Meta(min_length=1, max_length=200, pattern=rf"^(?![\s\S]*[{UNSEEN}])")]
+"""The name of a video: it stands in tables, in reports and in file names."""
+
+Count = Annotated[int, msgspec.Meta(ge=0, le=2**31)]
+
+WORDS = {
+    "int": "a whole number",
+    "float": "a number",
+    "str": "text",
+    "bool": "true or false",
+    "null": "null",
+    "array": "a list",
+    "object": "an object",
+}
+"""How an error names the types of JSON."""
+
+T = TypeVar("T")
+
+
+class Document(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True, omit_defaults=True):
+    """An object of a document: its fields and their types, no others."""
+
+
+def checked(value: Any, kind: type[T], where: str | os.PathLike[str], at: str = "$", remedy: str = "") -> T:
+    """``value``, what a JSON file holds, as a ``kind``.
+
+    Args:
+        where: the file, for errors. at: the field that ``value`` stands in; default: the whole of the file.
+        remedy: what to do about it, where the field alone does not tell.
+
+    ValueError names the file, the field, what was expected and what was found: of a field that there is not the nearest
+    one that there is.
+    """
+    try:
+        return msgspec.convert(value, kind, strict=True)
+    except msgspec.ValidationError as error:
+        said, _, path = str(error).partition(" - at ")
+        steps = _steps(path.strip("`").removeprefix("$"), value)
+        field, found, names = _walk(value, steps)
+        field = f"{'' if at == '$' else at}{field}".lstrip(".")
+        unknown = re.match(r"Object contains unknown field `(.*)`$", said, re.DOTALL)
+        absent = re.match(r"Object missing required field `(\w+)`$", said)
+        if unknown:
+            expected, found_text = _unknown(unknown[1], _fields_at(kind, steps))
+            field = f"{field}.{shown(unknown[1])[1:-1]}".lstrip(".")
+        elif absent:
+            field, expected, found_text = f"{field}.{absent[1]}".lstrip("."), "a value", "none. Add it"
+        else:
+            expected, found_text = _expected(said), shown(found)
+        of = f" (of {shown(names)})" if names is not None else ""
+        raise ValueError(
+            f"{where}: {field or 'the whole of it'}{of}: expected {expected}; found {found_text}. "
+            + (remedy or "Correct it; docs/formats.md lists the fields.")
+        ) from None
+
+
+def shown(value: Any) -> str:
+    """A value as an error shows it: in one line, short, without characters that a terminal heeds."""
+    if isinstance(value, int) and not isinstance(value, bool) and abs(value) >= 10**40:
+        return f"a whole number of some {int(value.bit_length() * 0.30103) + 1} digits"
+    if isinstance(value, str):
+        value = value[:90]  # repr alone escapes what cannot be seen
+    if isinstance(value, list | tuple):
+        text = f"a list of {len(value)}"
+        plain = all(isinstance(x, str | float | bool | None) for x in value)
+        text = repr(value) if plain and len(value) <= 8 else text
+    elif isinstance(value, dict):
+        text = f"an object with {', '.join(shown(str(k)) for k in list(value)[:4]) or 'no fields'}"
+    else:
+        text = (
+            {None: "null", True: "true", False: "false"}[value]
+            if value is None or isinstance(value, bool)
+            else repr(value)
+        )
+    return text if len(text) <= 80 else text[:77] + "..."
+
+
+def json_schema(kind: type[Document], title: str) -> dict[str, Any]:
+    """The JSON Schema (2020-12) of a document."""
+    schema = msgspec.json.schema(kind)
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": title, **schema}
+
+
+def fields_of(kind: type[Document]) -> tuple[str, ...]:
+    """The names that an object of a document may have."""
+    return kind.__struct_fields__
+
+
+def nearest(word: str, known: Any) -> str | None:
+    """The one of ``known`` that ``word`` is probably meant to be."""
+    close = difflib.get_close_matches(word[:100].lower(), {k.lower(): k for k in known}, 1, 0.5)
+    return next((k for k in known if close and k.lower() == close[0]), None)
+
+
+def _unknown(word: str, known: tuple[str, ...]) -> tuple[str, str]:
+    near = nearest(word, known)
+    meant = "Take it out" if near is None else f"Did you mean {near!r}? Else take it out"
+    return (
+        f"one of the fields {', '.join(known)}" if near is None else "a field that there is",
+        f"{shown(word)}. {meant}",
+    )
+
+
+def _expected(said: str) -> str:
+    """msgspec's words in ours."""
+    if said == "Number out of range":
+        return "a number below 1e308"
+    if "matching regex" in said:
+        return "text on one line, without control characters"
+    said = said.removeprefix("Expected ")
+    said = said.partition(", got ")[0]
+    types, _, bounds = said.partition("` ")
+    words = [WORDS.get(w, w) for w in re.split(r" \| ", types.strip("`"))]
+    text = " or ".join(words)
+    return f"{text} {bounds}".strip() if bounds else text
+
+
+def _steps(path: str, value: Any) -> list[str | int | None]:
+    """The steps of msgspec's path: names, indices, and None for a key that it does not tell."""
+    steps: list[str | int | None] = []
+    for name, index in re.findall(r"\.(\w+)|\[(\d+|\.\.\.)\]", path):
+        steps.append(name if name else None if index == "..." else int(index))
+    return steps
+
+
+def _walk(value: Any, steps: list[str | int | None]) -> tuple[str, Any, str | None]:
+    """(the steps as text, what stands there, the innermost name that an object on the way has)."""
+    text, name = "", None
+    for step in steps:
+        text += f"[{step}]" if isinstance(step, int) else "[...]" if step is None else f".{step}"
+        try:
+            value = next(iter(value.values())) if step is None else value[step]
+        except (KeyError, IndexError, TypeError, AttributeError, StopIteration):
+            return text, None, name
+        if isinstance(value, dict) and isinstance(value.get("name"), str):
+            name = value["name"]
+    return text, value, name
+
+
+def _fields_at(kind: Any, steps: list[str | int | None]) -> tuple[str, ...]:
+    """The fields of the object that ``steps`` lead to, as its schema tells."""
+    for step in steps:
+        kinds = _documents(kind) if isinstance(step, str) else []
+        if isinstance(step, str):
+            kind = next(
+                (get_type_hints(k, include_extras=False)[step] for k in kinds if step in k.__struct_fields__), None
+            )
+        else:
+            kind = next((get_args(k)[-1] for k in _options(kind) if get_origin(k) in (list, tuple, dict)), None)
+    return tuple(name for k in _documents(kind) for name in k.__struct_fields__)
+
+
+def _options(kind: Any) -> list[Any]:
+    """The kinds that a union is made of; of any other the kind itself."""
+    if get_origin(kind) is Annotated:
+        return _options(get_args(kind)[0])
+    if get_origin(kind) in (list, tuple, dict) or isinstance(kind, type):
+        return [kind]
+    return [own for each in get_args(kind) for own in _options(each)]
+
+
+def _documents(kind: Any) -> list[type[Document]]:
+    return [k for k in _options(kind) if isinstance(k, type) and not get_args(k) and issubclass(k, Document)]
