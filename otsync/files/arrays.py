@@ -7,7 +7,7 @@ import os
 import threading
 import zipfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
@@ -34,9 +34,21 @@ def atomic_write(path: str | os.PathLike[str], mode: str = "wb") -> Iterator[IO[
             stream.flush()
             os.fsync(stream.fileno())
         os.replace(temporary, path)
+    except OSError as error:  # a disk that is full names no file; a temporary one's name would help nobody
+        _remove(temporary)
+        if error.filename is not None and str(error.filename) != str(temporary):
+            raise
+        raise type(error)(
+            error.errno, f"cannot be written ({error.strerror}); nothing is half written", str(path)
+        ) from None
     except BaseException:
-        temporary.unlink(missing_ok=True)
+        _remove(temporary)
         raise
+
+
+def _remove(temporary: Path) -> None:
+    with suppress(OSError):
+        temporary.unlink(missing_ok=True)
 
 
 def write_json(path: str | os.PathLike[str], value: Any) -> None:
@@ -105,6 +117,10 @@ def read_npz(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> dic
             raise ValueError(f"arrays of {total} bytes, more than the {max_bytes} allowed; pass a larger max_bytes")
         with np.load(path, allow_pickle=False) as data:
             return {name: data[name] for name in data.files}
+    except MemoryError:
+        raise MemoryError(
+            f"{path}: expected arrays that fit into memory; they do not. Use fewer or smaller ones."
+        ) from None
     except (
         zipfile.BadZipFile,
         ValueError,

@@ -13,6 +13,8 @@ from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
 import msgspec
 
+from .arrays import write_json
+
 UNSEEN = r"\x00-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069\ud800-\udfff"
 """Characters that move a terminal's cursor, turn its text around, or cannot be written: a class of a pattern."""
 
@@ -103,6 +105,11 @@ def json_schema(kind: type[Document], title: str) -> dict[str, Any]:
     """The JSON Schema (2020-12) of a document."""
     schema = msgspec.json.schema(kind)
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": title, **schema}
+
+
+def write_schema(path: str | os.PathLike[str], kind: type[Document], title: str) -> None:
+    """Write the JSON Schema of a document, for editors and for programs that write such files."""
+    write_json(path, json_schema(kind, title))
 
 
 def fields_of(kind: type[Document]) -> tuple[str, ...]:

@@ -32,7 +32,7 @@ Number = float | None
 """A number, or null where it is not known."""
 
 
-class TransformFile(Document, kw_only=True):
+class TransformFile(Document, frozen=True, kw_only=True):
     """A similarity; see :data:`FRAMES`."""
 
     scale: float
@@ -43,7 +43,7 @@ class TransformFile(Document, kw_only=True):
     scale_sigma: Number = None
 
 
-class VideoOffset(Document, kw_only=True):
+class VideoOffset(Document, frozen=True, kw_only=True):
     """The clock of one video."""
 
     name: Name
@@ -58,7 +58,7 @@ class VideoOffset(Document, kw_only=True):
     transform: TransformFile | None = None
 
 
-class PairOffset(Document, kw_only=True):
+class PairOffset(Document, frozen=True, kw_only=True):
     """The answer of one pair."""
 
     a: Name
@@ -75,7 +75,7 @@ class PairOffset(Document, kw_only=True):
     transform: TransformFile | None = None
 
 
-class OffsetsFile(Document, kw_only=True):
+class OffsetsFile(Document, frozen=True, kw_only=True):
     """The content of offsets.json and truth.json."""
 
     format: Literal["otsync.offsets"]

@@ -18,17 +18,18 @@ from typing import Any, get_args
 import numpy as np
 
 from otsync.files.arrays import read_json, write_json
+from otsync.files.strict import checked
 from otsync.types import Camera, Clock, Offsets
 from otsync.types.clock import Source
 from recon.evaluate.views import ViewScore
 from recon.footage.footage import Footage
 from recon.observe.effects import Effect
 from recon.observe.recorded import kept, restored
+from recon.result.layout import MAX_SIDE, RunFile
 from recon.scene.gaussians4d import Gaussians4D
 
 FORMAT, VERSION = "otsync.reconstruction", 2
-MAX_VIDEOS = 10_000
-MAX_SIDE, MAX_PIXELS = 16_384, 2**26
+MAX_PIXELS = 2**26
 """Of one image: a foreign run.json or a requested width may take no more memory."""
 
 
@@ -188,11 +189,9 @@ def load_result(folder: str | os.PathLike[str]) -> SavedReconstruction:
         raise ValueError(
             f"{folder / 'run.json'}: expected format {FORMAT!r}, version {VERSION}; found another. Run the fit again."
         )
+    checked(document, RunFile, folder / "run.json", remedy="Run the fit again.")
     try:
-        rows = document["videos"]
-        if not isinstance(rows, list) or not 1 <= len(rows) <= MAX_VIDEOS:
-            raise ValueError(f"expected 1 to {MAX_VIDEOS} videos")
-        videos = tuple(_filmed_by(row) for row in rows)
+        videos = tuple(_filmed_by(row) for row in document["videos"])
         options, frame = _options(document["options"]), str(document["frame"])
         optics = restored(options["optics"])
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
