@@ -5,7 +5,7 @@ BIN    := $(VENV)/bin
 PIP    := $(BIN)/pip --disable-pip-version-check install --quiet -c constraints.txt
 WORKERS ?= 2
 
-.PHONY: demo test test-all bench docs stability lint format clean
+.PHONY: demo test test-all test-floors bench schemas docs stability lint format clean
 .DELETE_ON_ERROR:
 
 $(VENV)/.core: pyproject.toml constraints.txt
@@ -38,6 +38,10 @@ lint: $(VENV)/.test
 $(VENV)/.docs: $(VENV)/.core
 	$(PIP) -e '.[docs]'
 	touch $@
+
+schemas: $(VENV)/.test  ## docs/schemas/, from what the readers ask for
+	$(BIN)/python -m otsync.io.schemas docs/schemas
+	$(BIN)/python -m recon.result.layout docs/schemas
 
 docs: $(VENV)/.docs  ## the pages of docs/ as HTML in site/; fails on warnings, and on pages that load from a network
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet

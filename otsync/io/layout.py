@@ -10,9 +10,8 @@ from ..files.strict import Count, Document, Name, Text
 
 MAX_VIDEOS, MAX_FILES = 1000, 200_000
 
-Files = Text | list[Text]
-"""A pattern with ``*`` in the file name, or a list of files. How many is asked where they are looked for: bounds of a
-list beside a pattern of text in one union have msgspec 0.20 to 0.22 free memory twice."""
+Files = Text | Annotated[list[Text], Meta(min_length=1, max_length=MAX_FILES)]
+"""A pattern with ``*`` in the file name, or a list of files."""
 
 Row3 = Annotated[list[float], Meta(min_length=3, max_length=3)]
 Pixels = Annotated[int, Meta(ge=1, le=1_000_000)]
