@@ -226,29 +226,6 @@ def check_size(width: int, height: int) -> None:
         )
 
 
-def clear_parts(*folders: Path) -> None:
-    """Remove unfinished files that killed writers left in ``folders`` (see :func:`otsync.files.arrays.atomic_write`).
-
-    Those of living processes stay: another run may be writing there.
-    """
-    if os.name != "posix":  # elsewhere asking for a process would end it
-        return
-    for part in (p for folder in folders for p in folder.glob(".*.part")):
-        pid = part.name.removesuffix(".part").rpartition(".")[2].partition("-")[0]
-        if pid.isdecimal() and not _lives(int(pid)):
-            part.unlink(missing_ok=True)
-
-
-def _lives(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except PermissionError:
-        pass
-    return True
-
-
 def _filmed_by(row: dict[str, Any]) -> FilmedBy:
     c = row["camera"]
     check_size(int(c["width"]), int(c["height"]))
