@@ -48,10 +48,14 @@ def owner(folder: Path) -> str | None:
 
 
 @contextmanager
-def claimed(folder: str | os.PathLike[str], command: str) -> Iterator[Path]:
+def claimed(folder: str | os.PathLike[str], command: str, *, keep: bool = True) -> Iterator[Path]:
     """Hold ``folder`` for ``command`` while the block runs; it is made where there is none.
 
     Unfinished files that killed runs left in it, and in its ``stages``, are removed.
+
+    Args:
+        keep: leave the lock's file beside the result, to say whose it is. Off for folders of frames, which other
+            programs read file by file.
 
     ValueError where the folder holds the result of another command, or where another run works in it.
     """
@@ -69,11 +73,11 @@ def claimed(folder: str | os.PathLike[str], command: str) -> Iterator[Path]:
         yield folder
     finally:
         if lock is not None:
-            if owner(folder) is None:  # nothing was written: leave nothing
+            if not keep or owner(folder) is None:  # where nothing was written, nothing is left
                 with suppress(OSError):
                     (folder / LOCK).unlink()
                 if made:
-                    with suppress(OSError):
+                    with suppress(OSError):  # it is not empty
                         folder.rmdir()
             os.close(lock)
 

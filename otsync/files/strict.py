@@ -9,7 +9,8 @@ from __future__ import annotations
 import difflib
 import os
 import re
-from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
+from types import UnionType
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import msgspec
 
@@ -73,12 +74,16 @@ def checked(value: Any, kind: type[T], where: str | os.PathLike[str], at: str = 
         unknown = re.match(r"Object contains unknown field `(.*)`$", said, re.DOTALL)
         absent = re.match(r"Object missing required field `(\w+)`$", said)
         if unknown:
-            expected, found_text = _unknown(unknown[1], _fields_at(kind, steps))
+            known = tuple(name for each in _kinds_at(kind, steps) for name in getattr(each, "__struct_fields__", ()))
+            expected, found_text = _unknown(unknown[1], known)
             field = f"{field}.{shown(unknown[1])[1:-1]}".lstrip(".")
         elif absent:
             field, expected, found_text = f"{field}.{absent[1]}".lstrip("."), "a value", "none. Add it"
         else:
-            expected, found_text = _expected(said), shown(found)
+            choices = [
+                repr(x) for each in _kinds_at(kind, steps) if get_origin(each) is Literal for x in get_args(each)
+            ]
+            expected, found_text = " or ".join(choices) or _expected(said), shown(found)
         of = f" (of {shown(names)})" if names is not None else ""
         advice = "" if unknown or absent else f" {remedy or 'Correct it; docs/formats.md lists the fields.'}"
         raise ValueError(
@@ -198,27 +203,21 @@ def _walk(value: Any, steps: list[str | int | None]) -> tuple[str, Any, str | No
     return text, value, name
 
 
-def _fields_at(kind: Any, steps: list[str | int | None]) -> tuple[str, ...]:
-    """The fields of the object that ``steps`` lead to, as its schema tells."""
+def _kinds_at(kind: Any, steps: list[str | int | None]) -> list[Any]:
+    """What the schema asks for at the end of ``steps``: the options of a union, else one kind."""
     for step in steps:
-        kinds = _documents(kind) if isinstance(step, str) else []
         if isinstance(step, str):
-            kind = next(
-                (get_type_hints(k, include_extras=False)[step] for k in kinds if step in k.__struct_fields__), None
-            )
+            holders = [k for k in _options(kind) if isinstance(k, type) and issubclass(k, Document)]
+            kind = next((get_type_hints(k)[step] for k in holders if step in k.__struct_fields__), None)
         else:
-            kind = next((get_args(k)[-1] for k in _options(kind) if get_origin(k) in (list, tuple, dict)), None)
-    return tuple(name for k in _documents(kind) for name in k.__struct_fields__)
+            kind = next((get_args(k)[-1] for k in _options(kind) if get_origin(k) in (list, dict)), None)
+    return _options(kind)
 
 
 def _options(kind: Any) -> list[Any]:
     """The kinds that a union is made of; of any other the kind itself."""
     if get_origin(kind) is Annotated:
         return _options(get_args(kind)[0])
-    if get_origin(kind) in (list, tuple, dict) or isinstance(kind, type):
-        return [kind]
-    return [own for each in get_args(kind) for own in _options(each)]
-
-
-def _documents(kind: Any) -> list[type[Document]]:
-    return [k for k in _options(kind) if isinstance(k, type) and not get_args(k) and issubclass(k, Document)]
+    if get_origin(kind) in (Union, UnionType):
+        return [own for each in get_args(kind) for own in _options(each)]
+    return [kind]

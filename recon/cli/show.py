@@ -83,7 +83,7 @@ class Render:
         check_times(result.scene, times)
         turns = 1.0 if self.turns is None else self.turns
         images = rendered(result, times, self.camera, turns=turns, width=self.width)
-        with nullcontext() if self.out.suffix else claimed(self.out, "recon render"):
+        with nullcontext() if self.out.suffix else claimed(self.out, "recon render", keep=False):
             refuse_longer(self.out, len(times))
             count = write_images(counted(images, "rendering", "image", len(times)), self.out, fps)
         print(f"wrote {count} images to {self.out}")
@@ -211,7 +211,7 @@ class Export:
             times = frame_times(result.scene, self.fps).tolist()
         out = self.out or self.result / exporter.file
         refuse_parts_of_a_result(out)
-        with claimed(out, "recon export") if exporter.name == "ply-sequence" else nullcontext():
+        with claimed(out, "recon export", keep=False) if exporter.name == "ply-sequence" else nullcontext():
             export(result.scene, exporter, out, times, result.frame)
         print(f"wrote {out}")
         return 0

@@ -11,7 +11,6 @@ import pytest
 
 from otsync.cli import main
 from otsync.files.claim import LOCK, MARKS, claimed, owner, refuse_parts_of_a_result
-from recon.cli import main as recon
 from tests.docs.pages import ROOT
 
 HOLD = """
@@ -129,7 +128,16 @@ def test_commands_refuse_before_they_work(tmp_path, capsys):
         assert main([*command, "--out", str(tmp_path)]) == 2
         assert "holds that of otsync run" in capsys.readouterr().err
     assert main(["simulate", str(tmp_path)]) == 2
+    assert capsys.readouterr().err.count("holds that of otsync run") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["offsets_coarse.json"]
+
+
+def test_commands_of_the_reconstruction_refuse_before_they_work(tmp_path, capsys):
+    pytest.importorskip("torch")
+    from recon.cli import main as recon
+
+    (tmp_path / "offsets_coarse.json").touch()
     assert recon(["fit", "nowhere", "--offsets", "none.json", "--out", str(tmp_path)]) == 2
     assert recon(["simulate", str(tmp_path)]) == 2
-    assert capsys.readouterr().err.count("holds that of otsync run") == 3
+    assert capsys.readouterr().err.count("holds that of otsync run") == 2
     assert [path.name for path in tmp_path.iterdir()] == ["offsets_coarse.json"]

@@ -71,6 +71,7 @@ def test_a_sound_document_becomes_what_its_schema_says():
             {"depth": {"scales": 1}},
             "videos[0].depth.scales (of 'left'): expected a field that there is; found 'scales'. Did",
         ),
+        ({"camera": 5}, "videos[0].camera (of 'left'): expected an object or null; found 5. "),
         ({"range": [0, -3]}, "videos[0].range[1] (of 'left'): expected a whole number >= 0; found -3. "),
     ],
 )
@@ -82,6 +83,7 @@ def test_each_slip_is_named_with_what_was_expected_and_found(change, says):
     "change, says",
     [
         ({"notes": 5}, "notes: expected a list; found 5. "),
+        ({"version": 2}, "version: expected 1; found 2. "),
         ({"notes": ["a\nb"]}, r"notes[0]: expected text on one line, without control characters; found 'a\nb'"),
         ({"frame": None}, "frame: expected text; found null. "),
         ({"videos": {}}, "videos: expected a list; found an object with no fields. "),
