@@ -62,10 +62,9 @@ def checked(value: Any, kind: type[T], where: str | os.PathLike[str], at: str = 
     ValueError names the file, the field, what was expected and what was found: of a field that there is not the nearest
     one that there is.
     """
+    _all_on_one_line(value, where, "" if at == "$" else at)  # first: msgspec stumbles over what cannot be encoded
     try:
-        found_kind = msgspec.convert(value, kind, strict=True)
-        _on_one_line(value, where, "" if at == "$" else at)
-        return found_kind
+        return msgspec.convert(value, kind, strict=True)
     except msgspec.ValidationError as error:
         said, _, path = str(error).partition(" - at ")
         steps = _steps(path.strip("`").removeprefix("$"), value)
@@ -91,21 +90,27 @@ def checked(value: Any, kind: type[T], where: str | os.PathLike[str], at: str = 
         ) from None
 
 
-def _on_one_line(value: Any, where: str | os.PathLike[str], at: str) -> None:
-    """ValueError for a text, or a key, with characters that a terminal heeds or that cannot be written."""
-    if isinstance(value, str):
-        if re.search(rf"[{UNSEEN}]", value):
-            raise ValueError(
-                f"{where}: {at.lstrip('.')}: expected text on one line, without control characters; found "
-                f"{shown(value)}. Take them out."
-            )
-    elif isinstance(value, dict):
-        for key, item in value.items():
-            _on_one_line(key, where, at)
-            _on_one_line(item, where, f"{at}.{key}")
-    elif isinstance(value, list):
-        for n, item in enumerate(value):
-            _on_one_line(item, where, f"{at}[{n}]")
+def on_one_line(text: str, field: str) -> None:
+    """ValueError, beginning with the field, for a text with characters that a terminal heeds or none can write."""
+    if re.search(rf"[{UNSEEN}]", text):
+        raise ValueError(
+            f"{field}: expected text on one line, without control characters; found {shown(text)}. Take them out."
+        )
+
+
+def _all_on_one_line(value: Any, where: str | os.PathLike[str], at: str) -> None:
+    """The same of every text and key of a document, however deep."""
+    left = [(value, at)]
+    while left:
+        part, at = left.pop()
+        if isinstance(part, str):
+            on_one_line(part, f"{where}: {at.lstrip('.')}")
+        elif isinstance(part, dict):
+            for key in part:
+                on_one_line(key, f"{where}: {at.lstrip('.') or 'a key'}")
+            left += [(item, f"{at}.{key}") for key, item in part.items()]
+        elif isinstance(part, list):
+            left += [(item, f"{at}[{n}]") for n, item in enumerate(part) if not isinstance(item, float)]
 
 
 def shown(value: Any) -> str:

@@ -66,6 +66,7 @@ class Finding:
     remedy: str
 
 
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")  # a stranger's 1e308 is a finding, not a warning
 def check_scene(
     path: str | os.PathLike[str], *, every_frame: bool = True, allow_outside: bool = False
 ) -> list[Finding]:

@@ -48,7 +48,9 @@ class Camera:
         if w2c.shape[-2:] != (4, 4) or w2c.ndim not in (2, 3) or not np.isfinite(w2c).all():
             raise ValueError(f"Camera.w2c: expected finite values of shape (4,4) or (T,4,4); found shape {w2c.shape}.")
         R = w2c[..., :3, :3]
-        if not np.allclose(R @ np.swapaxes(R, -1, -2), np.eye(3), atol=1e-3):
+        with np.errstate(over="ignore", invalid="ignore"):  # a stranger's 1e308 is no rotation, and no more
+            turns = np.allclose(R @ np.swapaxes(R, -1, -2), np.eye(3), atol=1e-3)
+        if not turns:
             raise ValueError(
                 "Camera.w2c: expected a rotation in the upper 3x3; its rows are not orthonormal. Take scale out of it."
             )

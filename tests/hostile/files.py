@@ -15,7 +15,6 @@ import numpy as np
 from PIL import Image
 
 from otsync import Alignment, Offsets, TrackSet
-from otsync.files.arrays import read_npz
 from otsync.io import VideoFrames, open_scene
 from otsync.io.document import write_document
 from otsync.io.frames import ArrayFrames
@@ -42,6 +41,8 @@ class Kind:
     write: Callable[[Path], None]
     read: Callable[[Path], Any]
     others: tuple[str, ...] = ()
+    sound: bool = True
+    """Whether the file is one that is read, before it is damaged."""
 
 
 def tracks(folder: Path) -> None:
@@ -165,7 +166,7 @@ KINDS = (
     Kind("labels", "labels.png", picture("labels.png", np.uint16, 24, 32), read_labels),
     Kind("depth png", "depth.png", picture("depth.png", np.uint16, 24, 32), lambda path: read_depth(path, 0.001)),
     Kind("depth npy", "depth.npy", array("depth.npy", 24, 32), lambda path: read_depth(path, 1.0)),
-    Kind("depth exr", "depth.exr", exr, lambda path: read_depth(path, 1.0)),
+    Kind("depth exr", "depth.exr", exr, lambda path: read_depth(path, 1.0), sound=False),
     Kind("depth stack", "stack.npy", array("stack.npy", 3, 24, 32), lambda path: ArrayFrames(path)[2]),
     Kind("video", "left.mp4", video, read_video),
     Kind("bvh", "walk.bvh", text("walk.bvh", BVH), read_bvh),
@@ -230,7 +231,8 @@ def _other_json(document: Any, rng: np.random.Generator) -> tuple[bytes, tuple[s
             visit(value, here)
 
     visit(document, ())
-    part, key, way = places[int(rng.integers(0, len(places)))]
+    part, key, _ = places[int(rng.integers(0, len(places)))]
+    names = tuple({name for *_, way in places for name in way})
     fate = int(rng.integers(0, 5)) if isinstance(part, dict) else 0
     if fate == 1:
         part[f"{key}s"] = part.pop(key)
@@ -240,7 +242,7 @@ def _other_json(document: Any, rng: np.random.Generator) -> tuple[bytes, tuple[s
         part[f"{key}_"] = copy.deepcopy(part[key])
     else:
         part[key] = copy.deepcopy(HOSTILE[int(rng.integers(0, len(HOSTILE)))])
-    return _dumped(document).encode("utf-8", "surrogatepass"), way
+    return _dumped(document).encode("utf-8", "surrogatepass"), names
 
 
 def _dumped(value: Any) -> str:
@@ -281,7 +283,3 @@ def _other_header(content: bytes, rng: np.random.Generator) -> bytes:
     out = io.BytesIO()
     np.lib.format.write_array_header_1_0(out, {"descr": kind, "fortran_order": False, "shape": shape})
     return out.getvalue() + content[stream.tell() :]
-
-
-def plain_arrays(path: Path) -> dict[str, np.ndarray]:
-    return read_npz(path)

@@ -18,5 +18,5 @@ def test_damaged_files_are_read_or_refused(kind: Kind, tmp_path):
 @pytest.mark.slow
 @ALL
 def test_two_thousand_damaged_files_are_read_or_refused(kind: Kind, tmp_path):
-    """With those of the reconstruction over 2000."""
-    assert fuzzed(kind, tmp_path, 120, seed=14) >= 10
+    """140 of each of 15 kinds."""
+    assert fuzzed(kind, tmp_path, 140, seed=14) >= 10

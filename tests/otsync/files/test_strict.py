@@ -90,7 +90,7 @@ def test_each_slip_is_named_with_what_was_expected_and_found(change, says):
         ({"videos": []}, "videos: expected a list of length >= 1; found []. "),
         ({"videos": [3]}, "videos[0]: expected an object; found 3. "),
         ({"vidoes": []}, "vidoes: expected a field that there is; found 'vidoes'. Did you mean 'videos'? "),
-        ({"a\x07b": 1}, r"a\x07b: expected one of the fields format, version, videos, "),
+        ({"a\x07b": 1}, r"a key: expected text on one line, without control characters; found 'a\x07b'. "),
     ],
 )
 def test_slips_of_the_whole(change, says):
