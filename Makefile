@@ -27,6 +27,9 @@ test: $(VENV)/.test lint  ## under ten minutes on two cores
 test-all: $(VENV)/.test lint  ## every test, the slow ones too
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 
+test-floors:  ## fast tests of the core with the lowest versions that pyproject.toml allows, in an environment of its own
+	PYTHON=$(PYTHON) WORKERS=$(WORKERS) .ci/floors
+
 bench: $(VENV)/.test  ## what is timed; writes bench/out/
 	$(BIN)/otsync bench all --out bench/out
 

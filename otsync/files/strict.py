@@ -113,6 +113,15 @@ def _all_on_one_line(value: Any, where: str | os.PathLike[str], at: str) -> None
             left += [(item, f"{at}[{n}]") for n, item in enumerate(part) if not isinstance(item, float)]
 
 
+def in_words(error: Exception) -> str:
+    """An error that Python raised over the content of a file, in the words that our own have."""
+    if isinstance(error, KeyError):
+        return f"{shown(str(error.args[0]))[1:-1]}: expected a value; found none"
+    if isinstance(error, ValueError) and "expected" in str(error):
+        return str(error)
+    return f"expected another content; found what gives {type(error).__name__} ({shown(str(error))[1:-1]})"
+
+
 def shown(value: Any) -> str:
     """A value as an error shows it: in one line, short, without characters that a terminal heeds."""
     if isinstance(value, int) and not isinstance(value, bool) and abs(value) >= 10**40:

@@ -32,6 +32,7 @@ import numpy as np
 from ..files.arrays import read_json
 from ..files.strict import checked, shown
 from ..types import Camera, Video
+from ..types.camera import matrix_of
 from .document import FORMAT, VERSION
 from .frames import ArrayFrames, FrameRange, ImageFrames, LazyFrames, VideoFrames
 from .images import read_depth, read_image, read_labels, read_mask
@@ -203,23 +204,13 @@ def camera_from(value: Any) -> Camera:
             + (own if missing == ["w2c"] else "")
         )
     return Camera(
-        _matrix(value["K"], "camera.K", "(3,3)"),
-        _matrix(value["w2c"], "camera.w2c", "(4,4), or (T,4,4)"),
+        matrix_of(value["K"], "camera.K", "(3,3)"),
+        matrix_of(value["w2c"], "camera.w2c", "(4,4), or (T,4,4)"),
         int(value["width"]),
         int(value["height"]),
         None if value.get("distortion") is None else np.asarray(value["distortion"], float),
         None if value.get("readout") is None else float(value["readout"]),
     )
-
-
-def _matrix(value: Any, name: str, shape: str) -> np.ndarray:
-    """Rows of numbers as an array; its shape is the camera's affair. ValueError for rows of several lengths."""
-    try:
-        return np.asarray(value, float)
-    except (ValueError, TypeError, OverflowError):
-        raise ValueError(
-            f"{name}: expected numbers of shape {shape}; found rows of several lengths. Write all rows whole."
-        ) from None
 
 
 def _depth(value: Any, paths: Paths) -> LazyFrames | None:

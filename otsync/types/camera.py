@@ -146,6 +146,16 @@ class Video:
         return frame_times(self.fps, self.timestamps, len(self.frames))
 
 
+def matrix_of(value: Any, name: str, shape: str) -> np.ndarray:
+    """Rows of numbers as an array; its shape is the camera's affair. ValueError for rows of several lengths."""
+    try:
+        return np.asarray(value, float)
+    except (ValueError, TypeError, OverflowError):
+        raise ValueError(
+            f"{name}: expected numbers of shape {shape}; found rows of several lengths. Write all rows whole."
+        ) from None
+
+
 def clock(
     fps: float | None, timestamps: Any, n_frames: int, owner: str
 ) -> tuple[float | None, Float[np.ndarray, " T"] | None]:

@@ -18,8 +18,9 @@ from typing import Any, get_args
 import numpy as np
 
 from otsync.files.arrays import read_json, write_json
-from otsync.files.strict import checked
+from otsync.files.strict import checked, in_words
 from otsync.types import Camera, Clock, Offsets
+from otsync.types.camera import matrix_of
 from otsync.types.clock import Source
 from recon.evaluate.views import ViewScore
 from recon.footage.footage import Footage
@@ -196,7 +197,7 @@ def load_result(folder: str | os.PathLike[str]) -> SavedReconstruction:
         optics = restored(options["optics"])
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
         raise ValueError(
-            f"{folder / 'run.json'}: not a sound reconstruction; {type(error).__name__}: {error}. Run the fit again."
+            f"{folder / 'run.json'}: not a sound reconstruction; {in_words(error)}. Run the fit again."
         ) from None
     scene, offsets = Gaussians4D.load(folder / "scene.npz"), Offsets.load(folder / "offsets.json")
     return SavedReconstruction(scene, offsets, videos, options, frame, optics)
@@ -231,7 +232,12 @@ def _filmed_by(row: dict[str, Any]) -> FilmedBy:
     check_size(int(c["width"]), int(c["height"]))
     readout = None if c["readout"] is None else float(c["readout"])
     camera = Camera(
-        np.array(c["K"], float), np.array(c["w2c"], float), int(c["width"]), int(c["height"]), None, readout
+        matrix_of(c["K"], "camera.K", "(3,3)"),
+        matrix_of(c["w2c"], "camera.w2c", "(4,4), or (T,4,4)"),
+        int(c["width"]),
+        int(c["height"]),
+        None,
+        readout,
     )
     seconds, rate, how = (row["clock"][k] for k in ("offset_seconds", "rate", "known"))
     clock = Clock(float(seconds), float(rate), how)

@@ -55,10 +55,11 @@ def fuzzed(kind: Kind, folder: Path, count: int, seed: int) -> int:
             assert named, f"{what}: the file is not named: {said}"
             assert "\n" not in said and said.isprintable(), f"{what}: not one line: {said!r}"
             assert "expected" in said or "no such file" in said or "occurs twice" in said, f"{what}: no remedy: {said}"
-            if fields:
+            if fields and kind.sound:
                 fields += tuple(
                     f"Camera.{name.removeprefix('camera_')}" for name in fields if name.startswith("camera_")
                 )
+                fields += tuple(last for name in fields if (last := name.rpartition(".")[2]) != name)
                 known = (*fields, "format", "version", "expected JSON", "pickled", "no files")
                 assert any(name in said for name in known), f"{what}: the field {fields} is not named: {said}"
     path.write_bytes(sound)
