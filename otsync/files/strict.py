@@ -140,6 +140,7 @@ def shown(value: Any) -> str:
             if value is None or isinstance(value, bool)
             else repr(value)
         )
+    text = " ".join(text.split("\n"))
     return text if len(text) <= 80 else text[:77] + "..."
 
 

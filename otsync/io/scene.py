@@ -88,7 +88,13 @@ def open_scene(path: str | os.PathLike[str], *, reader: str | None = None, allow
             otherwise have any file of yours read.
     """
     document, root = read_document(path, reader=reader)
-    return scene_from_document(document, root, allow_outside=allow_outside)
+    return scene_from_document(document, root, allow_outside=allow_outside, file=file_of(path))
+
+
+def file_of(path: str | os.PathLike[str]) -> Path:
+    """The file that tells of a scene, for errors; of a folder without one the folder."""
+    path = Path(path)
+    return path / "scene.json" if (path / "scene.json").is_file() else path
 
 
 def read_document(path: str | os.PathLike[str], *, reader: str | None = None) -> tuple[dict[str, Any], Path]:
@@ -110,9 +116,15 @@ def read_document(path: str | os.PathLike[str], *, reader: str | None = None) ->
     return document, path.parent
 
 
-def scene_from_document(document: dict[str, Any], root: Path, *, allow_outside: bool = False) -> Scene:
-    """Build the scene; ValueError names the file, the video and the field for anything unsound."""
-    file = Path(root) / "scene.json"
+def scene_from_document(
+    document: dict[str, Any], root: Path, *, allow_outside: bool = False, file: Path | None = None
+) -> Scene:
+    """Build the scene; ValueError names the file, the video and the field for anything unsound.
+
+    Args:
+        root: the folder that paths are relative to. file: where the document is from, for errors.
+    """
+    file = file or file_of(root)
     checked(document, SceneFile, file)
     entries = document["videos"]
     if document.get("missing"):

@@ -16,7 +16,7 @@ from ..files.strict import checked, shown
 from ..geometry import common_target
 from ..io.frames import VideoFrames
 from ..io.layout import MAX_VIDEOS, SceneFile, VideoFile
-from ..io.scene import Paths, Scene, camera_from, read_document, scene_from_document, video_frames
+from ..io.scene import Paths, Scene, camera_from, file_of, read_document, scene_from_document, video_frames
 from ..types import Camera, Video
 
 FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -79,7 +79,7 @@ def check_scene(
         document, root = read_document(path)
     except (ValueError, OSError) as error:
         return [Finding("error", "", str(error), "Mend the file, or write it anew with otsync init.")]
-    findings, entries = _layout(document, root)
+    findings, entries = _layout(document, file_of(path))
     if not entries:
         return findings
     document = {**document, "videos": entries}
@@ -95,7 +95,9 @@ def check_scene(
         if pose:
             continue
         try:
-            one = scene_from_document({**document, "videos": [entry], "missing": []}, root, allow_outside=allow_outside)
+            one = scene_from_document(
+                {**document, "videos": [entry], "missing": []}, root, allow_outside=allow_outside, file=file_of(path)
+            )
         except (ValueError, OSError) as error:
             findings.append(Finding("error", name, str(error), ""))
             continue
@@ -108,9 +110,9 @@ def check_scene(
     return sorted(findings, key=lambda f: f.severity)
 
 
-def _layout(document: dict[str, Any], root: Path) -> tuple[list[Finding], list[dict[str, Any]]]:
+def _layout(document: dict[str, Any], file: Path) -> tuple[list[Finding], list[dict[str, Any]]]:
     """What the schema says of the document and of each video, and the videos that are as it says, named."""
-    file, entries = root / "scene.json", document.get("videos")
+    entries = document.get("videos")
     findings, sound = [], []
     for n, entry in enumerate(entries[:MAX_VIDEOS] if isinstance(entries, list) else ()):
         name = entry.get("name", f"video{n}") if isinstance(entry, dict) else f"video{n}"

@@ -26,7 +26,7 @@ from recon.evaluate.views import ViewScore, view
 from recon.fit.verb import Reconstruction, fit
 from recon.observe.effects import Effect
 from recon.observe.recorded import kept, optics, with_declared
-from recon.pipeline.intake import given_clocks, readable
+from recon.pipeline.intake import given_clocks, readable, trained
 from recon.pipeline.plan import Plan
 from recon.pipeline.prepare import Prepared, prepare
 from recon.pipeline.stages import read_footage
@@ -88,9 +88,10 @@ def reconstruct(
 
     plan, progress, cache = plan or Plan(), progress or Progress(), cache or Cache(out / "stages")
     # what is lacking is said before the work, not after it
+    train = trained(scene, offsets, held_out)
     check_effects_of(plan, [v.camera.readout for v in scene.videos if v.name not in held_out])
     if truth is not None:
-        _check_truth(truth, [n for n in scene.names if n in given_clocks(offsets) and n not in held_out])
+        _check_truth(truth, train)
     out.mkdir(parents=True, exist_ok=True)
     clear_parts(out, out / "stages")
     ready = prepare(
