@@ -88,6 +88,8 @@ def checked(value: Any, kind: type[T], where: str | os.PathLike[str], at: str = 
         raise ValueError(
             f"{where}: {field or 'the whole of it'}{of}: expected {expected}; found {found_text}.{advice}"
         ) from None
+    except RecursionError:
+        raise ValueError(f"{where}: expected a document of a few levels; found too many. Write it anew.") from None
 
 
 def on_one_line(text: str, field: str) -> None:

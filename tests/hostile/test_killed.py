@@ -188,14 +188,16 @@ SHOWN = [
 def test_exports_and_renderings_that_are_killed_or_find_the_disk_full(whole, tmp_path, fault):
     before = digests(whole)
     for n, ((command, *options), name, at) in enumerate(SHOWN):
+        if fault == "full" and name == "a.mp4":  # FFmpeg writes by itself
+            continue
         out, other = tmp_path / f"{fault}{n}" / name, tmp_path / f"whole{n}" / name
         at = at if fault == "kill" else max(1, at // 3)
         code, err = ended("recon", command, whole, *options, "--out", out, fault=fault, at=at)
         if fault == "kill":
             assert code == -signal.SIGKILL, (n, err)
-        elif not name.endswith("mp4"):  # FFmpeg writes by itself
+        else:
             assert code == 2 and "No space left on device" in clean(err), (n, err)
-        assert not out.is_file() or at == 3
+        assert not out.is_file()
         assert digests(whole) == before
         for target in (out, other):
             code, err = ended("recon", command, whole, *options, "--out", target)
