@@ -208,7 +208,7 @@ def _steps(path: str, value: Any) -> list[str | int | None]:
 
 def _walk(value: Any, steps: list[str | int | None]) -> tuple[str, Any, str | None]:
     """(the steps as text, what stands there, the innermost name that an object on the way has)."""
-    text, name = "", None
+    text, name = "", value.get("name") if isinstance(value, dict) and isinstance(value.get("name"), str) else None
     for step in steps:
         text += f"[{step}]" if isinstance(step, int) else "[...]" if step is None else f".{step}"
         try:

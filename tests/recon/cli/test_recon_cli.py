@@ -309,7 +309,7 @@ def test_a_damaged_result_is_named(result, tmp_path, capsys):
     shutil.copytree(result, tmp_path / "odd")
     (tmp_path / "odd" / "run.json").write_text(json.dumps(run))
     assert main(["render", str(tmp_path / "odd"), "--camera", "cam0"]) == 2
-    assert "not a sound reconstruction" in capsys.readouterr().err
+    assert "run.json: videos[0].gain (of 'cam0'): expected a list" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
