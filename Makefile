@@ -5,7 +5,7 @@ BIN    := $(VENV)/bin
 PIP    := $(BIN)/pip --disable-pip-version-check install --quiet -c constraints.txt
 WORKERS ?= 2
 
-.PHONY: demo test test-all bench docs stability lint format clean
+.PHONY: demo test test-all test-floors bench schemas docs stability lint format clean
 .DELETE_ON_ERROR:
 
 $(VENV)/.core: pyproject.toml constraints.txt
@@ -27,6 +27,9 @@ test: $(VENV)/.test lint  ## under ten minutes on two cores
 test-all: $(VENV)/.test lint  ## every test, the slow ones too
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 
+test-floors:  ## fast tests of the core with the lowest versions that pyproject.toml allows, in an environment of its own
+	PYTHON=$(PYTHON) WORKERS=$(WORKERS) .ci/floors
+
 bench: $(VENV)/.test  ## what is timed; writes bench/out/
 	$(BIN)/otsync bench all --out bench/out
 
@@ -38,6 +41,10 @@ lint: $(VENV)/.test
 $(VENV)/.docs: $(VENV)/.core
 	$(PIP) -e '.[docs]'
 	touch $@
+
+schemas: $(VENV)/.test  ## docs/schemas/, from what the readers ask for
+	$(BIN)/python -m otsync.io.schemas docs/schemas
+	$(BIN)/python -m recon.result.layout docs/schemas
 
 docs: $(VENV)/.docs  ## the pages of docs/ as HTML in site/; fails on warnings, and on pages that load from a network
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet

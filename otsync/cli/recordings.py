@@ -165,6 +165,10 @@ def sync_recording(
     else:
         scene = open_scene(path, allow_outside=options.allow_outside)
         solve = partial(synchronize_scene, route=options.route)
+    if own and (out / "scene.json").exists() and out.resolve() == scene.root.resolve():
+        raise ValueError(
+            f"--out: expected another folder than the recording's, whose scene.json it would replace: {out}."
+        )
     if options.cameras:
         scene = scene.take(options.cameras)
     chosen = reference_among(scene.names, reference)

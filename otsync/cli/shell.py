@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import importlib
 import logging
+import signal
 import sys
-from collections.abc import Callable, Mapping, Sequence
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
@@ -73,6 +77,8 @@ def run_command(
         refused: errors that mean an answer is not to be trusted: exit code 1. Bad arguments or files (ValueError,
             OSError, a package that is not installed) give 2, an interrupt 130.
         interrupted: what an interrupted run leaves behind, in words.
+
+    SIGTERM is an interrupt like Ctrl-C.
     """
     try:
         rest = shared_options(list(sys.argv[1:] if args is None else args))
@@ -80,17 +86,66 @@ def run_command(
             print(f"{prog} {__version__}")
             return 0
         command = parsed(prog, commands(), rest, description + SHARED)
-        return command.run()
+        with ended_like_ctrl_c():
+            return command.run()
     except refused as error:
         code, said = 1, str(error)
     except ModuleNotFoundError as error:
         code, said = 2, missing_package(error)
-    except (ValueError, OSError) as error:
+    except ValueError as error:
         code, said = 2, str(error)
+    except OSError as error:
+        code, said = 2, of_the_system(error)
+    except MemoryError as error:
+        code, said = 2, str(error) or "not enough memory"
+        if "Use " not in said:  # our own name a file and what to do
+            said += ". Use fewer frames or videos, or smaller images."
     except KeyboardInterrupt:
         code, said = 130, f"interrupted; {interrupted}"
     print(f"{prog}: {said}", file=sys.stderr)
     return code
+
+
+REMEDIES = {
+    errno.ENOSPC: "Free some space, or write to another disk.",
+    errno.EDQUOT: "Free some space, or write to another disk.",
+    errno.EFBIG: "Write to a disk that takes larger files.",
+    errno.EACCES: "Check its permissions.",
+    errno.EPERM: "Check its permissions.",
+    errno.EROFS: "Write to another disk.",
+    errno.EMFILE: "Raise the limit of open files (ulimit -n).",
+    errno.ENAMETOOLONG: "Give it a shorter name.",
+    errno.EIO: "Check the disk.",
+}
+"""What to do about an error of the system, by its number."""
+
+
+def of_the_system(error: OSError) -> str:
+    """The file, what went wrong and what to do, of an error that the system raised; of our own their words."""
+    if error.errno is None or not error.strerror:
+        return str(error)
+    what = f"{error.filename}: " if error.filename is not None else ""
+    return f"{what}{error.strerror}. {REMEDIES.get(error.errno, 'Check the path and the disk.')}"
+
+
+@contextmanager
+def ended_like_ctrl_c() -> Iterator[None]:
+    """SIGTERM, which schedulers and service managers send, raises KeyboardInterrupt, so that everything is cleared up.
+
+    Only a process's main thread can be told so.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def interrupt(number: int, frame: Any) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL if before is None else before)
 
 
 def parsed(prog: str, commands: Mapping[str, Load], args: list[str], description: str) -> Any:

@@ -8,6 +8,7 @@ from typing import Literal
 
 import tyro
 
+from ..files.claim import claimed
 from ..sync.verb import unique_names
 from ..types import Offsets
 from .tables import report, with_progress
@@ -31,9 +32,12 @@ class Demo:
     seed: int = 1
 
     def run(self) -> int:
+        with claimed(self.out, "otsync demo"):
+            return self._run()
+
+    def _run(self) -> int:
         from ..simulate import simulate
 
-        self.out.mkdir(parents=True, exist_ok=True)
         tracks, truth = simulate(self.motion, preset=self.preset, videos=self.videos, seed=self.seed)
         print(
             f"{self.videos} videos of a simulated scene ({self.motion}, {self.preset}), filmed without a common clock."
@@ -64,6 +68,10 @@ class Simulate:
     seed: int = 0
 
     def run(self) -> int:
+        with claimed(self.out, "otsync simulate"):
+            return self._run()
+
+    def _run(self) -> int:
         from ..simulate import simulate
 
         tracks, truth = simulate(

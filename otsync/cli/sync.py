@@ -8,6 +8,7 @@ from typing import Annotated
 
 import tyro
 
+from ..files.claim import claimed
 from ..sync.graph import Graph
 from ..sync.own_frames import COMPLETE, Frames
 from ..sync.verb import unique_names
@@ -53,6 +54,10 @@ class Sync:
     """Print the content of offsets.json instead of the table."""
 
     def run(self) -> int:
+        with claimed(self.out, "otsync sync"):
+            return self._run()
+
+    def _run(self) -> int:
         method = self.slots.chosen(Graph(complete=COMPLETE) if self.frames == "own" else None)
         if len(self.tracks) == 1 and self.tracks[0].suffix != ".npz":
             refuse_unused(self, ("workers",), f"a recording ({self.tracks[0]}), which has --recording.workers,")
@@ -78,7 +83,6 @@ class Sync:
         names = unique_names(tracks)
         reference = reference_among(names, self.reference)
         known = None if self.truth is None else true_offsets(self.truth, names)
-        self.out.mkdir(parents=True, exist_ok=True)  # before the work, not after it
         offsets = with_progress(
             tracks,
             "synchronising",

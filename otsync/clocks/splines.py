@@ -25,6 +25,12 @@ BRIDGE_FRAMES = 2.5
 ON_SAMPLE = 1e-6
 """Frames within which a time is that of a sample, for rounding."""
 
+THIRD = (-1.0, 3.0, -3.0, 1.0)
+"""Weights of a third difference."""
+
+AT_ONCE = 2**20
+"""Samples and coefficients that are solved for together: some 100 MB, whatever the length of the clip."""
+
 WITHIN = 1e-9
 """Share of a knot's distance by which the last time is kept inside the last interval."""
 
@@ -64,22 +70,27 @@ class TrackSplines:
         self.mean, self.coefficients = self._fit(xyz, smoothing * max(1.0, 1 / (30 * self.frame)))
 
     def _fit(self, xyz: np.ndarray, penalty: float) -> tuple[np.ndarray, np.ndarray]:
-        seen = self.seen
-        weight = seen.astype(float)
-        values = np.where(seen[..., None], xyz, 0.0)
-        mean = values.sum(1) / np.maximum(weight.sum(1), 1)[:, None]
-        values = np.where(seen[..., None], xyz - mean[:, None], 0.0)
-        basis = self._design(self.times, DEGREE)
-        differences = np.diff(np.eye(self.n), 3, axis=0) if self.n > 3 else np.zeros((1, self.n))
-        regular = penalty * differences.T @ differences + RIDGE * np.eye(self.n)
-        bands = np.zeros((len(xyz), DEGREE + 1, self.n))
-        for d in range(DEGREE + 1):
-            product = basis[:, : self.n - d].multiply(basis[:, d:])
-            bands[:, DEGREE - d, d:] = weight @ product + np.diag(regular, d)
-        right = np.stack([basis.T @ v for v in values]) if len(xyz) else np.zeros((0, self.n, 3))
-        solved = [solveh_banded(bands[m], right[m], check_finite=False) for m in range(len(xyz))]
-        coefficients = np.stack(solved, 1) if solved else np.zeros((self.n, 0, 3))
-        return mean, np.ascontiguousarray(coefficients.reshape(self.n, -1))
+        """(M,3) means, and (n, M*3) coefficients around them. Memory grows with T + n, not with its square."""
+        count, basis = len(xyz), self._design(self.times, DEGREE)
+        # by diagonal: what turns the weights of samples into a band of the normal equations
+        products = [basis[:, : self.n - d].multiply(basis[:, d:]).T.tocsr() for d in range(DEGREE + 1)]
+        transposed, regular = basis.T.tocsr(), _penalty_bands(self.n, penalty)
+        mean, coefficients = np.zeros((count, 3)), np.zeros((self.n, count, 3))
+        many = max(1, AT_ONCE // (len(self.times) + self.n))
+        for first in range(0, count, many):
+            part = slice(first, first + many)
+            seen = self.seen[part]
+            weight = seen.astype(float)
+            values = np.where(seen[..., None], xyz[part], 0.0)
+            mean[part] = values.sum(1) / np.maximum(weight.sum(1), 1)[:, None]
+            values = np.where(seen[..., None], xyz[part] - mean[part, None], 0.0)
+            right = (transposed @ values.transpose(1, 0, 2).reshape(len(self.times), -1)).reshape(self.n, -1, 3)
+            bands = np.tile(regular, (len(values), 1, 1))
+            for d in range(DEGREE + 1):
+                bands[:, DEGREE - d, d:] += (products[d] @ weight.T).T
+            for m in range(len(values)):
+                coefficients[:, first + m] = solveh_banded(bands[m], right[:, m], check_finite=False)
+        return mean, coefficients.reshape(self.n, -1)
 
     def take(self, index: np.ndarray) -> TrackSplines:
         """The splines of the tracks at ``index`` (repeats allowed), without fitting anew."""
@@ -148,3 +159,14 @@ class TrackSplines:
     def _design(self, t: np.ndarray, degree: int) -> sparse.csr_array:
         knots = self.knots if degree == DEGREE else self.knots[1:-1]
         return sparse.csr_array(BSpline.design_matrix(np.clip(t, knots[degree], knots[-degree - 1]), knots, degree))
+
+
+def _penalty_bands(n: int, penalty: float) -> Float[np.ndarray, "4 n"]:
+    """Upper bands of λ D'D + ridge, D third differences of n >= 4 coefficients; row 3 - d is the d-th diagonal."""
+    bands = np.zeros((DEGREE + 1, n))
+    for d in range(DEGREE + 1):
+        for k in range(DEGREE + 1 - d):
+            # coefficient k of each difference beside coefficient k + d of the same one
+            bands[DEGREE - d, k + d : k + d + n - DEGREE] += penalty * THIRD[k] * THIRD[k + d]
+    bands[DEGREE] += RIDGE
+    return bands

@@ -7,7 +7,7 @@ import os
 import threading
 import zipfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
@@ -34,9 +34,21 @@ def atomic_write(path: str | os.PathLike[str], mode: str = "wb") -> Iterator[IO[
             stream.flush()
             os.fsync(stream.fileno())
         os.replace(temporary, path)
+    except OSError as error:  # a disk that is full names no file; a temporary one's name would help nobody
+        _remove(temporary)
+        if error.filename is not None and str(error.filename) != str(temporary):
+            raise
+        raise type(error)(
+            error.errno, f"cannot be written ({error.strerror}); nothing is half written", str(path)
+        ) from None
     except BaseException:
-        temporary.unlink(missing_ok=True)
+        _remove(temporary)
         raise
+
+
+def _remove(temporary: Path) -> None:
+    with suppress(OSError):
+        temporary.unlink(missing_ok=True)
 
 
 def write_json(path: str | os.PathLike[str], value: Any) -> None:
@@ -52,9 +64,23 @@ def read_json(path: str | os.PathLike[str], *, max_bytes: int = 64 * 2**20) -> A
     if path.stat().st_size > max_bytes:
         raise ValueError(f"{path}: expected a JSON file of at most {max_bytes} bytes; found {path.stat().st_size}.")
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+        return json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=_once)
+    except (ValueError, RecursionError) as error:  # a ValueError also for a number of more than 4300 digits
         raise ValueError(f"{path}: expected JSON; {error}. Write it again with otsync.") from None
+    except OSError as error:
+        raise type(error)(error.errno, f"cannot be read ({error.strerror}). Check its permissions", str(path)) from None
+    except MemoryError:
+        raise MemoryError(f"{path}: expected JSON that fits into memory; found too much. Cut the file.") from None
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object of JSON. ValueError for a key that occurs twice, of which one would be dropped in silence."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        names = [name for name, _ in pairs]
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"the key {twice[:80]!r} occurs twice in one object; leave one of them")
+    return found
 
 
 def existing(path: str | os.PathLike[str]) -> Path:
@@ -91,6 +117,10 @@ def read_npz(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> dic
             raise ValueError(f"arrays of {total} bytes, more than the {max_bytes} allowed; pass a larger max_bytes")
         with np.load(path, allow_pickle=False) as data:
             return {name: data[name] for name in data.files}
+    except MemoryError:
+        raise MemoryError(
+            f"{path}: expected arrays that fit into memory; they do not. Use fewer or smaller ones."
+        ) from None
     except (
         zipfile.BadZipFile,
         ValueError,

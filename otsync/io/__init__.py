@@ -1,5 +1,7 @@
 """Recordings in: scene documents, the readers that write them, and frames that are decoded lazily.
 
+layout.py       scene.json: what it may hold, the source of its JSON Schema
+schemas.py      JSON Schemas of scene.json and offsets.json, for docs/
 document.py     scene.json: format, version, writing
 scene.py        from a document to a scene, checked
 readers.py      what a reader is; READERS, in the order in which they are asked

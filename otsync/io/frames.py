@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..files.arrays import existing
-from .images import read_image, read_npy
+from .images import MAX_PIXELS, read_image, read_npy
 
 CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,flv,mxf,ogg"
 """Containers that hold their own frames. FFmpeg also knows playlists, which would have it read other files."""
@@ -128,6 +128,8 @@ class VideoFrames(LazyFrames):
         with self._errors(), self._open() as container:
             stream = container.streams.video[0]
             self.width, self.height = int(stream.codec_context.width), int(stream.codec_context.height)
+            if self.width * self.height > MAX_PIXELS:
+                raise ValueError(f"{self.width} x {self.height} pixels, more than the {MAX_PIXELS} allowed")
             self._base = float(stream.time_base or 0)
             self.rate = float(stream.average_rate) if stream.average_rate else None
             for packet in container.demux(stream):
@@ -143,7 +145,13 @@ class VideoFrames(LazyFrames):
     def _open(self) -> Any:
         import av
 
-        return av.open(f"file:{self.path.resolve()}", options={"format_whitelist": CONTAINERS})
+        container = av.open(f"file:{self.path.resolve()}", options={"format_whitelist": CONTAINERS})
+        if not container.streams.video:
+            container.close()
+            raise ValueError("no video in it")
+        # a frame may claim more pixels than the header: the decoder is told before it takes the memory
+        container.streams.video[0].codec_context.options = {"max_pixels": str(MAX_PIXELS)}
+        return container
 
     def _errors(self) -> _Errors:
         return _Errors(self.path)
@@ -202,7 +210,9 @@ class _Errors:
         if error is None or not isinstance(error, Exception) or isinstance(error, ImportError):
             return
         if type(error) is MemoryError:  # PyAV's own one comes from sizes that a damaged file makes up
-            return
+            raise MemoryError(
+                f"{self.path}: expected frames that fit into memory; found none left. Use a smaller video."
+            ) from None
         if isinstance(error, ValueError) and str(error).startswith(str(self.path)):
             return
         raise ValueError(

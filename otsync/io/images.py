@@ -67,7 +67,9 @@ def read_npy(path: str | os.PathLike[str], *, memmap: bool = False) -> np.ndarra
         with open(path, "rb") as stream:
             check_declared(stream, path.stat().st_size, "it")
         return np.load(path, mmap_mode="r" if memmap or path.stat().st_size > 2**20 else None, allow_pickle=False)
-    except (ValueError, OSError, EOFError, SyntaxError, TypeError, KeyError, OverflowError) as error:
+    except MemoryError:
+        raise MemoryError(f"{path}: expected an array that fits into memory; it does not. Use a smaller one.") from None
+    except Exception as error:  # tokenize.TokenError and the like: whatever a damaged header raises
         raise ValueError(f"{path}: expected a plain .npy array; {error}. Write it again.") from None
 
 
@@ -83,7 +85,9 @@ def _decode(path: str | os.PathLike[str]) -> Any:
             image.load()
             return image.copy()
     except MemoryError:
-        raise
+        raise MemoryError(
+            f"{path}: expected an image that fits into memory; found none left. Use smaller ones."
+        ) from None
     except Exception as error:  # decoders raise OSError, SyntaxError, struct.error, ... on damaged bytes
         raise ValueError(
             f"{path}: expected a readable image ({', '.join(FORMATS)}); {type(error).__name__}: {error}. "

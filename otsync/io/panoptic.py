@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..files.arrays import read_json
+from ..files.strict import in_words
 from .document import document
 
 METAS = ("train_meta.json", "test_meta.json")
@@ -39,7 +40,7 @@ class Panoptic:
                     videos += _videos(read_json(folder / name), folder, rate)
                 except (KeyError, TypeError, IndexError, ValueError, AttributeError) as error:
                     raise ValueError(
-                        f"{folder / name}: expected w, h, fn, k, w2c and cam_id; {type(error).__name__}: {error}."
+                        f"{folder / name}: expected w, h, fn, k, w2c and cam_id; {in_words(error)}. Mend the file."
                     ) from None
         videos.sort(key=lambda v: (len(v["name"]), v["name"]))
         assumed = f"the layout does not store the capture rate; {rate:g} fps assumed"

@@ -30,13 +30,14 @@ from typing import Any
 import numpy as np
 
 from ..files.arrays import read_json
+from ..files.strict import checked, shown
 from ..types import Camera, Video
+from ..types.camera import matrix_of
 from .document import FORMAT, VERSION
 from .frames import ArrayFrames, FrameRange, ImageFrames, LazyFrames, VideoFrames
 from .images import read_depth, read_image, read_labels, read_mask
+from .layout import MAX_FILES, SceneFile
 from .readers import describe_folder
-
-MAX_VIDEOS, MAX_FILES = 1000, 200_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +88,13 @@ def open_scene(path: str | os.PathLike[str], *, reader: str | None = None, allow
             otherwise have any file of yours read.
     """
     document, root = read_document(path, reader=reader)
-    return scene_from_document(document, root, allow_outside=allow_outside)
+    return scene_from_document(document, root, allow_outside=allow_outside, file=file_of(path))
+
+
+def file_of(path: str | os.PathLike[str]) -> Path:
+    """The file that tells of a scene, for errors; of a folder without one the folder."""
+    path = Path(path)
+    return path / "scene.json" if (path / "scene.json").is_file() else path
 
 
 def read_document(path: str | os.PathLike[str], *, reader: str | None = None) -> tuple[dict[str, Any], Path]:
@@ -109,22 +116,30 @@ def read_document(path: str | os.PathLike[str], *, reader: str | None = None) ->
     return document, path.parent
 
 
-def scene_from_document(document: dict[str, Any], root: Path, *, allow_outside: bool = False) -> Scene:
-    """Build the scene; ValueError names the video and the field for anything unsound."""
-    entries = document.get("videos")
-    if not isinstance(entries, list) or not 1 <= len(entries) <= MAX_VIDEOS:
-        raise ValueError(f"scene.videos: expected a list of 1 to {MAX_VIDEOS} videos; found {_short(entries)}.")
+def scene_from_document(
+    document: dict[str, Any], root: Path, *, allow_outside: bool = False, file: Path | None = None
+) -> Scene:
+    """Build the scene; ValueError names the file, the video and the field for anything unsound.
+
+    Args:
+        root: the folder that paths are relative to. file: where the document is from, for errors.
+    """
+    file = file or file_of(root)
+    checked(document, SceneFile, file)
+    entries = document["videos"]
     if document.get("missing"):
         raise ValueError(
-            f"scene.json: still missing: {_short(document['missing'])}. Write the file with otsync init, fill it in, "
+            f"{file}: still missing: {shown(document['missing'])}. Write the file with otsync init, fill it in, "
             "then delete 'missing'."
         )
-    builder = Paths(root, allow_outside)
-    built = [_video(entry, n, builder) for n, entry in enumerate(entries)]
-    names = [video.name for video, _, _ in built]
+    names = names_of(entries)
     twice = sorted({n for n in names if names.count(n) > 1})
     if twice:
-        raise ValueError(f"scene.videos: expected unique names; {', '.join(twice)} occur more than once.")
+        raise ValueError(
+            f"{file}: videos: expected unique names; {', '.join(map(shown, twice))} occur more than once. Rename them."
+        )
+    builder = Paths(root, allow_outside)
+    built = [_video(entry, n, builder, file) for n, entry in enumerate(entries)]
     return Scene(
         tuple(video for video, _, _ in built),
         tuple(masks for _, masks, _ in built),
@@ -135,26 +150,31 @@ def scene_from_document(document: dict[str, Any], root: Path, *, allow_outside: 
     )
 
 
-def _video(entry: Any, n: int, paths: Paths) -> tuple[Video, Sequence[np.ndarray] | None, Sequence[np.ndarray] | None]:
-    if not isinstance(entry, dict):
-        raise ValueError(f"scene.videos[{n}]: expected an object; found {_short(entry)}.")
-    name = str(entry.get("name", f"video{n}"))
-    where = f"scene.videos[{n}] ({name[:80]})"
+def names_of(entries: Sequence[dict[str, Any]]) -> list[str]:
+    """The names of a document's videos, those without one by their number."""
+    return [entry.get("name", f"video{n}") for n, entry in enumerate(entries)]
+
+
+def _video(
+    entry: dict[str, Any], n: int, paths: Paths, file: Path
+) -> tuple[Video, Sequence[np.ndarray] | None, Sequence[np.ndarray] | None]:
+    name = entry.get("name", f"video{n}")
+    where = f"{file}: videos[{n}] ({shown(name)[1:-1]})"
     try:
         frames, timestamps, fps = video_frames(entry, paths)
-        shown = _range(entry, len(frames))
+        used = _range(entry, len(frames))
         camera = camera_from(entry.get("camera"))
         if camera.w2c.ndim == 3 and len(camera.w2c) == len(frames):
-            camera = replace(camera, w2c=camera.w2c[shown.start : shown.stop])
+            camera = replace(camera, w2c=camera.w2c[used.start : used.stop])
         if timestamps is not None and len(timestamps) == len(frames):
-            timestamps = timestamps[shown.start : shown.stop]
+            timestamps = timestamps[used.start : used.stop]
 
         def cut(sequence: LazyFrames | None, what: str) -> LazyFrames | None:
             if sequence is None:
                 return None
             if len(sequence) != len(frames):
                 raise ValueError(f"{what}: expected {len(frames)} files, one a frame; found {len(sequence)}.")
-            return sequence if len(shown) == len(sequence) else FrameRange(sequence, shown)
+            return sequence if len(used) == len(sequence) else FrameRange(sequence, used)
 
         depth = cut(_depth(entry.get("depth"), paths), "depth")
         masks = cut(_images(entry.get("masks"), paths, read_mask, "mask"), "masks")
@@ -163,6 +183,8 @@ def _video(entry: Any, n: int, paths: Paths) -> tuple[Video, Sequence[np.ndarray
         return video, masks, labels
     except FileNotFoundError as error:
         raise FileNotFoundError(f"{where}: {error}") from None
+    except OSError as error:
+        raise OSError(f"{where}: cannot be read ({error}). Check the files and their permissions.") from None
     except (ValueError, TypeError, KeyError, OverflowError) as error:
         raise ValueError(f"{where}: {error}") from None
 
@@ -194,8 +216,8 @@ def camera_from(value: Any) -> Camera:
             + (own if missing == ["w2c"] else "")
         )
     return Camera(
-        np.asarray(value["K"], float),
-        np.asarray(value["w2c"], float),
+        matrix_of(value["K"], "camera.K", "(3,3)"),
+        matrix_of(value["w2c"], "camera.w2c", "(4,4), or (T,4,4)"),
         int(value["width"]),
         int(value["height"]),
         None if value.get("distortion") is None else np.asarray(value["distortion"], float),
@@ -225,7 +247,7 @@ def _range(entry: dict[str, Any], n: int) -> range:
     if value is None:
         return range(n)
     if not (isinstance(value, list) and len(value) == 2 and all(isinstance(x, int) for x in value)):
-        raise ValueError(f"range: expected [first, stop]; found {_short(value)}.")
+        raise ValueError(f"range: expected [first, stop]; found {shown(value)}.")
     if not 0 <= value[0] < value[1] <= n:
         raise ValueError(f"range: expected 0 <= first < stop <= {n}, the number of frames; found {value}.")
     return range(value[0], value[1])
@@ -242,7 +264,7 @@ class Paths:
     def one(self, text: Any) -> Path:
         """A single file."""
         if not isinstance(text, str) or not text or "\0" in text:
-            raise ValueError(f"path: expected a file name; found {_short(text)}.")
+            raise ValueError(f"path: expected a file name; found {shown(text)}.")
         path = Path(self.root) / text
         if not self.allow_outside:
             home = self.resolve(Path(self.root))
@@ -260,10 +282,10 @@ class Paths:
                 raise ValueError(f"frames: expected 1 to {MAX_FILES} files; found {len(pattern)}.")
             return [self.one(p) for p in pattern]
         if not isinstance(pattern, str) or "*" not in pattern or ".." in Path(pattern).parts or "**" in pattern:
-            raise ValueError(f"frames: expected a pattern like 'left/*.jpg', or a list; found {_short(pattern)}.")
+            raise ValueError(f"frames: expected a pattern like 'left/*.jpg', or a list; found {shown(pattern)}.")
         base, _, name = pattern.rpartition("/")
         if "*" in base:
-            raise ValueError(f"frames: expected '*' in the file name only; found {_short(pattern)}.")
+            raise ValueError(f"frames: expected '*' in the file name only; found {shown(pattern)}.")
         folder = self.one(base or ".")
         files = sorted(folder.glob(name), key=natural)[: MAX_FILES + 1] if folder.is_dir() else []
         if not 0 < len(files) <= MAX_FILES:
@@ -276,8 +298,3 @@ class Paths:
 def natural(path: Path) -> list[Any]:
     """Sort key by which frame_9 comes before frame_10."""
     return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name[:255])]
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 80 else text[:77] + "..."

@@ -12,9 +12,11 @@ import numpy as np
 
 from ..clocks.common import USUAL_FPS
 from ..clocks.shutter import LONGEST
+from ..files.strict import checked, shown
 from ..geometry import common_target
 from ..io.frames import VideoFrames
-from ..io.scene import Paths, Scene, camera_from, read_document, scene_from_document, video_frames
+from ..io.layout import MAX_VIDEOS, SceneFile, VideoFile
+from ..io.scene import Paths, Scene, camera_from, file_of, read_document, scene_from_document, video_frames
 from ..types import Camera, Video
 
 FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -64,6 +66,7 @@ class Finding:
     remedy: str
 
 
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")  # a stranger's 1e308 is a finding, not a warning
 def check_scene(
     path: str | os.PathLike[str], *, every_frame: bool = True, allow_outside: bool = False
 ) -> list[Finding]:
@@ -74,24 +77,27 @@ def check_scene(
     """
     try:
         document, root = read_document(path)
-        entries = document.get("videos")
-        if not isinstance(entries, list) or not all(isinstance(e, dict) for e in entries) or not entries:
-            raise ValueError(f"{path}: expected a list of videos; found {str(entries)[:80]}.")
     except (ValueError, OSError) as error:
         return [Finding("error", "", str(error), "Mend the file, or write it anew with otsync init.")]
-    findings: list[Finding] = []
+    findings, entries = _layout(document, file_of(path))
+    if not entries:
+        return findings
+    document = {**document, "videos": entries}
     for item in document.get("missing") or ():
         findings.append(Finding("error", "", f"still missing: {item}.", "Fill it in, then delete 'missing'."))
     if len(entries) < 2:
         findings.append(Finding("error", "", "one video only.", "Add at least a second one."))
-    for n, entry in enumerate(entries):
-        name = str(entry.get("name", f"video{n}"))
+    findings += _twice(entries, Paths(root, allow_outside))
+    for entry in entries:
+        name = entry["name"]
         pose = list(_pose(entry, name))
         findings += pose
         if pose:
             continue
         try:
-            one = scene_from_document({**document, "videos": [entry], "missing": []}, root, allow_outside=allow_outside)
+            one = scene_from_document(
+                {**document, "videos": [entry], "missing": []}, root, allow_outside=allow_outside, file=file_of(path)
+            )
         except (ValueError, OSError) as error:
             findings.append(Finding("error", name, str(error), ""))
             continue
@@ -102,6 +108,63 @@ def check_scene(
     findings += _common_volume(cameras)
     findings += _depth_units(document, root, cameras, allow_outside)
     return sorted(findings, key=lambda f: f.severity)
+
+
+def _layout(document: dict[str, Any], file: Path) -> tuple[list[Finding], list[dict[str, Any]]]:
+    """What the schema says of the document and of each video, and the videos that are as it says, named."""
+    entries = document.get("videos")
+    findings, sound = [], []
+    for n, entry in enumerate(entries[:MAX_VIDEOS] if isinstance(entries, list) else ()):
+        name = entry.get("name", f"video{n}") if isinstance(entry, dict) else f"video{n}"
+        try:
+            checked(entry, VideoFile, file, f"videos[{n}]")
+        except ValueError as error:
+            findings.append(Finding("error", shown(str(name))[1:-1], str(error), ""))
+        else:
+            sound.append({**entry, "name": name})
+    try:
+        checked({**document, "videos": sound} if sound else document, SceneFile, file)
+    except ValueError as error:
+        if sound or not findings:
+            findings.append(Finding("error", "", str(error), ""))
+        sound = []
+    return findings, sound
+
+
+def _twice(entries: Sequence[dict[str, Any]], paths: Paths) -> Iterable[Finding]:
+    """Names that occur twice, poses that two cameras share, files that two videos are made of."""
+    names: dict[str, int] = {}
+    poses: dict[Any, str] = {}
+    files: dict[Path, str] = {}
+    for entry in entries:
+        name = entry["name"]
+        names[name] = names.get(name, 0) + 1
+        w2c = (entry.get("camera") or {}).get("w2c")
+        first = poses.setdefault(str(w2c), name)
+        if w2c is not None and first != name:
+            yield Finding(
+                "error",
+                name,
+                f"its camera stands where that of {first} stands, pose for pose.",
+                "Two cameras have two places: give each its own w2c.",
+            )
+        sharing = {first for path in _files_of(entry, paths) if (first := files.setdefault(path, name)) != name}
+        for other in sorted(sharing):
+            yield Finding(
+                "error", name, f"it is made of files that {other} is made of.", "Name the files of each camera once."
+            )
+    for name, count in names.items():
+        if count > 1:
+            yield Finding("error", name, f"{count} videos have this name.", "Rename them: names tell videos apart.")
+
+
+def _files_of(entry: dict[str, Any], paths: Paths) -> Sequence[Path]:
+    """The files of a video's frames, links followed; none where they cannot be found, which other checks report."""
+    try:
+        wanted = [paths.one(entry["file"])] if "file" in entry else paths.many(entry.get("frames"))
+        return [path.resolve() for path in wanted]
+    except (ValueError, OSError):
+        return ()
 
 
 def _pose(entry: dict[str, Any], name: str) -> Iterable[Finding]:
@@ -237,9 +300,9 @@ def _clock(entry: dict[str, Any], video: Video, paths: Paths) -> Iterable[Findin
 
 def _cameras(entries: Sequence[dict[str, Any]]) -> dict[str, Camera]:
     out = {}
-    for n, entry in enumerate(entries):
+    for entry in entries:
         try:
-            out[str(entry.get("name", f"video{n}"))] = camera_from(entry.get("camera"))
+            out[entry["name"]] = camera_from(entry.get("camera"))
         except (ValueError, TypeError, KeyError, OverflowError):
             continue  # the checks of each video report it
     return out
@@ -311,8 +374,8 @@ def _depth_units(
     if len(cameras) < 2 or _parallel(list(cameras.values())):
         return
     target = common_target(list(cameras.values()))
-    for n, entry in enumerate(document["videos"]):
-        name = str(entry.get("name", f"video{n}"))
+    for entry in document["videos"]:
+        name = entry["name"]
         if entry.get("depth") is None or name not in cameras:
             continue
         try:

@@ -17,8 +17,10 @@ import numpy as np
 from ..clocks.shutter import check_within_a_frame
 from ..compute.threads import MapLike
 from ..files.cache import Cache
+from ..files.strict import checked
 from ..frames import OwnFrames
-from ..io.scene import Scene, camera_from, read_document, scene_from_document
+from ..io.layout import SceneFile
+from ..io.scene import Scene, camera_from, file_of, read_document, scene_from_document
 from ..progress import Progress, Tell
 from ..sync.method import Method
 from ..sync.verb import synchronize
@@ -36,11 +38,12 @@ def open_without_poses(path: str | os.PathLike[str], *, allow_outside: bool = Fa
     document, root = read_document(path)
     filled = copy.deepcopy(document)
     filled.pop("missing", None)  # what is missing besides poses is named by the field that lacks it
-    for video in filled.get("videos") or ():
+    checked(document, SceneFile, file_of(path))
+    for video in filled["videos"]:
         camera = video.get("camera") if isinstance(video, dict) else None
         if isinstance(camera, dict) and camera.get("w2c") is None:
             camera["w2c"] = np.eye(4).tolist()
-    return scene_from_document(filled, root, allow_outside=allow_outside), document
+    return scene_from_document(filled, root, allow_outside=allow_outside, file=file_of(path)), document
 
 
 def synchronize_own_scene(

@@ -165,7 +165,10 @@ def _bvh_hierarchy(words: list[str], path: Path) -> tuple[list[str], list[int], 
             channels[open_joints[-1]] = own
             i += 2 + count
         else:
-            raise ValueError(f"{path}: hierarchy: did not expect {word[:40]!r}.")
+            raise ValueError(
+                f"{path}: hierarchy: expected ROOT, JOINT, End Site, OFFSET, CHANNELS or a brace in its place; found "
+                f"{word[:40]!r}. Export it again."
+            )
     if not names or open_joints:
         raise ValueError(f"{path}: hierarchy: expected one ROOT with matching braces.")
     for j in range(len(names)):

@@ -48,7 +48,9 @@ class Camera:
         if w2c.shape[-2:] != (4, 4) or w2c.ndim not in (2, 3) or not np.isfinite(w2c).all():
             raise ValueError(f"Camera.w2c: expected finite values of shape (4,4) or (T,4,4); found shape {w2c.shape}.")
         R = w2c[..., :3, :3]
-        if not np.allclose(R @ np.swapaxes(R, -1, -2), np.eye(3), atol=1e-3):
+        with np.errstate(over="ignore", invalid="ignore"):  # a stranger's 1e308 is no rotation, and no more
+            turns = np.allclose(R @ np.swapaxes(R, -1, -2), np.eye(3), atol=1e-3)
+        if not turns:
             raise ValueError(
                 "Camera.w2c: expected a rotation in the upper 3x3; its rows are not orthonormal. Take scale out of it."
             )
@@ -142,6 +144,16 @@ class Video:
     def times(self) -> Float[np.ndarray, " T"]:
         """Seconds of every frame on the video's own clock."""
         return frame_times(self.fps, self.timestamps, len(self.frames))
+
+
+def matrix_of(value: Any, name: str, shape: str) -> np.ndarray:
+    """Rows of numbers as an array; its shape is the camera's affair. ValueError for rows of several lengths."""
+    try:
+        return np.asarray(value, float)
+    except (ValueError, TypeError, OverflowError):
+        raise ValueError(
+            f"{name}: expected numbers of shape {shape}; found rows of several lengths. Write all rows whole."
+        ) from None
 
 
 def clock(

@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import math
 import os
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from msgspec import UNSET, Meta, UnsetType
 
 from ..files.arrays import read_json
+from ..files.strict import Document, Name, Text, checked
 from .clock import Break
 from .similarity import Similarity
 from .status import Status, gravest, in_order
@@ -32,6 +34,77 @@ BREAKS = (
     "offset; frames within still_seconds before at_seconds stood still and tell no time"
 )
 
+Number = float | None
+"""A number, or null where it is not known."""
+
+
+class TransformFile(Document, frozen=True, kw_only=True):
+    """A similarity; see :data:`FRAMES`."""
+
+    scale: float
+    quaternion: Annotated[list[float], Meta(min_length=4, max_length=4)]
+    translation: Annotated[list[float], Meta(min_length=3, max_length=3)]
+    covariance: list[list[float]] | None = None
+    rotation_sigma_degrees: Number = None
+    scale_sigma: Number = None
+
+
+class BreakFile(Document, frozen=True, kw_only=True):
+    """Where a clock breaks; see :data:`BREAKS`."""
+
+    at_seconds: float
+    jump_seconds: float
+    still_seconds: float
+    sigma_seconds: Number
+
+
+class VideoOffset(Document, frozen=True, kw_only=True):
+    """The clock of one video."""
+
+    name: Name
+    fps: Number
+    rate: Number
+    offset_seconds: Number
+    offset_frames: Number | UnsetType = UNSET
+    sigma_seconds: Number
+    reference: Name
+    status: Text
+    flags: list[Text]
+    transform: TransformFile | None = None
+    breaks: list[BreakFile] | UnsetType = UNSET
+
+
+class PairOffset(Document, frozen=True, kw_only=True):
+    """The answer of one pair."""
+
+    a: Name
+    b: Name
+    fps: Number
+    rate: Number
+    offset_seconds: Number
+    offset_frames: Number | UnsetType = UNSET
+    sigma_seconds: Number
+    status: Text
+    flags: list[Text]
+    hypotheses: list[Annotated[list[Number], Meta(min_length=2, max_length=2)]]
+    stats: dict[str, Number]
+    transform: TransformFile | None = None
+
+
+class OffsetsFile(Document, frozen=True, kw_only=True):
+    """The content of offsets.json and truth.json."""
+
+    format: Literal["otsync.offsets"]
+    version: Literal[1]
+    unit: Literal["seconds"] = "seconds"
+    sign: Text = SIGN
+    frames: Text | UnsetType = UNSET
+    breaks: Text | UnsetType = UNSET
+    reference: Name
+    videos: Annotated[list[VideoOffset], Meta(min_length=1)]
+    pairs: list[PairOffset]
+    stats: dict[str, Number]
+
 
 def read_offsets(path: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[tuple[int, int], dict[str, Any]]]:
     """(fields of ``Offsets`` but for alignments, fields of the ``Alignment`` of every pair (i, j)) of a file.
@@ -47,11 +120,15 @@ def read_offsets(path: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[tup
             "that wrote it, or write it anew with this one."
         )
     try:
-        return _fields(data)
+        fields = _fields(data)
     except (KeyError, TypeError, IndexError, AttributeError, OverflowError) as error:
+        checked(data, OffsetsFile, path, remedy="Write it anew.")  # it knows the field, where the error does not
         detail = f"{type(error).__name__}: {error}"
     except ValueError as error:
         detail = str(error)
+    else:
+        checked(data, OffsetsFile, path, remedy="Write it anew.")
+        return fields
     raise ValueError(f"{path}: not a sound offsets file; {detail}. Write it anew.")
 
 

@@ -10,10 +10,17 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..files.arrays import MAX_BYTES, read_npz, write_npz
+from ..files.strict import nearest, on_one_line, shown
 from .camera import Camera, clock, frame_times
 from .drawing import short
 
 FORMAT, VERSION = "otsync.tracks", 1
+
+ARRAYS = (
+    *("format", "version", "name", "frame", "xyz", "visible", "features", "fps", "timestamps", "uv", "sigma", "labels"),
+    *("camera_K", "camera_w2c", "camera_width", "camera_height", "camera_distortion", "camera_readout"),
+)
+"""All that a file may hold."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,21 +177,34 @@ class TrackSet:
                 f"{path}: expected version {VERSION}; found {version}. Read it with the otsync release that wrote it."
             )
         try:
+            for name in data:
+                if name not in ARRAYS:
+                    near = nearest(name, ARRAYS)
+                    meant = f"Did you mean {near!r}? Else" if near else "Read it with the otsync that wrote it, or"
+                    raise ValueError(
+                        f"{shown(name)[1:-1]}: expected an array of a track set; found one that is none. {meant} leave "
+                        "it out."
+                    )
             camera = None
             if "camera_K" in data:
-                parts = {k.removeprefix("camera_"): v for k, v in data.items() if k.startswith("camera_")}
-                scalars = {k: v.item() for k, v in parts.items() if k in ("width", "height", "readout")}
-                camera = Camera(**{**parts, **scalars})
+                parts: dict[str, Any] = {}
+                for field in (f for f in ARRAYS if f.startswith("camera_") and f in data):
+                    kinds = {"camera_width": "iu", "camera_height": "iu", "camera_readout": "iuf"}.get(field)
+                    value = _numbers(data[field], field) if kinds is None else _scalar(data, field, kinds)
+                    parts[field.removeprefix("camera_")] = value
+                camera = Camera(**parts)
             arrays = {k: data[k] for k in ("visible", "features", "timestamps", "uv", "sigma", "labels") if k in data}
+            if "timestamps" in arrays:
+                arrays["timestamps"] = _numbers(arrays["timestamps"], "timestamps")
             return cls(
                 data.get("xyz"),
                 **arrays,
-                fps=float(data["fps"]) if "fps" in data else None,
-                name=str(data.get("name", "")),
+                fps=float(_scalar(data, "fps", "iuf")) if "fps" in data else None,
+                name=_scalar(data, "name", "U") if "name" in data else "",
                 camera=camera,
-                frame=str(data["frame"]) if "frame" in data else None,
+                frame=_scalar(data, "frame", "U") if "frame" in data else None,
             )
-        except (ValueError, TypeError, KeyError) as error:
+        except (ValueError, TypeError, KeyError, OverflowError) as error:
             raise ValueError(f"{path}: not a sound track set; {error}") from None
 
 
@@ -194,6 +214,23 @@ def check_same_world(a: TrackSet, b: TrackSet) -> None:
         raise ValueError(
             f"b.frame: expected {a.frame!r} as a declares; found {b.frame!r}. Bring the positions into one world frame."
         )
+
+
+def _scalar(data: dict[str, np.ndarray], field: str, kinds: str) -> Any:
+    """What an array without axes holds, of one of numpy's ``kinds``; text on one line. ValueError names the field."""
+    value = data[field]
+    want = "text" if kinds == "U" else "a whole number" if kinds == "iu" else "a number"
+    if value.shape != () or value.dtype.kind not in kinds:
+        raise ValueError(f"{field}: expected {want}; found {value.dtype} of shape {value.shape}. Save it again.")
+    if kinds == "U":
+        on_one_line(str(value), field)
+    return value.item()
+
+
+def _numbers(value: np.ndarray, field: str) -> np.ndarray:
+    if value.dtype.kind not in "iuf":
+        raise ValueError(f"{field}: expected numbers; found {value.dtype} of shape {value.shape}. Save it again.")
+    return value
 
 
 def _real(value: Any, shape: tuple[int | None, ...], name: str) -> np.ndarray:

@@ -49,6 +49,12 @@ class Fit:
     """Let the scene name files outside its folder."""
 
     def run(self) -> int:
+        from otsync.files.claim import claimed
+
+        with claimed(self.out, "recon fit"):
+            return self._run()
+
+    def _run(self) -> int:
         from otsync.types import Offsets, TrackSet
 
         deadline = deadline_of(self.plan)

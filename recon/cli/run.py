@@ -48,7 +48,13 @@ class Run:
     recording: RecordingOptions = field(default_factory=RecordingOptions)
 
     def run(self) -> int:
-        from otsync.cli.tables import table
+        from otsync.files.claim import claimed
+
+        with claimed(self.out, "otsync run"):
+            return self._run()
+
+    def _run(self) -> int:
+        from otsync.cli.tables import table, true_offsets
         from otsync.files.arrays import write_json
         from otsync.files.cache import Cache
         from otsync.io.mend import cut
@@ -57,7 +63,8 @@ class Run:
         from otsync.report.frames import write_recording_report
         from recon.cli.common import deadline_of, opened, reconstructed, with_length
         from recon.fit.run import Diverged
-        from recon.pipeline.intake import readable
+        from recon.pipeline.intake import given_clocks, readable
+        from recon.pipeline.verb import check_effects_of
 
         for name in ("masks", "points", "features"):
             if getattr(self.recording, name) is not None:
@@ -72,14 +79,22 @@ class Run:
                 [*self.recording.cameras, *(n for n in self.held_out if n not in self.recording.cameras)]
             )
         scene.take(self.held_out)  # names that are not there
+        names = [n for n in scene.names if n not in self.held_out]
+        if len(names) < 2:
+            raise ValueError(
+                f"--held-out: expected at least two videos; found {len(names)} that are not held out. Hold out fewer."
+            )
+        if self.reference is not None and self.reference not in names:
+            raise ValueError(f"--reference: expected one of {', '.join(names)}; found {self.reference!r}.")
+        if self.truth is not None:
+            true_offsets(self.truth, tuple(names))  # names the videos that it lacks
+        check_effects_of(self.plan, [v.camera.readout for v in scene.videos if v.name in names])
         cache, progress = Cache(self.recording.cache or self.out / "stages"), Progress(tell)
         with ThreadPoolExecutor(threads) as pool:
             part = scene if self.plan.frames is None else cut(scene, *self.plan.frames)
             with progress.stage("reading"):  # the reconstruction cuts and reads again, from what is kept
                 part = readable(part, cache, pool.map, progress)
             train = part.take([n for n in part.names if n not in self.held_out])
-            if self.reference is not None and self.reference not in train.names:
-                raise ValueError(f"--reference: expected one of {', '.join(train.names)}; found {self.reference!r}.")
             reference = 0 if self.reference is None else train.names.index(self.reference)
             coarse = synchronize_scene(
                 train,
@@ -100,6 +115,14 @@ class Run:
         for name, flags in zip(coarse.offsets.names, coarse.offsets.flags, strict=True):
             for flag in flags:
                 print(f"{name}: {flag.code}: {flag}", file=sys.stderr)
+        linked = sorted(given_clocks(coarse.offsets))
+        if len(linked) < 2:
+            print(
+                f"otsync: expected two videos and more on one clock; found {len(linked)} of {len(coarse.offsets)}, so "
+                f"nothing is reconstructed. Look at {self.out / 'sync.html'}; otsync check may find the cause.",
+                file=sys.stderr,
+            )
+            return 1
         try:
             return reconstructed(
                 scene,

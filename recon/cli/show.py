@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -11,6 +12,7 @@ from typing import Literal
 import tyro
 
 from otsync.cli.slots import one_of
+from otsync.files.claim import claimed, refuse_parts_of_a_result
 from otsync.plugins import available, made
 from otsync.progress import counted, tell
 from recon.cli.common import opened, print_json
@@ -54,7 +56,7 @@ class Render:
         from recon.result.export import MAX_FRAMES, check_times, frame_times
         from recon.result.folder import load_result
         from recon.result.images import rendered, stretched
-        from recon.result.video import check_target, write_images
+        from recon.result.video import check_target, refuse_longer, write_images
 
         if (self.camera is None) == (self.path is None):
             raise ValueError("--camera, --path: expected one of them: the name of a video, or orbit.")
@@ -72,6 +74,7 @@ class Render:
         if self.fps is not None and not 0 < self.fps <= 1000:
             raise ValueError(f"--fps: expected frames per second above 0, at most 1000; found {self.fps:g}.")
         check_target(self.out)
+        refuse_parts_of_a_result(self.out)
         result = load_result(self.result)
         fps = 1.0 / result.scene.frame_step if self.fps is None else self.fps
         times = list(self.times) or frame_times(result.scene, fps).tolist()
@@ -80,7 +83,9 @@ class Render:
         check_times(result.scene, times)
         turns = 1.0 if self.turns is None else self.turns
         images = rendered(result, times, self.camera, turns=turns, width=self.width)
-        count = write_images(counted(images, "rendering", "image", len(times)), self.out, fps)
+        with nullcontext() if self.out.suffix else claimed(self.out, "recon render", keep=False):
+            refuse_longer(self.out, len(times))
+            count = write_images(counted(images, "rendering", "image", len(times)), self.out, fps)
         print(f"wrote {count} images to {self.out}")
         return 0
 
@@ -128,6 +133,10 @@ class Eval:
         result = load_result(self.result)
         scene = opened(self.scene, self.allow_outside)
         given = None if self.offsets is None else Offsets.load(self.offsets)
+        out = self.out or self.result / "eval.json"
+        refuse_parts_of_a_result(out)
+        if self.truth is not None:
+            Offsets.load(self.truth)  # before the work, not after it
         names = self.held_out or tuple(v.name for v in result.videos if v.held_out)
         if not names:
             raise ValueError("--held-out: expected names of videos; none was held out of this fit.")
@@ -151,7 +160,6 @@ class Eval:
             else:
                 lines.append(f"offset error: mean {error['mean_frames']:.3f}, max {error['max_frames']:.3f} frames")
             document["offset_error"] = error
-        out = self.out or self.result / "eval.json"
         write_json(out, document)
         if self.json:
             print_json(document)
@@ -202,6 +210,8 @@ class Export:
         elif exporter.holds == "frames":
             times = frame_times(result.scene, self.fps).tolist()
         out = self.out or self.result / exporter.file
-        export(result.scene, exporter, out, times, result.frame)
+        refuse_parts_of_a_result(out)
+        with claimed(out, "recon export", keep=False) if exporter.name == "ply-sequence" else nullcontext():
+            export(result.scene, exporter, out, times, result.frame)
         print(f"wrote {out}")
         return 0

@@ -39,6 +39,12 @@ class Simulate:
     seed: int = 0
 
     def run(self) -> int:
+        from otsync.files.claim import claimed
+
+        with claimed(self.out, "recon simulate"):
+            return self._run()
+
+    def _run(self) -> int:
         from recon.simulate.capture import synthetic
         from recon.simulate.effects import Blur, Exposure, MoreNoise, Rolling, Sheen
         from recon.simulate.recording import write_capture

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from otsync.files.arrays import read_npz, write_npz
+from otsync.files.strict import in_words
 from recon.fit.problem import scene_groups
 from recon.scene.gaussians4d import UNSOUND, scene_from_arrays
 
@@ -118,7 +119,7 @@ class Checkpoint:
             scene = scene_from_arrays(snapshot.scene)  # what a fit continues from: here its errors name the file
         except (*UNSOUND, ValueError) as error:
             raise ValueError(
-                f"{self.path}: not a sound checkpoint; {type(error).__name__}: {error}. Delete it to begin anew."
+                f"{self.path}: not a sound checkpoint; {in_words(error)}. Delete it to begin anew."
             ) from None
         if key != self.key:
             raise ValueError(

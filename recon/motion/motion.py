@@ -55,5 +55,5 @@ def motion_from_arrays(arrays: Mapping[str, np.ndarray]) -> Motion:
     kinds: dict[str, Any] = {"scaffold": Scaffold, "per-gaussian": PerGaussian, "static": Static}
     kind = str(arrays.get("kind"))
     if kind not in kinds:
-        raise ValueError(f"arrays['kind']: expected one of {sorted(kinds)}; found {kind!r}.")
+        raise ValueError(f"kind: expected one of {sorted(kinds)}; found {kind!r}.")
     return kinds[kind].from_arrays(arrays)

@@ -59,6 +59,17 @@ def split(
 
     Videos without an offset on the reference's clock are left out, with a note.
     """
+    train, known = trained(scene, offsets, held_out), given_clocks(offsets)
+    for name in scene.names:
+        if name not in train and name not in held_out:
+            why = "has no offset on the common clock" if name in offsets.names else "is not in the offsets"
+            progress.note(f"video {name} is left out: it {why}")
+    clocks = {n: clock for n, clock in known.items() if n in held_out}
+    return scene.take(train), scene.take(held_out) if held_out else None, only(offsets, train), clocks
+
+
+def trained(scene: Scene, offsets: Offsets, held_out: Sequence[str]) -> list[str]:
+    """The names of the videos to fit. ValueError for held-out ones that there are not, or a reference among them."""
     missing = [n for n in held_out if n not in scene.names]
     if missing:
         raise ValueError(f"held_out: expected some of {', '.join(scene.names)}; found {', '.join(missing)}.")
@@ -70,12 +81,7 @@ def split(
             f"{', '.join(train) or 'none'}. "
             "Hold out another video, or synchronise with another reference."
         )
-    for name in scene.names:
-        if name not in train and name not in held_out:
-            why = "has no offset on the common clock" if name in offsets.names else "is not in the offsets"
-            progress.note(f"video {name} is left out: it {why}")
-    clocks = {n: clock for n, clock in known.items() if n in held_out}
-    return scene.take(train), scene.take(held_out) if held_out else None, only(offsets, train), clocks
+    return train
 
 
 def given_clocks(offsets: Offsets) -> dict[str, Clock]:

@@ -15,6 +15,7 @@ import numpy as np
 from otsync.compute.indices import evenly
 from otsync.compute.threads import MapLike
 from otsync.files.arrays import write_json
+from otsync.files.claim import clear_parts
 from otsync.io import Scene
 from otsync.io.mend import cut, on_mended_clocks
 from otsync.metrics import offset_error
@@ -25,11 +26,11 @@ from recon.evaluate.views import ViewScore, view
 from recon.fit.verb import Reconstruction, fit
 from recon.observe.effects import Effect
 from recon.observe.recorded import kept, optics, with_declared
-from recon.pipeline.intake import given_clocks, readable
+from recon.pipeline.intake import given_clocks, readable, trained
 from recon.pipeline.plan import Plan
 from recon.pipeline.prepare import Prepared, prepare
 from recon.pipeline.stages import read_footage
-from recon.result.folder import FilmedBy, SavedReconstruction, clear_parts, metrics_of, save_run
+from recon.result.folder import FilmedBy, SavedReconstruction, metrics_of, save_run
 from recon.result.report import write_reconstruction_report
 
 
@@ -86,8 +87,11 @@ def reconstruct(
     from otsync.files.cache import Cache
 
     plan, progress, cache = plan or Plan(), progress or Progress(), cache or Cache(out / "stages")
-    # what an effect lacks is said before the work, not after it
-    with_declared(plan.effects, [v.camera.readout for v in scene.videos if v.name not in held_out])
+    # what is lacking is said before the work, not after it
+    train = trained(scene, offsets, held_out)
+    check_effects_of(plan, [v.camera.readout for v in scene.videos if v.name not in held_out])
+    if truth is not None:
+        _check_truth(truth, train)
     out.mkdir(parents=True, exist_ok=True)
     clear_parts(out, out / "stages")
     ready = prepare(
@@ -103,7 +107,6 @@ def reconstruct(
     )
     true = None if truth is None else true_seconds(truth, ready.offsets)
     effects = with_declared(plan.effects, [f.readout for f in ready.footage], ready.gains)
-    kept([effect for effect in effects if not effect.groups])  # says before the work what run.json cannot name
     options = replace(plan.fit, effects=effects)
     if deadline is not None:
         progress.note(f"budget: {deadline.left:.0f} of {deadline.seconds:.0f} s are left for the fit")
@@ -227,11 +230,25 @@ def offset_figures(offsets: Offsets, true: np.ndarray) -> dict[str, Any]:
 
 def true_seconds(truth: Offsets, offsets: Offsets) -> np.ndarray:
     """True offsets of the videos relative to their reference. ValueError names those that the truth lacks."""
-    missing = [n for n in offsets.names if n not in truth.names]
-    if missing:
-        raise ValueError(f"truth: expected offsets of {', '.join(offsets.names)}; {', '.join(missing)} are not in it.")
+    _check_truth(truth, offsets.names)
     seconds = np.array([truth.seconds[truth.names.index(n)] for n in offsets.names])
     return seconds - seconds[offsets.reference]
+
+
+def _check_truth(truth: Offsets, names: Sequence[str]) -> None:
+    missing = [n for n in names if n not in truth.names]
+    if missing:
+        raise ValueError(f"truth: expected offsets of {', '.join(names)}; {', '.join(missing)} are not in it.")
+
+
+def check_effects_of(plan: Plan, readouts: Sequence[float | None]) -> None:
+    """ValueError for effects of the plan that lack something, or that run.json cannot name.
+
+    Args:
+        readouts: that the cameras of the videos to fit declare.
+    """
+    effects = with_declared(plan.effects, readouts)
+    kept([effect for effect in effects if not effect.groups])
 
 
 def evaluate(

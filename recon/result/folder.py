@@ -18,17 +18,19 @@ from typing import Any, get_args
 import numpy as np
 
 from otsync.files.arrays import read_json, write_json
+from otsync.files.strict import checked, in_words
 from otsync.types import Camera, Clock, Offsets
+from otsync.types.camera import matrix_of
 from otsync.types.clock import Source
 from recon.evaluate.views import ViewScore
 from recon.footage.footage import Footage
 from recon.observe.effects import Effect
 from recon.observe.recorded import kept, restored
+from recon.result.layout import MAX_SIDE, RunFile
 from recon.scene.gaussians4d import Gaussians4D
 
 FORMAT, VERSION = "otsync.reconstruction", 2
-MAX_VIDEOS = 10_000
-MAX_SIDE, MAX_PIXELS = 16_384, 2**26
+MAX_PIXELS = 2**26
 """Of one image: a foreign run.json or a requested width may take no more memory."""
 
 
@@ -188,16 +190,14 @@ def load_result(folder: str | os.PathLike[str]) -> SavedReconstruction:
         raise ValueError(
             f"{folder / 'run.json'}: expected format {FORMAT!r}, version {VERSION}; found another. Run the fit again."
         )
+    checked(document, RunFile, folder / "run.json", remedy="Run the fit again.")
     try:
-        rows = document["videos"]
-        if not isinstance(rows, list) or not 1 <= len(rows) <= MAX_VIDEOS:
-            raise ValueError(f"expected 1 to {MAX_VIDEOS} videos")
-        videos = tuple(_filmed_by(row) for row in rows)
+        videos = tuple(_filmed_by(row) for row in document["videos"])
         options, frame = _options(document["options"]), str(document["frame"])
         optics = restored(options["optics"])
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
         raise ValueError(
-            f"{folder / 'run.json'}: not a sound reconstruction; {type(error).__name__}: {error}. Run the fit again."
+            f"{folder / 'run.json'}: not a sound reconstruction; {in_words(error)}. Run the fit again."
         ) from None
     scene, offsets = Gaussians4D.load(folder / "scene.npz"), Offsets.load(folder / "offsets.json")
     return SavedReconstruction(scene, offsets, videos, options, frame, optics)
@@ -227,35 +227,17 @@ def check_size(width: int, height: int) -> None:
         )
 
 
-def clear_parts(*folders: Path) -> None:
-    """Remove unfinished files that killed writers left in ``folders`` (see :func:`otsync.files.arrays.atomic_write`).
-
-    Those of living processes stay: another run may be writing there.
-    """
-    if os.name != "posix":  # elsewhere asking for a process would end it
-        return
-    for part in (p for folder in folders for p in folder.glob(".*.part")):
-        pid = part.name.removesuffix(".part").rpartition(".")[2].partition("-")[0]
-        if pid.isdecimal() and not _lives(int(pid)):
-            part.unlink(missing_ok=True)
-
-
-def _lives(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except PermissionError:
-        pass
-    return True
-
-
 def _filmed_by(row: dict[str, Any]) -> FilmedBy:
     c = row["camera"]
     check_size(int(c["width"]), int(c["height"]))
     readout = None if c["readout"] is None else float(c["readout"])
     camera = Camera(
-        np.array(c["K"], float), np.array(c["w2c"], float), int(c["width"]), int(c["height"]), None, readout
+        matrix_of(c["K"], "camera.K", "(3,3)"),
+        matrix_of(c["w2c"], "camera.w2c", "(4,4), or (T,4,4)"),
+        int(c["width"]),
+        int(c["height"]),
+        None,
+        readout,
     )
     seconds, rate, how = (row["clock"][k] for k in ("offset_seconds", "rate", "known"))
     clock = Clock(float(seconds), float(rate), how)

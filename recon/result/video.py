@@ -21,6 +21,15 @@ def check_target(out: Path) -> None:
         raise ValueError(f"{out}: expected a folder for PNG frames; found a file. Choose another place.")
 
 
+def refuse_longer(out: Path, count: int) -> None:
+    """ValueError for a folder of more frames than ``count``: some would stay and look like those of this rendering."""
+    stale = sorted(p.name for p in out.glob("*.png") if p.stem.isdecimal() and int(p.stem) >= count)
+    if not out.suffix and stale:
+        raise ValueError(
+            f"{out}: expected a folder without frames of another rendering; it holds {stale[0]}. Choose another."
+        )
+
+
 def write_images(images: Iterable[UInt8[np.ndarray, "h w 3"]], out: str | os.PathLike[str], fps: float = 30.0) -> int:
     """Write RGB images of one size as they come, and return how many there were.
 
@@ -69,7 +78,10 @@ def _video(images: Iterable[np.ndarray], out: Path, fps: float) -> int:
                 raise ValueError(f"{out}: expected at least one image to write; found none.")
             video.mux(stream.encode())
         os.replace(part, out)
-    except BaseException:
+    except BaseException as error:
         part.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.errno is not None:  # FFmpeg's own, which name the temporary file
+            said = f"cannot be written ({os.strerror(error.errno)}); nothing is half written"
+            raise OSError(error.errno, said, str(out)) from None
         raise
     return count

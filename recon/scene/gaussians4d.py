@@ -5,21 +5,24 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from otsync.files.arrays import read_npz, write_npz
+from otsync.files.strict import in_words
 from otsync.types import Camera
 from recon.motion import Motion, motion_from_arrays
 from recon.motion.arrays import numbers
 from recon.raster import Rendering
 from recon.scene.device import device_of
 from recon.scene.gaussians import Gaussians
+
+T = TypeVar("T")
 
 FORMAT, VERSION = "otsync.scene4d", 1
 
@@ -137,7 +140,7 @@ class Gaussians4D:
         try:
             return scene_from_arrays(read_npz(path))
         except UNSOUND as error:
-            raise ValueError(f"{path}: not a sound 4D scene; {type(error).__name__}: {error}. Write it anew.") from None
+            raise ValueError(f"{path}: not a sound 4D scene; {in_words(error)}. Write it anew.") from None
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
 
@@ -194,7 +197,7 @@ def scene_from_arrays(arrays: Mapping[str, np.ndarray]) -> Gaussians4D:
     first, last = about["span"]
     return Gaussians4D(
         dynamic=dynamic,
-        motion=motion_from_arrays(motion),
+        motion=_named("motion", lambda: motion_from_arrays(motion)),
         footprint=float(about["footprint"]),
         frame_step=float(about["frame_step"]),
         span=(float(first), float(last)),
@@ -204,11 +207,22 @@ def scene_from_arrays(arrays: Mapping[str, np.ndarray]) -> Gaussians4D:
     )
 
 
+def _named(part: str, make: Callable[[], T]) -> T:
+    """What ``make`` makes of a part of a file; its ValueError or KeyError begins with the part's name."""
+    try:
+        return make()
+    except KeyError as error:
+        raise KeyError(f"{part}.{error.args[0]}") from None
+    except ValueError as error:
+        said = str(error)
+        raise ValueError(said if said.startswith(part) else f"{part}.{said}") from None
+
+
 def _gaussians(arrays: Mapping[str, np.ndarray], part: str) -> Gaussians:
     """The Gaussians whose arrays are named ``part.*``; shapes are checked by their own class."""
     names = [f"{part}.{f.name}" for f in fields(Gaussians)]
     means, *others = (numbers(arrays, n, (None,) * np.ndim(arrays[n])) for n in names)
-    gaussians = Gaussians(means, *others)
+    gaussians = _named(part, lambda: Gaussians(means, *others))
     if any(x.dtype != means.dtype for x in others):
         raise ValueError(f"{part}: expected arrays of one precision; found {[str(x.dtype) for x in (means, *others)]}.")
     return gaussians

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
@@ -20,6 +21,8 @@ from otsync.bench.sync_worlds import MOVING
 from otsync.cli import main
 from otsync.cli.shell import EXTRAS
 from otsync.cli.simulate import Simulate
+from otsync.files.arrays import write_json
+from otsync.files.claim import LOCK
 from otsync.types import Alignment, Refused, Status
 
 ROOT = Path(__file__).parents[3]
@@ -51,7 +54,7 @@ def world(tmp_path_factory):
 
 
 def test_simulate_writes_track_sets_and_the_truth(world):
-    assert sorted(p.name for p in world.iterdir()) == ["truth.json", "video0.npz", "video1.npz", "video2.npz"]
+    assert sorted(p.name for p in world.glob("[!.]*")) == ["truth.json", "video0.npz", "video1.npz", "video2.npz"]
     truth = Offsets.load(world / "truth.json")
     assert truth.names == ("video0", "video1", "video2") and truth.seconds[0] == 0
     assert 0 < np.abs(truth.frames[1:]).max() <= 9 and len(TrackSet.load(world / "video1.npz")) > 50
@@ -309,8 +312,9 @@ def test_an_interrupt_amid_a_write_leaves_nothing_half_written(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["a.npz"] and path.read_bytes() == before
 
 
-def test_an_interrupted_command_says_so(tmp_path):
-    """SIGINT in the midst of matching and synchronising: exit code 130, and no files but whole ones."""
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_command_says_so(tmp_path, number):
+    """SIGINT or SIGTERM in the midst of matching and synchronising: exit code 130, and no files but whole ones."""
     command = [sys.executable, "-m", "otsync.cli", "demo", "--videos", "30", "--out", str(tmp_path / "out")]
     run = subprocess.Popen(
         command,
@@ -322,12 +326,13 @@ def test_an_interrupted_command_says_so(tmp_path):
     )
     assert "30 videos" in run.stdout.readline()
     time.sleep(1.0)
-    run.send_signal(signal.SIGINT)
+    run.send_signal(number)
     _, err = run.communicate(timeout=3600)
     # a compiled extension that is just being imported may abort instead; a signal that reaches the interpreter's own
     # end gives -SIGINT, which a shell shows as 130 too
-    assert run.returncode in (130, -signal.SIGINT, -signal.SIGABRT), err
-    assert list((tmp_path / "out").iterdir()) == []
+    assert run.returncode in (130, -number, -signal.SIGABRT), err
+    left = list((tmp_path / "out").iterdir()) if (tmp_path / "out").exists() else []
+    assert {path.name for path in left} <= {LOCK}
 
 
 def test_a_gate_without_the_classes_of_its_baseline_judges_nothing(monkeypatch, tmp_path, capsys):
@@ -335,3 +340,42 @@ def test_a_gate_without_the_classes_of_its_baseline_judges_nothing(monkeypatch, 
     monkeypatch.setattr("otsync.bench.sync.motions", lambda: MOVING)
     assert main(["bench", "sync", "--gate", "--out", str(tmp_path)]) == 2
     assert "Set OTSYNC_DATA" in capsys.readouterr().err and not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "error, says",
+    [
+        (
+            OSError(errno.ENOSPC, "cannot be written (No space left on device)", "out/a.json"),
+            "otsync: out/a.json: cannot be written (No space left on device). Free some space",
+        ),
+        (
+            PermissionError(errno.EACCES, "Permission denied", "b.json"),
+            "otsync: b.json: Permission denied. Check its permissions.",
+        ),
+        (
+            MemoryError("a.npz: expected arrays that fit into memory; they do not. Use fewer or smaller ones."),
+            "smaller ones.\n",
+        ),
+        (MemoryError(), "otsync: not enough memory. Use fewer frames"),
+        (FileNotFoundError("a.npz: no such file. Check the path."), "otsync: a.npz: no such file. Check the path."),
+    ],
+)
+def test_errors_of_the_system_name_the_file_and_the_remedy(monkeypatch, tmp_path, capsys, error, says):
+    def stop(self):
+        raise error
+
+    monkeypatch.setattr(Simulate, "run", stop)
+    assert main(["simulate", str(tmp_path)]) == 2
+    assert says in capsys.readouterr().err
+
+
+def test_a_write_that_fails_keeps_the_old_file_and_names_it(monkeypatch, tmp_path):
+    def full(descriptor):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    (tmp_path / "a.json").write_text("old")
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match=r"cannot be written \(No space left on device\).*a\.json"):
+        write_json(tmp_path / "a.json", [1])
+    assert [path.name for path in tmp_path.iterdir()] == ["a.json"] and (tmp_path / "a.json").read_text() == "old"

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
+from scipy.interpolate import BSpline
 
 from otsync import Matches, TrackSet
 from otsync.clocks.common import common_clock, is_uniform
-from otsync.clocks.splines import TrackSplines
+from otsync.clocks.splines import RIDGE, SMOOTHING, TrackSplines
 from tests.conftest import wiggle
 
 
@@ -109,3 +112,32 @@ def test_timestamps_are_honoured():
     assert len(shared) > 80  # else nothing is compared
     for j in shared:
         np.testing.assert_allclose(pair.b[0, j], pair.a[0, j + lag], atol=5e-3)
+
+
+def test_the_normal_equations_are_those_of_the_definition():
+    """Against dense matrices, on tracks with gaps."""
+    rng = np.random.default_rng(3)
+    t, x = np.arange(37) / 30, wiggle(rng, 5, 37)
+    x[rng.random((5, 37)) < 0.3] = np.nan
+    s = TrackSplines(t, x)
+    B = BSpline.design_matrix(np.clip(t, s.knots[3], s.knots[-4]), s.knots, 3).toarray()
+    D = np.diff(np.eye(s.n), 3, axis=0)
+    for m in range(5):
+        seen = np.isfinite(x[m, :, 0])
+        A = B[seen].T @ B[seen] + SMOOTHING * D.T @ D + RIDGE * np.eye(s.n)
+        expected = np.linalg.solve(A, B[seen].T @ (x[m, seen] - x[m, seen].mean(0)))
+        np.testing.assert_allclose(s.by_track[m], expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("frames, pause", [(150, 4900.0), (108_000, 0.0)], ids=["a long pause", "an hour"])
+def test_memory_grows_with_the_length_of_a_clip_and_not_with_its_square(frames, pause):
+    t = np.arange(frames) / 30
+    t[frames // 2 :] += pause
+    x = np.stack([np.sin(t), np.cos(2 * t), 0 * t], -1)[None].repeat(3, 0)
+    tracemalloc.start()
+    s = TrackSplines(t, x)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert s.n > 50_000
+    assert peak < 200 * 2**20  # dense: 20 GiB and more
+    np.testing.assert_allclose(s.value(t[:70:7])[1], x[1, :70:7], atol=0.02)

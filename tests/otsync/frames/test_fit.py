@@ -16,7 +16,9 @@ from otsync.types import Clock, Similarity
 
 def draw(seed: int) -> Similarity:
     rng = np.random.default_rng(seed)
-    return Similarity(float(rng.uniform(0.5, 2)), Rotation.random(rng=rng).as_matrix(), rng.normal(size=3))
+    return Similarity(
+        float(rng.uniform(0.5, 2)), Rotation.from_quat(rng.normal(size=4)).as_matrix(), rng.normal(size=3)
+    )
 
 
 @pytest.mark.parametrize("seed", range(5))

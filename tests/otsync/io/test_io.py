@@ -16,7 +16,7 @@ from otsync.cli import main
 from otsync.files.arrays import write_npz
 from otsync.io import READERS, ImageFrames, VideoFrames, describe_folder, find_reader, open_scene, readers
 from otsync.io.document import FORMAT, VERSION, document, write_document
-from otsync.io.frames import _Errors
+from otsync.io.frames import ArrayFrames, _Errors
 from otsync.io.images import read_depth, read_image, read_mask
 from otsync.io.mend import keep_frames
 from otsync.plugins import forget, register
@@ -84,10 +84,12 @@ def test_take_names_what_there_is(folder):
         ({"frames": "/etc/*.png"}, "outside"),
         ({"frames": ["../secret.png"] * 12}, "outside"),
         ({"frames": "**/*.png"}, "pattern"),
-        ({"frames": 7}, "pattern"),
+        ({"frames": 7}, r"videos\[0\]\.frames .*expected text or a list; found 7"),
+        ({"frames": "a.png"}, "pattern"),
         ({"frames": "nothing/*.png"}, "no files"),
         ({"camera": None}, "calibration"),
-        ({"camera": {"K": 1}}, "w2c"),
+        ({"camera": {"K": 1}}, r"videos\[0\]\.camera\.K .*expected a list or null; found 1"),
+        ({"camera": {"width": 32}}, "w2c"),
         ({"fps": None}, "fps"),
         ({"fps": -3}, "fps"),
         ({"timestamps": [0.0] * 12}, "increasing"),
@@ -284,6 +286,26 @@ def test_damaged_videos_are_clean_errors(tmp_path, data):
             video[k]
     except ValueError as error:
         assert "v.mp4" in str(error)
+
+
+def test_a_video_of_more_pixels_than_are_decoded_is_refused(tmp_path, monkeypatch):
+    """By its header; and, where a frame says more than the header, by the decoder."""
+    write_video(tmp_path / "v.mp4", [3000 * k for k in range(5)])
+    monkeypatch.setattr("otsync.io.frames.MAX_PIXELS", 64 * 48)
+    assert VideoFrames(tmp_path / "v.mp4")[4].shape == (48, 64, 3)
+    monkeypatch.setattr("otsync.io.frames.MAX_PIXELS", 64 * 48 - 1)
+    with pytest.raises(ValueError, match=r"v\.mp4: .*64 x 48 pixels, more than the 3071 allowed"):
+        VideoFrames(tmp_path / "v.mp4")
+
+
+def test_an_array_that_claims_a_hundred_thousand_squared_takes_no_memory(tmp_path):
+    with open(tmp_path / "huge.npy", "wb") as stream:
+        about = {"descr": "<f4", "fortran_order": False, "shape": (100_000, 100_000)}
+        np.lib.format.write_array_header_1_0(stream, about)
+        stream.write(bytes(2**20))
+    for read in (lambda path: read_depth(path, 1.0), ArrayFrames):
+        with pytest.raises(ValueError, match=r"huge\.npy: .* it declares 40000000000 bytes but holds 1048576"):
+            read(tmp_path / "huge.npy")
 
 
 def test_sizes_that_a_damaged_video_makes_up_are_no_lack_of_memory():

@@ -91,6 +91,11 @@ def set_camera(videos, key, value):
         (lambda v: v[1].update(depth={"frames": "d1/*.png", "scale": 1}), "error", "times 0.001"),
         (lambda v: v[1].update(frames="nowhere/*.jpg"), "error", "no files"),
         (lambda v: v[1].update(range=[0, 20], depth=None), "warning", "few"),
+        (lambda v: v[1].update(name="c0"), "error", "2 videos have this name"),
+        (lambda v: set_camera(v, "w2c", v[0]["camera"]["w2c"]), "error", "stands where that of c0 stands"),
+        (lambda v: v[1].update(frames="c0/*.jpg"), "error", "made of files that c0 is made of"),
+        (lambda v: set_camera(v, "width", 160.9), "error", "videos[1].camera.width (of 'c1'): expected a whole number"),
+        (lambda v: v[1].update(nmae="x"), "error", "Did you mean 'name'?"),
         (lambda v: set_camera(v, "readout", 20.0), "error", "phones: 0.005 to 0.03"),
         (lambda v: v[1].update(fps=25, timestamps=[k / 30 for k in range(50)]), "error", "25"),
     ],
@@ -98,6 +103,16 @@ def set_camera(videos, key, value):
 def test_each_fault_is_found_and_named(sound, change, severity, words):
     found = findings(sound, change)
     assert any(f.severity == severity and words in f"{f.what} {f.remedy}" for f in found), text(found)
+
+
+def test_slips_of_several_videos_are_all_found_and_the_sound_ones_are_still_checked(sound):
+    def change(videos):
+        videos[0]["fps"] = True
+        videos[1]["name"] = None
+        set_camera(videos[1:], "K", [[460, 0, 320], [0, 460, 180], [0, 0, 1]])
+
+    found = text(findings(sound, change))
+    assert "videos[0].fps" in found and "videos[1].name" in found and "another resolution" in found
 
 
 def test_a_scaled_pose_is_found(sound):

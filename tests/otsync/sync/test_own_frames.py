@@ -21,7 +21,7 @@ from otsync.types import Alignment, Clock, Matches, Offsets, Similarity, Status
 def frames_of(n: int, seed: int) -> list[Similarity]:
     rng = np.random.default_rng(seed)
     made = [
-        Similarity(float(rng.uniform(0.5, 2)), Rotation.random(rng=rng).as_matrix(), rng.normal(size=3))
+        Similarity(float(rng.uniform(0.5, 2)), Rotation.from_quat(rng.normal(size=4)).as_matrix(), rng.normal(size=3))
         for _ in range(n)
     ]
     return [Similarity(1.0, np.eye(3), np.zeros(3)), *made[1:]]

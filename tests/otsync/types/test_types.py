@@ -112,7 +112,11 @@ def changed(where, value):
             float("inf"),
             r"videos, c: offset_seconds: expected a finite number, or null",
         ),
-        (("videos", 2, "offset_seconds"), 10**400, r"OverflowError"),
+        (
+            ("videos", 2, "offset_seconds"),
+            10**400,
+            r"videos\[2\]\.offset_seconds \(of 'c'\): expected a number below 1e308",
+        ),
         (("videos", 2, "offset_seconds"), "1", r"videos, c: offset_seconds: expected a number or null; found '1'"),
         (("videos", 1, "name"), "a", r"videos: expected at least one, with unique names"),
         (("videos", 2, "name"), 7, r"videos: expected at least one, with unique names"),
@@ -160,7 +164,7 @@ def test_offsets_that_make_no_sense_are_refused_with_the_field(tmp_path, where, 
     if says is None:
         Offsets.load(tmp_path / "o.json")
         return
-    with pytest.raises(ValueError, match=rf"o\.json: not a sound offsets file; .*{says}.*Write it anew"):
+    with pytest.raises(ValueError, match=rf"o\.json: (not a sound offsets file; )?.*{says}.*Write it anew"):
         Offsets.load(tmp_path / "o.json")
 
 

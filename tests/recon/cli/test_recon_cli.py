@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -308,7 +309,7 @@ def test_a_damaged_result_is_named(result, tmp_path, capsys):
     shutil.copytree(result, tmp_path / "odd")
     (tmp_path / "odd" / "run.json").write_text(json.dumps(run))
     assert main(["render", str(tmp_path / "odd"), "--camera", "cam0"]) == 2
-    assert "not a sound reconstruction" in capsys.readouterr().err
+    assert "run.json: videos[0].gain (of 'cam0'): expected a list" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -343,7 +344,9 @@ def test_a_strangers_run_json_is_refused_when_it_makes_no_sense(result, tmp_path
     for name in ("scene.npz", "offsets.json"):
         shutil.copy(result / name, tmp_path / name)
     (tmp_path / "run.json").write_text(json.dumps(document))
-    with pytest.raises(ValueError, match=r"run\.json: not a sound reconstruction"):
+    with pytest.raises(
+        ValueError, match=r"run\.json: (not a sound reconstruction|videos\[0\]\..*: expected .*; found )"
+    ):
         load_result(tmp_path)
 
 
@@ -734,6 +737,60 @@ def test_run_says_once_which_frames_it_leaves_out(world, synchronized, tmp_path,
     for note in ("video cam1, frame 1 is left out", "video cam1: 1 further frames are left out"):
         assert told.count(note) == 1
         assert note in (out / "report.html").read_text()
+
+
+def test_run_stops_in_one_line_where_fewer_than_two_videos_are_linked(world, tmp_path, monkeypatch, capsys):
+    part = only(Offsets.load(world / "start.json"), ("cam0", "cam1", "cam2"))
+    alone = replace(part, component=np.arange(3), sigma=np.zeros(3), alignments={})
+    found = SimpleNamespace(offsets=alone, route="tracks", why=(), seconds={})
+    monkeypatch.setattr("otsync.recordings.routes.synchronize_scene", lambda scene, **kwargs: found)
+    monkeypatch.setattr("otsync.report.frames.write_recording_report", lambda *args: None)
+    out = tmp_path / "r"
+    assert otsync(["run", str(world), "--out", str(out), "--steps", "2", "--held-out", "held0"]) == 1
+    assert "otsync: expected two videos and more on one clock; found 1 of 3" in capsys.readouterr().err
+    assert (out / "offsets_coarse.json").exists() and not (out / "scene.npz").exists()
+
+
+def test_run_looks_at_the_truth_before_it_works(world, synchronized, tmp_path, capsys):
+    few = only(Offsets.load(world / "truth.json"), ("cam0", "cam1"))
+    few.save(tmp_path / "few.json")
+    for truth, says in (("few.json", "cam2"), ("none.json", "no such file")):
+        args = [
+            "run",
+            str(world),
+            "--out",
+            str(tmp_path / "r"),
+            "--truth",
+            str(tmp_path / truth),
+            "--held-out",
+            "held0",
+        ]
+        assert otsync(args) == 2
+        assert says in capsys.readouterr().err
+    assert synchronized == [] and not (tmp_path / "r").exists()
+
+
+def test_no_command_writes_over_a_result(world, result, tmp_path, capsys):
+    folder = tmp_path / "r"
+    shutil.copytree(result, folder)
+    before = (folder / "scene.npz").read_bytes(), (folder / "offsets.json").read_bytes()
+    tracks = [str(path) for path in sorted((world / "tracks").glob("*.npz"))]
+    assert otsync(["sync", *tracks, "--out", str(folder)]) == 2
+    assert otsync(["run", str(world), "--out", str(folder)]) == 2
+    assert main(["export", str(folder), "--format", "tracks", "--out", str(folder / "scene.npz")]) == 2
+    assert main(["eval", str(folder), str(world), "--out", str(folder / "metrics.json")]) == 2
+    told = capsys.readouterr().err
+    assert told.count("holds that of recon fit") == 2 and told.count("belongs to that of recon fit") == 2
+    assert ((folder / "scene.npz").read_bytes(), (folder / "offsets.json").read_bytes()) == before
+
+
+def test_a_shorter_rendering_over_a_longer_one_is_refused(result, tmp_path, capsys):
+    args = ["render", str(result), "--camera", "cam0", "--width", "16", "--out", str(tmp_path / "f"), "--times", "0.1"]
+    assert main([*args, "0.2"]) == 0
+    assert main([*args, "0.2"]) == 0  # the same again
+    assert main(args) == 2
+    assert "it holds 00001.png" in capsys.readouterr().err
+    assert sorted(p.name for p in (tmp_path / "f").iterdir()) == ["00000.png", "00001.png"]
 
 
 def test_run_tells_the_reconstruction_which_frames_and_how_long_shutters_were_open(world, synchronized, tmp_path):

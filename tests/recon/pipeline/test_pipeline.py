@@ -15,6 +15,7 @@ import pytest
 
 from otsync.files.arrays import read_npz
 from otsync.files.cache import Cache
+from otsync.files.claim import clear_parts
 from otsync.io import open_scene
 from otsync.io.mend import cut, keep_frames, unreadable
 from otsync.priors.points import ChainedFlow
@@ -32,7 +33,7 @@ from recon.pipeline.prepare import prepare
 from recon.pipeline.stages import lifted_tracks
 from recon.pipeline.starts import world_footprint
 from recon.pipeline.verb import reconstruct
-from recon.result.folder import clear_parts, load_result
+from recon.result.folder import load_result
 from recon.scene.gaussians4d import Gaussians4D
 from tests.recon.worlds import CAMERAS, FRAMES, SIZE, capture, write_world
 

@@ -1,0 +1,62 @@
+"""What ``scene.json`` may hold: the one place that says so. Reading, checking and the JSON Schema follow from it."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from msgspec import UNSET, Meta, UnsetType, field
+
+from ..files.strict import Count, Document, Name, Text
+
+MAX_VIDEOS, MAX_FILES = 1000, 200_000
+
+Files = Text | Annotated[list[Text], Meta(min_length=1, max_length=MAX_FILES)]
+"""A pattern with ``*`` in the file name, or a list of files."""
+
+Row3 = Annotated[list[float], Meta(min_length=3, max_length=3)]
+Pixels = Annotated[int, Meta(ge=1, le=1_000_000)]
+
+
+class CameraFile(Document, frozen=True, kw_only=True):
+    """A camera: null stands for what is still missing."""
+
+    K: Annotated[list[Row3], Meta(min_length=3, max_length=3)] | None = None
+    w2c: list[list[float | list[float]]] | None = None
+    width: Pixels | None = None
+    height: Pixels | None = None
+    distortion: list[float] | None = None
+    readout: float | None = None
+
+
+class DepthFile(Document, frozen=True, kw_only=True):
+    """Depth of a video: a map a frame, or one array of all."""
+
+    frames: Files | UnsetType = UNSET
+    file: Text | UnsetType = UNSET
+    scale: float = 1.0
+
+
+class VideoFile(Document, frozen=True, kw_only=True):
+    """One video of a scene."""
+
+    name: Name | UnsetType = UNSET
+    file: Text | UnsetType = UNSET
+    frames: Files | UnsetType = UNSET
+    fps: float | None = None
+    timestamps: list[float] | None = None
+    range: Annotated[list[Count], Meta(min_length=2, max_length=2)] | None = None
+    camera: CameraFile | None = None
+    depth: DepthFile | None = None
+    masks: Files | None = None
+    labels: Files | None = None
+
+
+class SceneFile(Document, frozen=True, kw_only=True):
+    """A scene document."""
+
+    format: Literal["otsync.scene"]
+    version: Literal[1]
+    videos: Annotated[list[VideoFile], Meta(min_length=1, max_length=MAX_VIDEOS)]
+    frame: Name = "world"
+    missing: list[Text] | None = None
+    notes: list[Text] = field(default_factory=list)
