@@ -15,20 +15,20 @@ LEAST_WINDOW = 8 / 30
 """Seconds that a match must be seen in both videos within a window."""
 
 PRICE, SHARE = 7.0, 0.08
-"""Nats a match, and share of the whole evidence, that a jump must gain to be told. Clean pairs (mid to brutal) gain up to
-7, freezes of 15 frames and ten lost frames 10 to 25."""
+"""Nats a match, and share of the whole evidence, that a jump must gain to be told. Clean pairs (mid to brutal) gain up
+to 7, freezes of 15 frames and ten lost frames 10 to 25."""
 
 LOW_PRICE, LOW_SHARE = 3.5, 0.05
 """The same where part of the overlap is not explained by the best offset."""
 
 UNEXPLAINED, UNEXPLAINED_LONG = 0.5, 0.4
-"""Share of its motion that a window of 20 frames, and two in a row, must have in common at the best offset, for the best
-quarter of the matches. The least window of clean pairs has .73 and more (mid), .49 (hard, like people .67); of freezes
-and a missing second .43 and less; of ten lost frames .06 to .9."""
+"""Share of its motion that a window of 20 frames, and two in a row, must have in common at the best offset, for the
+best quarter of the matches. The least window of clean pairs has .73 and more (mid), .49 (hard, like people .67); of
+freezes and a missing second .43 and less; of ten lost frames .06 to .9."""
 
 ODD, UNUSUAL, LEAST_MISSING = 3.0, 4.5, 0.15
-"""How many times more than usual may be missing in two windows in a row: clean pairs 1.5 (mid), 4.3 (hard), 4.2 (brutal)
-at most, of ten lost frames half have 4.6 to 7; and what counts as missing at all."""
+"""How many times more than usual may be missing in two windows in a row: clean pairs 1.5 (mid), 4.3 (hard), 4.2
+(brutal) at most, of ten lost frames half have 4.6 to 7; and what counts as missing at all."""
 
 AGREES = 0.5
 """Share of its motion that the median match must have in common over a part, at the part's own offset."""
@@ -39,8 +39,8 @@ MOVES = 6.0
 BEST_QUARTER, LEAST_MOVING = 0.75, 5
 
 BEYOND = 0.5
-"""Share of a usual window's evidence that windows must have which lie beyond the overlap at the best offset: some offset
-suits them by chance. Clean pairs have up to .4 there, parts that are real .5 and more."""
+"""Share of a usual window's evidence that windows must have which lie beyond the overlap at the best offset: some
+offset suits them by chance. Clean pairs have up to .4 there, parts that are real .5 and more."""
 
 AS_A_RATE = 2.0
 """Nats a match that parts must add beyond what an even change of the offset adds."""
@@ -109,8 +109,8 @@ def find_breaks(
 ) -> tuple[Float[np.ndarray, "P 2"], float, bool]:
     """The parts of the overlap that have offsets of their own.
 
-    Returns rows (seconds of a's clock from which on, offset in seconds), none where one offset suits the whole; how much
-    evidence the parts add, nats a match; and whether there may be parts that the evidence is too weak to tell.
+    Returns rows (seconds of a's clock from which on, offset in seconds), none where one offset suits the whole; how
+    much evidence the parts add, nats a match; and whether there may be parts that the evidence is too weak to tell.
     """
     step = max(1, round(STEP * pair.fps))
     windows = -(-pair.a.shape[1] // step) + 1
@@ -238,7 +238,7 @@ def _rate_gain(curves: Float[np.ndarray, "W K"], straight: float) -> float:
     for ends in range(-most, most + 1):
         shift = np.rint(ends * position / max(W - 1, 1)).astype(np.int64)
         reach = int(np.abs(shift).max(initial=0))
-        if K <= 2 * reach:
+        if 2 * reach >= K:
             continue
         middle = np.arange(reach, K - reach)
         total = sum(curves[w, middle + shift[w]] for w in range(W))
@@ -249,7 +249,7 @@ def _rate_gain(curves: Float[np.ndarray, "W K"], straight: float) -> float:
 def without_steps(
     curves: Float[np.ndarray, "W K"], path: Int[np.ndarray, " W"], least: int, shortest: int
 ) -> Int[np.ndarray, " W"]:
-    """The path without parts that are shorter than ``shortest`` windows or whose lag is within ``least`` of the next."""
+    """The path without parts of fewer than ``shortest`` windows, or whose lag is within ``least`` of the next one's."""
     while True:
         edges = np.flatnonzero(np.diff(path)) + 1
         if not len(edges):

@@ -181,9 +181,7 @@ def evidence(pair: CommonClock, lags: Int[np.ndarray, " K"], weight: Float[np.nd
     floor = noise_floor(count, power, residual)
     total = np.zeros((1, len(lags)))
     begin, (block, few) = np.maximum(lags, 0), (frames(BLOCK), frames(MIN_WINDOW))  # treats a and b alike
-    kernels.windowed_evidence(
-        *positions[0].arrays, *positions[1].arrays, lags, begin, block, few, floor, weight, total
-    )
+    kernels.windowed_evidence(*positions[0].arrays, *positions[1].arrays, lags, begin, block, few, floor, weight, total)
     observed = (count > 0).sum(0).astype(float)
     windows = np.where(observed > 0, total[0] / len(pair.a), -np.inf)
     fast, slow = (velocity_score(pair, lags, frames(half), least, weight) for half in (FAST, SLOW))

@@ -10,7 +10,6 @@ import math
 import warnings
 
 import numpy as np
-from jaxtyping import Float
 
 from ..compute.indices import evenly
 from ..costs.linear import cosine_distance, unit_features

@@ -33,9 +33,9 @@ m over a static scene: share .96 to .997, size .02 to .1; the moving classes, al
 sizes of .6 and more (a box that flies), sizes below .3 with shares of .1 to .55."""
 
 RIVAL = 1.05
-"""Distance of the tracks at another time, over that at the answer, below which that time is as good: carousels .4 to 1.06,
-exact loops .9 to 1; presets mid 2 and more, hard 1.22, like people 1.29, brutal 1 to 1.22, real cameras 1.14 and more (24
-pairs; 10 each of the others)."""
+"""Distance of the tracks at another time, over that at the answer, below which that time is as good: carousels .4 to
+1.06, exact loops .9 to 1; presets mid 2 and more, hard 1.22, like people 1.29, brutal 1 to 1.22, real cameras 1.14 and
+more (24 pairs; 10 each of the others)."""
 
 LOOKS, ENOUGH = 30, 6
 """Moments at which the common motion is taken, and tracks that must be seen at one."""
@@ -44,11 +44,12 @@ MOMENTS, STEP = 200, 5 / 30
 """Moments at which velocities are compared after the common motion is taken out, and half the seconds they are over."""
 
 CORRELATED, RATHER_LITTLE = 0.19, 0.45
-"""Correlation of what is left of the best tenth of the matches, and size of what was taken out, below which only a drift
-is shared: static scenes with drifts of .2 m have .12 to .17 and at most .36; what moves by as little .5 and more (mid), .25
-(hard), .19 (brutal; 20 pairs each)."""
+"""Correlation of what is left of the best tenth of the matches, and size of what was taken out, below which only a
+drift is shared: static scenes with drifts of .2 m have .12 to .17 and at most .36; what moves by as little .5 and more
+(mid), .25 (hard), .19 (brutal; 20 pairs each)."""
 
 BEST_TENTH, LEAST_MOMENTS = 0.9, 40
+
 
 def vouch(alignment: Alignment, a: TrackSet, b: TrackSet, matches: Matches, aligner: Aligner) -> Alignment:
     """``alignment`` with the flags that its aligner did not raise.
@@ -67,9 +68,9 @@ def vouch(alignment: Alignment, a: TrackSet, b: TrackSet, matches: Matches, alig
         flags += scan.flags
         if not abs(scan.offset - alignment.offset) <= AGREES + 1e-9:
             flags.append(Status.DISAGREE)
-    if all(drifts(tracks, index) for tracks, index in zip((a, b), matches.pairs.T, strict=True)):
-        flags.append(Status.STATIC)
-    elif Status.DISAGREE not in flags and only_drift(a, b, matches, alignment.offset):
+    if all(drifts(tracks, index) for tracks, index in zip((a, b), matches.pairs.T, strict=True)) or (
+        Status.DISAGREE not in flags and only_drift(a, b, matches, alignment.offset)
+    ):
         flags.append(Status.STATIC)
     if a.frame is not None and a.frame == b.frame:
         distance = apart(a, b, matches, alignment.offset)

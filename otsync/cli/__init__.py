@@ -1,6 +1,7 @@
 """Synchronise videos of one moving scene: ``otsync demo | simulate | match | init | check | sync | run | bench``.
 
-Exit codes: 0 done; 1 an answer was refused (its status is printed); 2 bad arguments or files; 130 interrupted, by Ctrl-C or SIGTERM.
+Exit codes: 0 done; 1 an answer was refused (its status is printed); 2 bad arguments or files; 130 interrupted, by
+Ctrl-C or SIGTERM.
 """
 
 from __future__ import annotations

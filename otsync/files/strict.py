@@ -1,7 +1,7 @@
 """Strict documents: JSON against one schema, types and fields alike, with errors that name file and field.
 
-A document is a :class:`Document`; what it may hold stands in its annotations, and :func:`json_schema` writes the same as
-JSON Schema. Nothing is converted: true is no number, 160.9 no count of pixels, " 3 " no number.
+A document is a :class:`Document`; what it may hold stands in its annotations, and :func:`json_schema` writes the same
+as JSON Schema. Nothing is converted: true is no number, 160.9 no count of pixels, " 3 " no number.
 """
 
 from __future__ import annotations

@@ -188,7 +188,7 @@ class System:
     def wander(self) -> float:
         """See :class:`Fit`."""
         H, g = self.by_time[0][:, 0, 0], self.by_time[1][:, 0]
-        told = H > 1e-9 * max(float(H.sum()), 1e-300)
+        told = 1e-9 * max(float(H.sum()), 1e-300) < H
         return float(np.sqrt((g[told] ** 2 / H[told]).sum() / max(float(H[told].sum()), 1e-300)))
 
 

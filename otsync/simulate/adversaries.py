@@ -58,7 +58,7 @@ def loop(rng: np.random.Generator) -> Scene:
 
 
 def carousel(rng: np.random.Generator) -> Scene:
-    """Eight like horses go round and bob up and down; each place is taken by the next horse after an eighth of a turn."""
+    """Eight like horses go round and bob up and down; an eighth of a turn later each is where the next one was."""
     count, turn, start = 8, rng.uniform(0.4, 0.9), rng.uniform(0, TAU)
 
     def pose(t: np.ndarray) -> Poses:
@@ -86,7 +86,7 @@ def flock(rng: np.random.Generator) -> Scene:
     """Twelve like things that wander together, and hardly apart."""
     count = 12
     together, apart = Wander(rng, 3, 0.4, 0.15, 0.6), Wander(rng, 3 * count, 0.05, 0.3, 1.0)
-    place = rng.uniform(-0.8, 0.8, (count, 3)) + [0, 0, 1.0]
+    place = rng.uniform(-0.8, 0.8, (count, 3)) + np.array([0, 0, 1.0])
 
     def pose(t: np.ndarray) -> Poses:
         own = apart(t).reshape(len(t), count, 3).transpose(1, 0, 2)

@@ -1,7 +1,7 @@
 """Breaks of clocks in a set of videos: which video froze, lost frames or was cut, where, and by how much.
 
-A pair says that its offset jumps, not whose clock it is. A video that stands still where the other moves is the one that
-froze; among three and more the video that most pairs name is the one.
+A pair says that its offset jumps, not whose clock it is. A video that stands still where the other moves is the one
+that froze; among three and more the video that most pairs name is the one.
 """
 
 from __future__ import annotations
@@ -227,7 +227,10 @@ def stood_still(curves: TrackSplines, start: float, length: float) -> bool:
     """Whether all tracks rest from ``start`` on for ``length`` s, and move before and behind."""
     inner = min(0.25 * length, MARGIN)
     during = _speed(curves, start + inner, start + length - inner)
-    around = [_speed(curves, start - AROUND, start - MARGIN), _speed(curves, start + length + MARGIN, start + length + AROUND)]
+    around = [
+        _speed(curves, start - AROUND, start - MARGIN),
+        _speed(curves, start + length + MARGIN, start + length + AROUND),
+    ]
     known = [s for s in around if math.isfinite(s)]
     return bool(known) and math.isfinite(during) and during < STILL * float(np.mean(known))
 

@@ -65,8 +65,9 @@ def synchronize(
             paper's star.
         rematch: how often pairs whose first answer is trusted are matched again with positions at the synchronised
             times (more than once adds nothing); None: once. Matches of your own are left alone.
-        rate: "fixed" takes frame rates as declared; "fit" frees them for pairs that overlap by 20 s and more, and
-            keeps what is significant; None: as the refiner says, by default "fixed".
+        rate: "fit" frees frame rates and keeps what is significant and moves the ends of the overlap; "fixed" takes
+        them
+            as declared, and flags what contradicts them; None: as the refiner says, by default "fit".
         frames: "common" where all positions are in one world frame; "own" where every video has a frame and a unit of
             its own (several depth cameras, phones with depth): then rotation, translation and scale are found beside
             the offsets, in :attr:`Offsets.transforms`. An :class:`OwnFrames` sets how. ``aligner``, ``refiner``,

@@ -30,8 +30,8 @@ FRAMES = (
 
 
 BREAKS = (
-    "a video whose clock breaks: from at_seconds of its own clock on, jump_seconds are added to t_video before rate and "
-    "offset; frames within still_seconds before at_seconds stood still and tell no time"
+    "a video whose clock breaks: from at_seconds of its own clock on, jump_seconds are added to t_video before rate "
+    "and offset; frames within still_seconds before at_seconds stood still and tell no time"
 )
 
 Number = float | None

@@ -21,11 +21,11 @@ class Status(StrEnum):
     )
     RATE_MISMATCH = (
         "The motion contradicts the declared frame rates. Check fps (29.97 against 30, 25 against 30) or the "
-        "container's timestamps, or call with rate='fit' on a long clip."
+        "container's timestamps, or let the rate be fitted (rate='fit', the default)."
     )
     BROKEN_CLOCK = (
-        "Parts of the overlap have offsets of their own: a video froze, lost frames, was paused or cut. Look at the parts; "
-        "give the true timestamps, or cut the recording there."
+        "Parts of the overlap have offsets of their own: a video froze, lost frames, was paused or cut. Look at the "
+        "parts; give the true timestamps, or cut the recording there."
     )
     POOR_FIT = (
         "The matched motions hardly correlate at the answer. Check that both videos show the same scene, and the "

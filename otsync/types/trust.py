@@ -29,7 +29,8 @@ class Trust:
         spread: SPREAD when fits with other detrending windows differ by more than this, s.
         correlation: POOR_FIT below this pooled correlation of the matched velocities at the answer.
         blur: WEAK when the rms residual of the fit is more than this many seconds of rms motion.
-        wander: BROKEN_CLOCK when the offsets of single seconds differ by more than this share of ``blur``: of noise they
+        wander: BROKEN_CLOCK when the offsets of single seconds differ by more than this share of ``blur``: of noise
+        they
             differ by .08 of it at most (16 pairs each, mid to brutal), in two takes of one choreography by .12 to .46.
         rate_gain: RATE_MISMATCH when another common ratio of frame rates raises the score's peak by this factor.
         rate_sigmas: a fitted rate counts when it differs from the declared one by more than this many sigmas.

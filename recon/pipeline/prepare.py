@@ -12,8 +12,8 @@ from otsync.clocks.shutter import at_frame_times
 from otsync.compute.threads import MapLike
 from otsync.io import Scene
 from otsync.io.mend import cut, on_mended_clocks
-from otsync.sync.breaks import mended
 from otsync.progress import Deadline, Progress
+from otsync.sync.breaks import mended
 from otsync.types import Clock, Offsets, TrackSet
 from recon.backdrop.fit import StaticFit, with_backdrop
 from recon.footage.footage import Footage

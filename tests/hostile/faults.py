@@ -1,8 +1,8 @@
 """A plugin that ends a command, holds it, or fills its disk, at a moment that is counted in files written, not in time.
 
-FAULT: ``kill`` (SIGKILL, which nothing can catch), ``wait`` (until a line comes in), ``full`` (from there on every write
-fails as on a full disk). FAULT_AT: the moment, from 1 on; every file has three: half written, before and after it gets
-its name. Of a full disk the number of the file.
+FAULT: ``kill`` (SIGKILL, which nothing can catch), ``wait`` (until a line comes in), ``full`` (from there on every
+write fails as on a full disk). FAULT_AT: the moment, from 1 on; every file has three: half written, before and after
+it gets its name. Of a full disk the number of the file.
 """
 
 from __future__ import annotations

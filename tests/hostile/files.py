@@ -186,9 +186,36 @@ KINDS = (
 )
 
 HOSTILE: tuple[Any, ...] = (
-    None, True, False, -1, 0, 1e308, -1e308, 10**30, 10**4000, float("nan"), float("inf"), 160.9, " 3_0 ", "", "\x1b[2J\x07", "a\nb",
-    "\ud800", "x" * 5000, "../../etc/passwd", "*", "**/*", [], [[]], {}, {"a": 1}, [None], [[[[[1]]]]], [0] * 5000, ["a", 1],
-)  # fmt: skip
+    None,
+    True,
+    False,
+    -1,
+    0,
+    1e308,
+    -1e308,
+    10**30,
+    10**4000,
+    float("nan"),
+    float("inf"),
+    160.9,
+    " 3_0 ",
+    "",
+    "\x1b[2J\x07",
+    "a\nb",
+    "\ud800",
+    "x" * 5000,
+    "../../etc/passwd",
+    "*",
+    "**/*",
+    [],
+    [[]],
+    {},
+    {"a": 1},
+    [None],
+    [[[[[1]]]]],
+    [0] * 5000,
+    ["a", 1],
+)
 """Values that have no business in a field."""
 
 
@@ -261,10 +288,19 @@ def _other_arrays(content: bytes, rng: np.random.Generator) -> tuple[bytes, tupl
     name = sorted(arrays)[int(rng.integers(0, len(arrays)))]
     old = arrays.pop(name)
     others = (
-        np.array(7), np.array("text"), np.array([{}], object), old.astype("c16") if old.dtype.kind in "fiub" else old[None],
-        old[None], old[..., :-1] if old.ndim else old[None], np.full(old.shape, np.nan), np.full((3, 0, 2), 1.0),
-        np.full(old.shape, -1, np.int64), np.full(old.shape, 1e308), np.array("a\x1b[2J"), np.full(old.shape, True),
-    )  # fmt: skip
+        np.array(7),
+        np.array("text"),
+        np.array([{}], object),
+        old.astype("c16") if old.dtype.kind in "fiub" else old[None],
+        old[None],
+        old[..., :-1] if old.ndim else old[None],
+        np.full(old.shape, np.nan),
+        np.full((3, 0, 2), 1.0),
+        np.full(old.shape, -1, np.int64),
+        np.full(old.shape, 1e308),
+        np.array("a\x1b[2J"),
+        np.full(old.shape, True),
+    )
     choice = int(rng.integers(-1, len(others)))
     if choice >= 0:
         arrays[name] = others[choice]

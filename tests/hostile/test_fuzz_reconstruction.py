@@ -40,10 +40,20 @@ KINDS = (
     Kind("4D scene", "scene.npz", scene, Gaussians4D.load),
     Kind("run", "run.json", result, lambda path: load_result(path.parent)),
     Kind("result's scene", "scene.npz", result, lambda path: load_result(path.parent)),
-    Kind("ply", "scene.ply", lambda folder: save_ply(random_scene(random_scaffold()).at(0.1), folder / "scene.ply"), load_ply),
-    Kind("checkpoint", "fit.npz", lambda folder: random_scene(random_scaffold()).save(folder / "fit.npz"),
-         lambda path: Checkpoint(path, "key").load({}), sound=False),
-)  # fmt: skip
+    Kind(
+        "ply",
+        "scene.ply",
+        lambda folder: save_ply(random_scene(random_scaffold()).at(0.1), folder / "scene.ply"),
+        load_ply,
+    ),
+    Kind(
+        "checkpoint",
+        "fit.npz",
+        lambda folder: random_scene(random_scaffold()).save(folder / "fit.npz"),
+        lambda path: Checkpoint(path, "key").load({}),
+        sound=False,
+    ),
+)
 
 ALL = pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
 

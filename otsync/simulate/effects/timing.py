@@ -1,8 +1,8 @@
 """Effects of what a file does to time and does not say: freezes, lost frames, cuts, loops, slow motion.
 
 Each changes which moment of the world a frame shows and leaves the video's declared clock alone. They belong before the
-errors of cameras and trackers in the tuple, since those happen in the video's own time. ``Truth.shown`` tells what every
-frame shows.
+errors of cameras and trackers in the tuple, since those happen in the video's own time. ``Truth.shown`` tells what
+every frame shows.
 """
 
 from __future__ import annotations

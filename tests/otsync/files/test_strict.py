@@ -1,4 +1,4 @@
-"""Documents against their schema: types are not converted, errors name file, field and the nearest field that there is."""
+"""Documents against their schema: types are not converted, keys are known, errors name the field."""
 
 from __future__ import annotations
 
