@@ -1,0 +1,33 @@
+"""What the matches of one answer hide: other times that suit as well, and drifts that all tracks share."""
+
+from __future__ import annotations
+
+import pytest
+
+from otsync import match, synchronize
+from otsync.align.rivals import rival
+from otsync.simulate import PRESETS, simulate
+from otsync.simulate.effects import SharedDrift, Transient
+from otsync.types import Status
+
+
+def test_a_carousel_suits_at_other_times_and_a_player_does_not():
+    ratio = {}
+    for motion in ("carousel", "tennis"):
+        (a, b), _ = simulate(motion, preset="mid", videos=2, offsets=[0.0, 0.1], seed=6)
+        ratio[motion] = rival(a, b, match(a, b, throw=False), 0.1)
+    assert ratio["carousel"] < 1.1 and ratio["tennis"] > 1.5
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_like_things_that_take_each_others_places_are_never_trusted_wrongly(seed):
+    tracks, truth = simulate("carousel", preset="mid", videos=2, max_offset=30, seed=seed)
+    offsets = synchronize(tracks)
+    assert not offsets.status[1].ok or abs(offsets.seconds[1] - truth.offsets[1]) * 30 < 1
+
+
+@pytest.mark.parametrize("effect", [Transient(0.2), SharedDrift(0.2, seed=5)], ids=["settling", "one drift for all"])
+def test_a_static_scene_that_drifts_alike_is_static(effect):
+    effects = (*PRESETS["mid"].effects, effect)
+    tracks, _ = simulate("static", preset="mid", videos=2, offsets=[0.0, 0.4], effects=effects, seed=1)
+    assert Status.STATIC in synchronize(tracks).flags[1]

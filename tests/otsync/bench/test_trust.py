@@ -1,0 +1,68 @@
+"""``otsync bench trust``: errors are measured against what frames show, and the tables say what they say."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from otsync.bench.trust.diagram import reliability
+from otsync.bench.trust.run import acceptance, interval, run, summarise, wrong
+from otsync.bench.trust.worlds import CLASSES, FPS, World
+from otsync.simulate import simulate
+from otsync.types import Break, Offsets
+
+
+def test_an_error_is_the_distance_from_what_a_frame_shows():
+    tracks, truth = simulate("tennis", preset="mid", videos=2, offsets=[0.0, 0.5], seed=1)
+    world = World(tuple(tracks), truth.shown)
+    for off in (0.0, 0.1, -0.2):
+        ends, worst = world.errors(Offsets.known(("a", "b"), np.array([0.0, 0.5 + off]), FPS))
+        assert ends[0] == pytest.approx(abs(off) * FPS, abs=1e-6) and worst[0] == pytest.approx(ends[0], abs=1e-6)
+
+
+def test_a_break_that_is_not_told_is_an_error_behind_it():
+    world = next(w for w in map(CLASSES["freeze of 30"], range(20)) if w.shown[1][0] < 0)  # most of it is common
+    assert world.shown is not None
+    late = float(world.shown[1][0] - world.shown[0][0])
+    plain = Offsets.known(("a", "b"), np.array([0.0, late]), FPS)
+    assert world.errors(plain)[0][0] == pytest.approx(30, abs=0.01)
+    step = np.flatnonzero(np.diff(world.shown[1]) < 1e-9)
+    at = float(world.tracks[1].times[step[-1] + 2])
+    import dataclasses
+
+    told = dataclasses.replace(plain, breaks=((), (Break(at, -1.0, 1.0),)))
+    assert world.errors(told)[0][0] < 0.01
+
+
+def test_where_there_is_no_truth_every_answer_is_wrong():
+    world = CLASSES["two scenes"](3)
+    ends, _ = world.errors(Offsets.known(("a", "b"), np.zeros(2), FPS))
+    assert np.isinf(ends).all()
+    assert wrong({"trusted": True, "error": float("inf")}) and not wrong({"trusted": False, "error": float("inf")})
+
+
+def test_tables_of_made_up_answers():
+    rng = np.random.default_rng(0)
+    sigma = rng.uniform(0.02, 0.2, 400)
+    base = {"method": "default", "trusted": True, "flags": ""}
+    rows = [
+        base | {"class": "mid", "error": abs(float(e)), "sigma": float(s)}
+        for e, s in zip(sigma * rng.normal(size=400), sigma, strict=True)
+    ]
+    told = reliability(rows)
+    assert len(told) == 8 and all(abs(r["claimed rms"] / r["found rms"] - 1) < 0.35 for r in told)
+    assert summarise(rows)[0]["trusted"] == 1.0
+    checks = {c.name: c for c in acceptance([*rows, base | {"class": "mid", "error": 9.0, "sigma": 0.1}])}
+    assert checks["confident and wrong, in 500 trusted"].measured == pytest.approx(500 / 401)
+    low, high = interval(0, 300)
+    assert low == 0 and high == pytest.approx(0.0122, abs=1e-3)
+
+
+def test_a_small_run_writes_tables_and_a_diagram(tmp_path):
+    assert run(tmp_path, seeds=1, first_seed=50, only=("mid", "two scenes")) == 0
+    rows = json.loads((tmp_path / "trust.json").read_text())["rows"]
+    assert {r["class"] for r in rows} == {"mid", "two scenes"} and (tmp_path / "trust.png").stat().st_size > 5000
+    with pytest.raises(ValueError, match="expected classes among"):
+        run(tmp_path, only=("nothing",))

@@ -1,0 +1,48 @@
+"""Effects on what a file does to time: exact, told by the truth, and confined to the video that they are in."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from otsync.simulate import ADVERSARIES, simulate
+from otsync.simulate.effects import Cut, Drop, Freeze, In, Loop, Repeats, Reverse, SlowMotion
+
+
+def filmed(effect, seed: int = 2):
+    return simulate("tennis", preset="mid", videos=2, offsets=[0.0, 0.2], effects=(In(1, effect),), seed=seed)
+
+
+@pytest.mark.parametrize(
+    "effect",
+    [Freeze(12), Freeze(12, catches_up=True), Drop(0.4), Cut(), Repeats(24), Loop(1.0), Reverse(), SlowMotion()],
+)
+def test_frames_show_what_the_truth_says(effect):
+    tracks, truth = filmed(effect)
+    for v in (0, 1):
+        expected = truth.positions(v, truth.shown[v])
+        seen = tracks[v].seen
+        np.testing.assert_allclose(tracks[v].positions()[seen], expected[seen], atol=1e-6)
+    np.testing.assert_allclose(truth.shown[0], tracks[0].times)
+    assert not np.allclose(truth.shown[1], tracks[1].times + 0.2)
+
+
+def test_a_freeze_repeats_the_frame_before_it_and_goes_on():
+    tracks, truth = filmed(Freeze(10, at=0.5))
+    shown = truth.shown[1]
+    assert np.ptp(shown[74:85]) < 1e-9 and shown[85] - shown[84] == pytest.approx(1 / 30)
+    assert shown[-1] == pytest.approx(tracks[1].times[-1] + 0.2 - 10 / 30)
+
+
+def test_lost_frames_are_jumped_over():
+    _, truth = filmed(Drop(1.0, at=0.4))
+    steps = np.diff(truth.shown[1])
+    assert steps.max() == pytest.approx(1 + 1 / 30) and (np.sort(steps)[:-1] == pytest.approx(1 / 30))
+
+
+@pytest.mark.parametrize("motion", ADVERSARIES)
+def test_motions_that_mislead_are_smooth_and_drawn_by_the_seed(motion):
+    (a, b), _ = simulate(motion, preset="clean", videos=2, effects=(), seed=4)
+    (c, _), _ = simulate(motion, preset="clean", videos=2, effects=(), seed=4)
+    np.testing.assert_array_equal(a.positions(), c.positions())
+    assert np.nanmax(np.abs(np.diff(b.positions(), axis=1))) < 1.0

@@ -1,0 +1,87 @@
+"""Clocks that break: which video, where, and by how much; and that videos without a break are left alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from otsync import synchronize
+from otsync.simulate import simulate
+from otsync.simulate.effects import Drop, Freeze, In
+from otsync.sync.breaks import mended
+from otsync.types import Break, Offsets, Status, TrackSet, mended_frames, mended_times
+
+
+def broken(effect, videos: int = 2, seed: int = 3, who: int = 1):
+    from otsync.simulate import PRESETS
+
+    late = [0.0, *(np.random.default_rng(seed).uniform(-0.6, 0.6, videos - 1))]
+    effects = (In(who, effect), *PRESETS["mid"].effects)
+    return simulate("basketball", preset="mid", videos=videos, offsets=late, effects=effects, seed=seed)
+
+
+@pytest.mark.parametrize(
+    ("effect", "jump", "still"),
+    [(Freeze(15, at=0.5), -0.5, 0.5), (Freeze(30, at=0.45), -1.0, 1.0), (Drop(10 / 30, at=0.5), 1 / 3, 0.0)],
+    ids=["freeze of 15", "freeze of 30", "ten frames dropped"],
+)
+def test_a_break_is_found_named_and_mended(effect, jump, still):
+    tracks, truth = broken(effect)
+    offsets = synchronize(tracks)
+    assert offsets.ok and offsets.breaks[0] == ()
+    (found,) = offsets.breaks[1]
+    assert found.jump == pytest.approx(jump, abs=0.2 / 30) and found.still == pytest.approx(still, abs=1e-6)
+    told = offsets.times(1, tracks[1].times)
+    error = np.abs(told - truth.shown[1]) * 30
+    away = np.abs(tracks[1].times - found.at) > still + 0.2
+    assert error[[0, -1]].max() < 0.15 and np.nanmax(error[away]) < 0.15
+    assert np.isnan(told).sum() == round(still * 30)
+    assert any("video1" in note for note in offsets.clock_notes())
+
+
+def test_of_four_videos_the_one_that_froze_is_named():
+    tracks, truth = broken(Freeze(20, at=0.5), videos=4, who=2)
+    offsets = synchronize(tracks)
+    assert [len(b) for b in offsets.breaks] == [0, 0, 1, 0]
+    assert np.abs(offsets.seconds - truth.offsets).max() * 30 < 0.15
+
+
+def test_whole_clocks_are_left_alone():
+    for seed in range(3):
+        tracks, _ = simulate("football", preset="mid", videos=2, max_offset=30, seed=seed)
+        offsets = synchronize(tracks)
+        assert offsets.breaks == ((), ()) and offsets.rates.tolist() == [1, 1]
+        assert Status.BROKEN_CLOCK not in offsets.flags[1]
+
+
+def test_a_wrong_rate_is_fitted_and_told():
+    tracks, _ = simulate("tennis", preset="mid", videos=2, frames=300, rates=[1.0, 1.01], offsets=[0, 0.3], seed=5)
+    offsets = synchronize(tracks)
+    assert offsets.ok and offsets.rates[1] == pytest.approx(1.01, abs=3e-4)
+    assert any("rate" in note for note in offsets.clock_notes())
+    held = synchronize(tracks, rate="fixed")
+    assert Status.RATE_MISMATCH in held.flags[1]
+
+
+def test_breaks_survive_the_file(tmp_path):
+    known = Offsets.known(("a", "b"), np.array([0.0, 0.5]), 30)
+    import dataclasses
+
+    told = dataclasses.replace(known, breaks=((), (Break(2.0, -0.5, 0.5, 0.001), Break(3.0, 1.0))))
+    told.save(tmp_path / "offsets.json")
+    again = Offsets.load(tmp_path / "offsets.json")
+    assert again.breaks[0] == () and again.breaks[1][0] == told.breaks[1][0]
+    assert again.breaks[1][1].jump == 1.0 and np.isnan(again.breaks[1][1].sigma)
+    with pytest.raises(ValueError, match="breaks"):
+        dataclasses.replace(known, breaks=((),))
+
+
+def test_times_behind_breaks_are_those_of_the_clock_before_them():
+    times = np.arange(10) / 10
+    shown, tells = mended_times(times, [Break(0.5, -0.2, 0.2)])
+    assert tells.tolist() == [True, True, True, False, False, True, True, True, True, True]
+    np.testing.assert_allclose(shown[tells], np.arange(8) / 10)
+    index, seconds = mended_frames(times, [Break(0.5, -1.0)])  # the halves were exchanged
+    assert index.tolist() == [5, 6, 7, 8, 9, 0, 1, 2, 3, 4] and (np.diff(seconds) > 0).all()
+    cut = mended(TrackSet(np.zeros((2, 10, 3)) + np.arange(10)[None, :, None], timestamps=times), [Break(0.5, -1.0)])
+    assert cut.xyz is not None and cut.xyz[0, :, 0].tolist() == index.tolist()
