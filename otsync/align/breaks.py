@@ -7,6 +7,7 @@ from jaxtyping import Float, Int
 
 from ..clocks.common import CommonClock
 from .peaks import vertex
+from .signal import Signal
 
 STEP = 10 / 30
 """Half the length, s, of the windows that are compared, and how far they are apart."""
@@ -67,7 +68,6 @@ def local_curves(
 ) -> Float[np.ndarray, "W K"]:
     """Evidence of every window of a's frames (two steps long) at every lag, nats a match."""
     from . import kernels
-    from .likelihood import Signal
 
     def frames(seconds: float) -> int:
         return max(1, round(seconds * pair.fps))

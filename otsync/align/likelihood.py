@@ -15,6 +15,7 @@ from ..types.checks import positive
 from ..types.trust import Trust
 from .breaks import find_breaks
 from .peaks import separate_peaks, vertex
+from .signal import Signal
 from .slot import Aligner
 
 MIN_OVERLAP = 24 / 30
@@ -195,27 +196,6 @@ def evidence(pair: CommonClock, lags: Int[np.ndarray, " K"], weight: Float[np.nd
         motion=np.sqrt(np.maximum(shared, 0)) / extent if extent > 0 else np.zeros(len(lags)),
         floor=floor,
     )
-
-
-@dataclass(frozen=True, eq=False)
-class Signal:
-    """One video's matched tracks in the kernels' form: (M,3,T) zero where unseen, (M,T) seen, (M,T) |x|²."""
-
-    arrays: tuple[np.ndarray, np.ndarray, np.ndarray]
-    extent: float
-
-    @classmethod
-    def of(cls, x: Float[np.ndarray, "M T 3"]) -> Signal:
-        """After subtracting each track's own mean, which only serves the numerics."""
-        seen = np.isfinite(x[..., 0])
-        count = np.maximum(seen.sum(1), 1)[:, None]
-        filled = np.where(seen[..., None], x, 0.0)
-        mean = filled.sum(1) / count
-        y = np.where(seen[..., None], x - mean[:, None], 0.0)
-        there = mean[seen.any(1)]
-        extent = float(np.sqrt(((there - there.mean(0)) ** 2).sum(1).mean())) if len(there) else 0.0
-        spread = np.ascontiguousarray(y.transpose(0, 2, 1))
-        return cls((spread, seen.astype(float), (spread**2).sum(1)), extent)
 
 
 def statistics(

@@ -39,7 +39,7 @@ def atomic_write(path: str | os.PathLike[str], mode: str = "wb") -> Iterator[IO[
         if error.filename is not None and str(error.filename) != str(temporary):
             raise
         raise type(error)(
-            error.errno, f"cannot be written ({error.strerror}); nothing is half written", str(path)
+            error.errno, f"cannot be written ({error.strerror or error}); nothing is half written", str(path)
         ) from None
     except BaseException:
         _remove(temporary)

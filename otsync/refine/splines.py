@@ -30,7 +30,7 @@ the square of the noise, and neither residuals nor other windows show them."""
 LONG = 60 / 30
 """Seconds of overlap from which a rate can be told from an offset."""
 
-LEAST_WANDER = 0.2 / 30
+LEAST_WANDER = 0.1 / 30
 """Seconds by which the parts of the overlap may differ, however well the tracks agree."""
 
 LEAST_DRIFT = 0.1 / 30
@@ -192,7 +192,7 @@ class SplineRefine(Refiner):
             Status.WEAK: stats["blur"] > t.blur,
             Status.MOVED: stats["moved"] > t.moved,
             Status.SPREAD: stats["spread"] > t.spread,
-            Status.BROKEN_CLOCK: stats["wander"] > max(t.wander * stats["blur"], LEAST_WANDER),
+            Status.BROKEN_CLOCK: stats["wander"] > t.wander * stats["blur"] + LEAST_WANDER,
             Status.SHORT_OVERLAP: stats["overlap"] < t.overlap - 1e-9,
             Status.FEW_MATCHES: stats["effective_matches"] < t.matches,
             Status.POOR_FIT: stats["correlation"] < t.correlation,

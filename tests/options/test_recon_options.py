@@ -501,7 +501,7 @@ def test_the_plan_of_a_run_is_that_of_a_fit(options, arriving, world, home):
     plan = arriving(otsync.cli.main, running(world, home / "r", *words))["fit"]["plan"]
     for option in ("fit.save_every", *options):
         assert leaf(plan, option) != leaf(base, option), option
-    assert plan == arriving(recon.cli.main, fitting(world, home / "r", *words, tracks=False))["fit"]["plan"]
+    assert plan == arriving(recon.cli.main, fitting(world, home / "fit", *words, tracks=False))["fit"]["plan"]
     refused(otsync.cli.main, running(world, home / "r", "--device", "abacus"), "device")
 
 
