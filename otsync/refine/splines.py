@@ -27,8 +27,12 @@ COMMON_ERRORS = 4.0
 """Seconds; blur²/COMMON_ERRORS joins sigma: errors that whole videos share (drifting depth, limbs, smoothing) grow with
 the square of the noise, and neither residuals nor other windows show them."""
 
-LONG = 60 / 30
-"""Seconds of overlap from which a rate can be told from an offset."""
+LONG = 180 / 30
+"""Seconds of overlap from which a rate is looked for: over less, one of 1 % moves the ends by less than a frame, and what
+whole videos have in common (drifting depth, limbs) looks like one: real cameras, 3.3 s, "1.010 ± .0015"."""
+
+AT_ENDS = 0.1
+"""Share of ``blur`` by which errors that a whole video shares move either end of the overlap by itself."""
 
 LEAST_WANDER = 0.1 / 30
 """Seconds by which the parts of the overlap may differ, however well the tracks agree."""
@@ -158,8 +162,7 @@ class SplineRefine(Refiner):
         free = fit_clock(*curves, fit.clock, self.windows[0], weight=weight, fit_rate=True)
         if free is None:
             return fit, None, (), {}
-        # errors that a whole video shares move either end by themselves
-        common = (free.blur**2 / COMMON_ERRORS) ** 2 + LEAST_SIGMA**2
+        common = (AT_ENDS * free.blur) ** 2 + LEAST_SIGMA**2
         sigma = math.sqrt(float(free.covariance[1, 1]) + 2 * common / overlap**2)
         stats = {"fitted_rate": free.clock.rate, "rate_sigma": sigma}
         off = abs(free.clock.rate - fit.clock.rate)

@@ -48,7 +48,7 @@ class Trust:
     correlation: float = 0.55
     blur: float = 5.6 / 30
     wander: float = 0.1
-    rate_sigmas: float = 6.0
+    rate_sigmas: float = 4.0
     rate_gain: float = 1.3
 
     def check(self, owner: str, reads: tuple[str, ...]) -> None:
