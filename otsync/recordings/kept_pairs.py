@@ -19,6 +19,9 @@ from ..types import Alignment, Matches, Similarity, Status, TrackSet
 
 log = logging.getLogger("otsync")
 
+MADE_BY = 2
+"""Raised when the same pair gets another answer, or more of one, than before: what was kept is then made anew."""
+
 
 @dataclass(frozen=True)
 class KeptPairs:
@@ -35,7 +38,7 @@ class KeptPairs:
             given = isinstance(item, Job) and item.matches is not None
             if self.cache.root is None or not isinstance(item, Job | OwnJob) or given:
                 return function(item)
-            key: tuple[Any, ...] = (_without_name(item.a), _without_name(item.b))
+            key: tuple[Any, ...] = (MADE_BY, _without_name(item.a), _without_name(item.b))
             if isinstance(item, OwnJob):
                 key = (*key, item.solver, item.start)
             else:
@@ -73,6 +76,8 @@ def pack(answer: Answer) -> dict[str, np.ndarray]:
         out["weight"] = matches.weight
     for name, alignment in (("scanned", answer.scanned), ("refined", answer.refined)):
         out[f"{name}_hypotheses"] = np.asarray(alignment.hypotheses, float)
+        if len(alignment.parts):
+            out[f"{name}_parts"] = np.asarray(alignment.parts, float)
         if alignment.curve is not None:
             out[f"{name}_curve"] = np.asarray(alignment.curve, float)
         if (S := alignment.transform) is not None:
@@ -108,6 +113,7 @@ def unpack(pair: tuple[int, int], arrays: dict[str, np.ndarray]) -> Answer:
             arrays.get(f"{name}_curve"),
             fps=of["fps"],
             transform=transform(name),
+            parts=arrays.get(f"{name}_parts", np.zeros((0, 2))),
             **words(of),
         )
 

@@ -65,9 +65,8 @@ def synchronize(
             paper's star.
         rematch: how often pairs whose first answer is trusted are matched again with positions at the synchronised
             times (more than once adds nothing); None: once. Matches of your own are left alone.
-        rate: "fit" frees frame rates and keeps what is significant and moves the ends of the overlap; "fixed" takes
-        them
-            as declared, and flags what contradicts them; None: as the refiner says, by default "fit".
+        rate: "fit" frees frame rates over six seconds and more, and keeps what is significant and moves the ends of
+            the overlap; "fixed" takes them as declared, and flags what contradicts them; None: as the refiner says.
         frames: "common" where all positions are in one world frame; "own" where every video has a frame and a unit of
             its own (several depth cameras, phones with depth): then rotation, translation and scale are found beside
             the offsets, in :attr:`Offsets.transforms`. An :class:`OwnFrames` sets how. ``aligner``, ``refiner``,
@@ -113,7 +112,6 @@ def synchronize(
         return judge(len(tracks), answers, chosen, centre, graph, refining.trust, refit)
 
     verdict = judged(list(map(run, jobs)))
-    broken: dict[int, tuple[Break, ...]] = {}
     jobs, verdict, broken = mend_clocks(jobs, verdict, tracks, judged, map)
     for _ in range(times if matches is None else 0):
         again = rematching(jobs, verdict)

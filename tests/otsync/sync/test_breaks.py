@@ -46,6 +46,18 @@ def test_of_four_videos_the_one_that_froze_is_named():
     assert np.abs(offsets.seconds - truth.offsets).max() * 30 < 0.15
 
 
+def test_pairs_that_are_kept_on_disk_keep_their_parts(tmp_path):
+    from otsync.files.cache import Cache
+    from otsync.recordings.kept_pairs import KeptPairs
+
+    tracks, _ = broken(Freeze(15, at=0.5))
+    plain = synchronize(tracks)
+    for _ in range(2):  # computed, then read
+        kept = synchronize(tracks, map=KeptPairs(Cache(tmp_path)))
+        assert kept.breaks == plain.breaks and plain.breaks[1]
+        assert kept.seconds.tolist() == plain.seconds.tolist() and kept.flags == plain.flags
+
+
 def test_whole_clocks_are_left_alone():
     for seed in range(3):
         tracks, _ = simulate("football", preset="mid", videos=2, max_offset=30, seed=seed)
