@@ -285,8 +285,7 @@ def evaluate(
     frames = result.options.get("frames")
     if frames is not None:
         part = cut(part, int(frames[0]), int(frames[1]))
-    if offsets is not None:
-        part = on_mended_clocks(part, offsets)
+    part = on_mended_clocks(part, result.offsets if offsets is None else offsets)
     part = readable(part, cache, map, progress)
     known = {v.name: v for v in result.videos}
     scores = []

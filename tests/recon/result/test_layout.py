@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from otsync.io.schemas import write_schema
+from otsync.files.strict import write_schema
 from recon.result.layout import RunFile
 
 ROOT = Path(__file__).resolve().parents[3]
