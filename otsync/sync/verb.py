@@ -17,6 +17,8 @@ from ..compute.threads import MapLike
 from ..costs.epipolar import EpipolarDistance
 from ..costs.linear import Cosine
 from ..costs.positions import SynchronousDistance
+from ..epipolar.scan import EpipolarScan
+from ..epipolar.steady import unsteady
 from ..frames import OwnFrames
 from ..match.slot import Matcher, MatcherLike
 from ..match.synchronous import SynchronousMatching
@@ -119,6 +121,11 @@ def synchronize(
             break
         fresh = {answer.pair: answer for answer in map(run, again)}
         verdict = judged([_still_broken(fresh.get(a.pair, a), a) for a in verdict.answers])
+    if isinstance(aligning, EpipolarScan):
+        sound = {a.pair: a.matches for a in verdict.answers if a.sound}
+        breaking = set(unsteady(aligning, tracks, sound, verdict.x))
+        if breaking:
+            verdict = judged([_doubted(a) if breaking & set(a.pair) else a for a in verdict.answers])
     return to_offsets(original, verdict, time.perf_counter() - started, broken)
 
 
