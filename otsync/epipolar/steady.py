@@ -28,10 +28,10 @@ NEAR = 2.5 / 30
 LEAST_SEEN, LEAST_PAIRS = 12 / 30, 3
 """Seconds within a window that a match must be seen in a, and how many such matches tell anything."""
 
-LEAST_GAIN, LEAST_SHARE = 25.0, 0.25
+LEAST_GAIN, LEAST_SHARE = 50.0, 0.25
 """Nats, and share of the rise over the typical offset, by which another offset must suit two windows in a row better.
-Basketball, ten frames dropped or fifteen frozen: four cameras .33 to .76 and 230 nats or more, without a break 0 (6 of
-6); two cameras .3 to 1.2 and 36 nats or more in 9 of 10, without a break 0 in 4 of 5."""
+Basketball: without a break at most 49 nats (12 pairs) and none (9 sets of four cameras); with ten frames dropped or
+fifteen frozen 60 and more in 19 of 24 pairs, and 230 and more in sets of four."""
 
 MATCHES = 1500
 """Matches of a pair that are read, the best ones."""
@@ -119,4 +119,6 @@ def _gain(curves: Sequence[Float[np.ndarray, "W D"]], fps: float) -> float:
     middle = total.shape[1] // 2
     near = np.abs(np.arange(total.shape[1]) - middle) <= NEAR * fps
     gain, rise = total.max(1) - total[:, near].max(1), total.max(1) - np.median(total, 1)
-    return float(gain[(gain > LEAST_GAIN) & (gain > LEAST_SHARE * rise)].sum())
+    # a curve that still rises at its end tells of no offset
+    inside = np.abs(total.argmax(1) - middle) < middle - 1
+    return float(gain[inside & (gain > LEAST_GAIN) & (gain > LEAST_SHARE * rise)].sum())
