@@ -1,0 +1,152 @@
+// The picture: Gaussians, lines over them, and the video and names on a canvas above.
+
+'use strict';
+
+const TRAIL = { before: 0.35, after: 0.05 }; // seconds of a trajectory that are shown around the present moment
+const LEAST_QUALITY = 0.35; // share of the pixels' width that is drawn while a slow computer moves
+
+class Stage {
+  constructor(view, overlay, about, arrays) {
+    this.canvas = view;
+    this.overlay = overlay;
+    this.about = about;
+    this.quality = 1;
+    this.gl = view.getContext('webgl2', { alpha: false, antialias: false, depth: false, preserveDrawingBuffer: true });
+    if (!this.gl) throw new Error('this browser offers no WebGL2. Open the page in a current browser, with hardware acceleration on');
+    this.splats = new Splats(this.gl, about, arrays);
+    this.lines = new Lines(this.gl);
+  }
+
+  /** Fits both canvases to the window; `full`: whatever it takes, draw every pixel. Returns [width, height]. */
+  fit(full) {
+    const ratio = Math.min(window.devicePixelRatio || 1, 2);
+    const { clientWidth, clientHeight } = this.canvas;
+    const sized = (canvas, scale) => {
+      const [width, height] = [clientWidth, clientHeight].map((side) => Math.max(1, Math.round(side * scale)));
+      if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
+    };
+    sized(this.canvas, full ? ratio : ratio * this.quality);
+    sized(this.overlay, ratio);
+    return [this.canvas.width, this.canvas.height];
+  }
+
+  /** Lowers the resolution while frames take long, and raises it again. */
+  learn(seconds) {
+    const factor = seconds > 1 / 20 ? 0.8 : seconds < 1 / 45 ? 1.1 : 1;
+    this.quality = clamp(this.quality * factor, LEAST_QUALITY, 1);
+  }
+
+  /** Puts the frusta of all cameras: pyramids of `size` world units at the poses that they have now. */
+  putFrusta(poses, size) {
+    this.about.cameras.forEach((camera, v) => {
+      this.lines.put(`frustum-${v}`, segmentRows(frustum(camera, poses[v], size), camera.rgb, 0.9));
+    });
+  }
+
+  /** Puts trajectories: `paths[s]` are the markers' positions at `seconds[s]`. */
+  putPaths(paths, seconds) {
+    const count = paths.length ? paths[0].length / 3 : 0;
+    const rows = new Float32Array(Math.max(0, paths.length - 1) * count * 2 * LINE_FLOATS);
+    let at = 0;
+    for (let m = 0; m < count; m++) {
+      for (let s = 0; s + 1 < paths.length; s++) {
+        for (const k of [s, s + 1]) {
+          rows.set([...paths[k].subarray(3 * m, 3 * m + 3), 1, 0.93, 0.55, 0.8, seconds[k]], at);
+          at += LINE_FLOATS;
+        }
+      }
+    }
+    this.lines.put('paths', rows);
+  }
+
+  /** Puts markers in the cameras' colours: `ghosts[v]` are their positions at the moment that video v shows. */
+  putGhosts(ghosts) {
+    const rows = new Float32Array(ghosts.reduce((sum, g) => sum + g.length / 3, 0) * LINE_FLOATS);
+    let at = 0;
+    ghosts.forEach((places, v) => {
+      for (let m = 0; m < places.length; m += 3, at += LINE_FLOATS) {
+        rows.set([places[m], places[m + 1], places[m + 2], ...this.about.cameras[v].rgb, 0.85, 0], at);
+      }
+    });
+    this.lines.put('ghosts', rows, 'dots');
+  }
+
+  /** Draws everything. `look`: which layers, the gain, the seconds that are shown, the camera that is looked through. */
+  draw(shot, look) {
+    const { gl } = this;
+    gl.viewport(0, 0, shot.width, shot.height);
+    gl.clearColor(0, 0, 0, 1);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+    this.splats.draw(shot, look.gain);
+    const near = 1e-3 * this.about.radius;
+    if (look.paths) this.lines.draw('paths', shot, { trail: [look.seconds, TRAIL.before, TRAIL.after], near });
+    if (look.ghosts) this.lines.draw('ghosts', shot, { dot: Math.max(3, shot.height / 160), near });
+    if (look.frusta) {
+      this.about.cameras.forEach((_, v) => v !== look.camera && this.lines.draw(`frustum-${v}`, shot, { near }));
+    }
+  }
+
+  /** Draws the video over the rendering, the edge of the camera's image, and the cameras' names. */
+  drawOver(shot, look) {
+    const { overlay } = this;
+    const context = overlay.getContext('2d');
+    const scale = overlay.width / shot.width;
+    context.setTransform(1, 0, 0, 1, 0, 0);
+    context.clearRect(0, 0, overlay.width, overlay.height);
+    if (look.camera >= 0) {
+      const [x0, y0, x1, y1] = shot.bounds.map((x) => x * scale);
+      context.globalAlpha = look.blend;
+      if (look.blend > 0) look.strip?.draw(context, look.own, x0, y0, x1 - x0, y1 - y0);
+      context.globalAlpha = 1;
+      context.fillStyle = 'rgb(0 0 0 / 62%)'; // beyond the image
+      context.fillRect(0, 0, overlay.width, y0);
+      context.fillRect(0, y1, overlay.width, overlay.height - y1);
+      context.fillRect(0, y0, x0, y1 - y0);
+      context.fillRect(x1, y0, overlay.width - x1, y1 - y0);
+    }
+    this.labels = [];
+    if (!look.frusta) return;
+    const size = 11 * (window.devicePixelRatio || 1);
+    context.font = `600 ${size}px system-ui, sans-serif`;
+    context.textAlign = 'center';
+    context.textBaseline = 'middle';
+    this.about.cameras.forEach((camera, v) => {
+      const at = v === look.camera ? null : shot.pixel(look.poses[v].eye);
+      if (!at) return;
+      const [x, y] = at.map((p) => p * scale);
+      if (x < 0 || y < 0 || x > overlay.width || y > overlay.height) return;
+      const name = shortened(camera.name, 18);
+      const half = context.measureText(name).width / 2 + 0.5 * size;
+      context.fillStyle = 'rgb(10 12 16 / 72%)';
+      context.fillRect(x - half, y - 0.85 * size, 2 * half, 1.7 * size);
+      context.fillStyle = camera.color;
+      context.fillRect(x - half, y + 0.7 * size, 2 * half, 0.15 * size);
+      context.fillStyle = '#fff';
+      context.fillText(name, x, y);
+      this.labels.push({ v, x0: x - half, x1: x + half, y0: y - size, y1: y + size });
+    });
+  }
+
+  /** The camera whose name stands at a point of the page, or -1. */
+  labelAt(clientX, clientY) {
+    const box = this.overlay.getBoundingClientRect();
+    const scale = this.overlay.width / box.width;
+    const [x, y] = [(clientX - box.left) * scale, (clientY - box.top) * scale];
+    const hit = (this.labels ?? []).find((l) => x >= l.x0 && x <= l.x1 && y >= l.y0 && y <= l.y1);
+    return hit ? hit.v : -1;
+  }
+}
+
+/** The edges of a camera's pyramid, `size` world units deep, with a mark on its upper side. */
+function frustum(camera, pose, size) {
+  const [fx, fy, cx, cy] = camera.lens;
+  const back = transposed(pose.turn);
+  const corner = (u, v) => add(pose.eye, times(turn(back, [(u - cx) / fx, (v - cy) / fy, 1]), size));
+  const [w, h] = [camera.width, camera.height];
+  const [a, b, c, d] = [corner(0, 0), corner(w, 0), corner(w, h), corner(0, h)];
+  const tip = corner(w / 2, -0.16 * h);
+  const rays = [a, b, c, d].map((end) => [pose.eye, end]);
+  return [...rays, [a, b], [b, c], [c, d], [d, a], [corner(0.38 * w, 0), tip], [tip, corner(0.62 * w, 0)]];
+}
+
+const shortened = (text, most) => (text.length > most ? `${text.slice(0, most - 1)}…` : text);
