@@ -50,23 +50,24 @@ FINEST = 0.25
 """Largest step of a position, in working pixels at the depth of what moves."""
 
 
+SCENE_PAGE = "scene.html"
+
+
 class Page(Exporter):
     """The whole scene as one HTML file that plays it in a browser: from any side, at any speed, without a network."""
 
-    name, file, holds = "page", "scene.html", "everything"
+    name, file, holds = "page", SCENE_PAGE, "everything"
 
     def write(self, scene: Gaussians4D, out: Path, times: Sequence[float], frame: str) -> None:
         write_page(out, scene)
 
     def write_result(self, result: SavedReconstruction, out: Path, times: Sequence[float]) -> None:
-        strips = () if result.folder is None else read_strips(result.folder)
-        write_page(out, result.scene, result, strips)
+        write_page(out, result, () if result.folder is None else read_strips(result.folder))
 
 
 def write_page(
     out: Path,
-    scene: Gaussians4D,
-    result: SavedReconstruction | None = None,
+    shown: SavedReconstruction | Gaussians4D,
     strips: Sequence[Strip] = (),
     *,
     title: str = "Scene",
@@ -75,16 +76,18 @@ def write_page(
     """Write the page, atomically.
 
     Args:
-        result: the reconstruction that the scene is of: its cameras and clocks; None: the scene alone.
+        shown: a reconstruction with its cameras and clocks, or a scene alone.
         strips: pictures of its videos; those of videos that it does not have are left out.
         report: address of the report, relative to the page; None: no link.
     """
     packing = Packing()
+    result = shown if isinstance(shown, SavedReconstruction) else None
+    scene = shown.scene if isinstance(shown, SavedReconstruction) else shown
     about = header(packing, scene, result)
-    shown = {s.name: s for s in strips}
+    strip_of = {s.name: s for s in strips}
     pictures = []
     for v, camera in enumerate(about["cameras"]):
-        strip = shown.get(camera["name"])
+        strip = strip_of.get(camera["name"])
         if strip is not None:
             camera["strip"] = _strip_header(strip)
             pictures.append(f'<script type="text/plain" id="strip-{v}">{_base64(strip.webp)}</script>')

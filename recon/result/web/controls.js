@@ -95,7 +95,7 @@ function videoTiles(list, cameras, chosen) {
     const picture = document.createElement('canvas');
     const words = document.createElement('span');
     const name = document.createElement('b');
-    const [offset, trust, moment] = [0, 1, 2].map(() => document.createElement('small'));
+    const [offset, trust] = [0, 1].map(() => document.createElement('small'));
     button.type = 'button';
     button.title = `Look through ${camera.name}`;
     button.setAttribute('aria-pressed', 'false');
@@ -106,7 +106,7 @@ function videoTiles(list, cameras, chosen) {
     trust.textContent = camera.trust;
     trust.title = camera.remedy;
     trust.className = camera.doubtful ? 'doubt' : '';
-    words.append(name, offset, trust, moment);
+    words.append(name, offset, trust);
     if (camera.strip) {
       Object.assign(picture, { width: camera.strip.width, height: camera.strip.height });
       button.append(picture);
@@ -115,16 +115,14 @@ function videoTiles(list, cameras, chosen) {
     button.addEventListener('click', () => chosen(v));
     item.append(button);
     list.append(item);
-    return { button, picture, moment };
+    return { button, picture };
   });
 }
 
 /** How late a video started, and how sure that is. */
 function offsetWords(camera) {
-  if (camera.reference) return 'the reference: offset 0';
+  if (camera.reference) return 'the reference';
   const late = camera.offset >= 0 ? 'late' : 'early';
-  const sure = camera.sigma === null ? '' : ` ± ${milliseconds(camera.sigma)}`;
-  return `started ${milliseconds(Math.abs(camera.offset))}${sure} ms ${late}`;
+  const sure = camera.sigma === null ? '' : ` ± ${(1000 * camera.sigma).toFixed(1)}`;
+  return `${(1000 * Math.abs(camera.offset)).toFixed(1)}${sure} ms ${late}`;
 }
-
-const milliseconds = (seconds) => (1000 * seconds).toFixed(Math.abs(seconds) < 0.01 ? 2 : 1);

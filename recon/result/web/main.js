@@ -16,7 +16,7 @@ class Page {
     this.view = new View(about);
     this.stage = new Stage(part('view'), part('overlay'), about, arrays);
     this.stepper = new Stepper(about, arrays);
-    this.seconds = about.span[0];
+    this.seconds = openingMoment(about);
     this.speed = Number(part('speed').value);
     this.playing = false;
     this.answer = null; // what the engine said last
@@ -132,19 +132,12 @@ class Page {
     part('now').textContent = `${seconds.toFixed(3)} s · frame ${frame.toFixed(2)}`;
     this.timeline.draw(seconds);
     about.cameras.forEach((camera, v) => {
-      const { button, picture, moment } = this.tiles[v];
+      const { button, picture } = this.tiles[v];
       const own = this.clocks.own(camera, seconds);
       button.setAttribute('aria-pressed', String(this.view.camera === v));
-      moment.textContent = `its own clock: ${own.toFixed(3)} s`;
       const context = picture.getContext('2d');
       const shown = this.strips[v]?.draw(context, own, 0, 0, picture.width, picture.height);
-      if (shown === false) {
-        context.fillStyle = '#000';
-        context.fillRect(0, 0, picture.width, picture.height);
-        context.fillStyle = '#8a92a0';
-        context.textAlign = 'center';
-        context.fillText('not running', picture.width / 2, picture.height / 2);
-      }
+      if (shown === false) blank(context, own < camera.first ? 'not yet filming' : 'stopped filming');
     });
     part('tour').setAttribute('aria-pressed', String(this.view.mode === 'tour'));
     part('camera').value = String(this.view.camera);
@@ -290,6 +283,27 @@ function prepareCameras(about, arrays) {
     camera.reference = v === about.reference;
   });
   if (about.motion.kind === 'scaffold') about.motion.clock_of = arrays.clock_of;
+}
+
+/** The first moment that all videos show; where there is none, the middle. */
+function openingMoment(about) {
+  const [first, last] = about.span;
+  const starts = about.cameras.map(({ offset, rate, first: own }) => rate * own + offset);
+  const ends = about.cameras.map(({ offset, rate, last: own }) => rate * own + offset);
+  const start = Math.max(first, ...starts);
+  return start < Math.min(last, ...ends) ? start : (first + last) / 2;
+}
+
+/** Says in a tile why it shows no picture. */
+function blank(context, words) {
+  const { width, height } = context.canvas;
+  context.fillStyle = '#000';
+  context.fillRect(0, 0, width, height);
+  context.fillStyle = '#a3abba';
+  context.font = `${Math.round(width / 12)}px system-ui, sans-serif`;
+  context.textAlign = 'center';
+  context.textBaseline = 'middle';
+  context.fillText(words, width / 2, height / 2);
 }
 
 function factsOf(about) {

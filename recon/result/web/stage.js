@@ -3,6 +3,7 @@
 'use strict';
 
 const TRAIL = { before: 0.35, after: 0.05 }; // seconds of a trajectory that are shown around the present moment
+const FRAME_SECONDS = 1 / 30; // that a frame may take while something moves
 const LEAST_QUALITY = 0.35; // share of the pixels' width that is drawn while a slow computer moves
 
 class Stage {
@@ -32,8 +33,8 @@ class Stage {
 
   /** Lowers the resolution while frames take long, and raises it again. */
   learn(seconds) {
-    const factor = seconds > 1 / 20 ? 0.8 : seconds < 1 / 45 ? 1.1 : 1;
-    this.quality = clamp(this.quality * factor, LEAST_QUALITY, 1);
+    const factor = clamp(Math.sqrt(FRAME_SECONDS / Math.max(seconds, 1e-3)), 0.5, 1.1);
+    if (factor < 0.8 || factor > 1.05) this.quality = clamp(this.quality * factor, LEAST_QUALITY, 1);
   }
 
   /** Puts the frusta of all cameras: pyramids of `size` world units at the poses that they have now. */
@@ -80,7 +81,7 @@ class Stage {
     this.splats.draw(shot, look.gain);
     const near = 1e-3 * this.about.radius;
     if (look.paths) this.lines.draw('paths', shot, { trail: [look.seconds, TRAIL.before, TRAIL.after], near });
-    if (look.ghosts) this.lines.draw('ghosts', shot, { dot: Math.max(3, shot.height / 160), near });
+    if (look.ghosts) this.lines.draw('ghosts', shot, { dot: Math.max(4, shot.height / 110), near });
     if (look.frusta) {
       this.about.cameras.forEach((_, v) => v !== look.camera && this.lines.draw(`frustum-${v}`, shot, { near }));
     }
