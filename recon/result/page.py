@@ -156,6 +156,7 @@ def header(packing: Packing, scene: Gaussians4D, result: SavedReconstruction | N
     finest = FINEST * scene.footprint
     moving = _moving(packing, scene, centre, finest)
     still = _gaussians(packing, "static", scene.static, centre, finest)
+    degrees = {"dynamic": scene.dynamic.sh_degree, "static": 0 if scene.static is None else scene.static.sh_degree}
     cameras = [_camera(packing, v, video, centre, result) for v, video in enumerate(videos)]
     reference = 0
     if result is not None and result.offsets.names[result.offsets.reference] in [v.name for v in videos]:
@@ -170,6 +171,8 @@ def header(packing: Packing, scene: Gaussians4D, result: SavedReconstruction | N
         "moving_near": scene.moving_near,
         "layered": True if result is None else result.layered,
         "blur": Settings().eps2d,
+        "degree": max(degrees.values()),
+        "degrees": degrees,
         "moving": len(scene),
         "still": still,
         "row_start": -(-len(scene) // PER_ROW) * PER_ROW,
@@ -249,7 +252,11 @@ def _gaussians(
         return 0
     flat = gaussians.detach().finite()
     means = flat.means.double().numpy() - centre
-    colors = (sh.C0 * flat.sh[:, 0].double().numpy() + 0.5).clip(0)
+    colors = sh.C0 * flat.sh[:, 0].double().numpy() + 0.5
+    if flat.sh_degree:  # the view's share is added before the colour is cut at 0
+        packing.measured(f"{part}_bands", flat.sh[:, 1:].numpy(), 8)
+    else:
+        colors = colors.clip(0)
     quats = torch.nn.functional.normalize(flat.quats, dim=-1).numpy()
     opacities = flat.opacities.double().numpy()
     packing.measured(f"{part}_means", means, 16, finest)

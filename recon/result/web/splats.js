@@ -20,6 +20,8 @@ uniform vec2 size;         // of the canvas, pixels
 uniform vec4 bounds;       // of the image, pixels: left, top, right, bottom
 uniform float blur;        // variance in square pixels added to every splat
 uniform vec3 gain;         // of the colours
+uniform sampler2D bands;   // spherical harmonics beyond the constant, one texel each
+uniform int degree;        // of the spherical harmonics; 0: colours do not depend on the view
 out vec2 across;           // standard deviations from the middle
 flat out vec4 paint;
 flat out float reach2;
@@ -35,12 +37,49 @@ mat3 rotation(vec4 q) {
     2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y));
 }
 
+vec3 band(int harmonic) {
+  int count = (degree + 1) * (degree + 1) - 1;
+  int texel = int(index) * count + harmonic - 1;
+  return texelFetch(bands, ivec2(texel % ${ROW_TEXELS}, texel / ${ROW_TEXELS}), 0).rgb;
+}
+
+// What the harmonics beyond the constant add to the colour in a direction: recon/raster/sh.py.
+vec3 shade(vec3 direction) {
+  vec3 sum = vec3(0.0);
+  float cosine = 1.0, sine = 0.0;       // of m * azimuth, times sin(polar)^m
+  float edge = 1.0;                     // Legendre polynomial l = m
+  for (int m = 0; m <= degree; m++) {
+    float before = 0.0, here = edge;    // those of l - 1 and l
+    float ratio = 1.0;                  // (l - m)! / (l + m)!
+    for (int k = 1; k <= 2 * m; k++) ratio /= float(k);
+    for (int l = m; l <= degree; l++) {
+      float norm = sqrt(float(2 * l + 1) / 6.283185307179586 * ratio);
+      if (m > 0) {
+        norm *= (m & 1) == 1 ? -1.0 : 1.0;
+        sum += norm * here * (cosine * band(l * l + l + m) + sine * band(l * l + l - m));
+      } else if (l > 0) {
+        sum += norm * 0.7071067811865476 * here * band(l * l + l);
+      }
+      float next = (float(2 * l + 1) * direction.z * here - float(l + m) * before) / float(l - m + 1);
+      before = here;
+      here = next;
+      ratio *= float(l + 1 - m) / float(l + 1 + m);
+    }
+    float turned = direction.x * cosine - direction.y * sine;
+    sine = direction.x * sine + direction.y * cosine;
+    cosine = turned;
+    edge *= float(2 * m + 1);
+  }
+  return sum;
+}
+
 void main() {
   gl_Position = vec4(2.0, 2.0, 2.0, 1.0);  // beyond the canvas: not drawn
   ivec2 at = ivec2((int(index) % ${PER_ROW}) * 2, int(index) / ${PER_ROW});
   vec4 look = texelFetch(looks, at, 0);
   if (look.w < LEAST_ALPHA) return;
-  vec3 mean = turn * texelFetch(places, at, 0).xyz + shift;
+  vec3 place = texelFetch(places, at, 0).xyz;
+  vec3 mean = turn * place + shift;
   float z = mean.z;
   if (z <= 0.0) return;
   mat3 axes = turn * rotation(normalize(texelFetch(places, at + ivec2(1, 0), 0)));
@@ -72,7 +111,9 @@ void main() {
   across = corner * sqrt(reach2);
   vec2 middle = lens.xy * tangent + lens.zw;
   vec2 pixel = middle + across.x * sqrt(larger) * along + across.y * sqrt(smaller) * vec2(-along.y, along.x);
-  paint = vec4(texelFetch(looks, at + ivec2(1, 0), 0).rgb * gain, look.w);
+  vec3 tint = texelFetch(looks, at + ivec2(1, 0), 0).rgb;
+  if (degree > 0) tint = max(tint + shade(normalize(place + transpose(turn) * shift)), 0.0);
+  paint = vec4(tint * gain, look.w);
   gl_Position = vec4(2.0 * pixel.x / size.x - 1.0, 1.0 - 2.0 * pixel.y / size.y, 0.0, 1.0);
 }`;
 
@@ -122,6 +163,8 @@ class Splats {
     this.rows = { moving: about.row_start / PER_ROW, all: Math.ceil((about.row_start + about.still) / PER_ROW) || 1 };
     this.places = this.#texture(this.#stillPlaces(about, arrays));
     this.looks = this.#texture(this.#looksOf(about, arrays));
+    this.degree = about.degree;
+    this.bands = this.#texture(this.#bandsOf(about, arrays));
     this.array = gl.createVertexArray();
     this.indices = gl.createBuffer();
     gl.bindVertexArray(this.array);
@@ -132,11 +175,13 @@ class Splats {
     gl.bindVertexArray(null);
   }
 
+  /** A texture of whole rows of four floats a texel. */
   #texture(values) {
     const { gl } = this;
     const texture = gl.createTexture();
+    const rows = values.length / (4 * ROW_TEXELS);
     gl.bindTexture(gl.TEXTURE_2D, texture);
-    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, ROW_TEXELS, this.rows.all, 0, gl.RGBA, gl.FLOAT, values);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, ROW_TEXELS, rows, 0, gl.RGBA, gl.FLOAT, values);
     for (const side of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, side, gl.NEAREST);
     return texture;
   }
@@ -168,6 +213,23 @@ class Splats {
     return values;
   }
 
+  /** Spherical harmonics beyond the constant: as many texels a Gaussian. */
+  #bandsOf(about, arrays) {
+    const count = (about.degree + 1) ** 2 - 1;
+    const rows = Math.max(1, Math.ceil(((about.row_start + about.still) * count) / ROW_TEXELS));
+    const values = new Float32Array(rows * ROW_TEXELS * 4);
+    for (const [part, first] of [['dynamic', 0], ['static', about.row_start]]) {
+      const bands = arrays[`${part}_bands`]; // [N, harmonics, 3]; a part may have fewer than the other
+      if (!bands) continue;
+      const own = (about.degrees[part] + 1) ** 2 - 1;
+      for (let i = 0; i < bands.length / 3; i++) {
+        const texel = (first + Math.floor(i / own)) * count + (i % own);
+        values.set(bands.subarray(3 * i, 3 * i + 3), 4 * texel);
+      }
+    }
+    return values;
+  }
+
   /** Takes what the engine computed for an instant and a view. */
   take({ places, order }) {
     const { gl } = this;
@@ -194,10 +256,13 @@ class Splats {
     gl.uniform4fv(uniforms.bounds, shot.bounds);
     gl.uniform1f(uniforms.blur, shot.blur);
     gl.uniform3fv(uniforms.gain, gain);
-    gl.activeTexture(gl.TEXTURE1);
-    gl.bindTexture(gl.TEXTURE_2D, this.looks);
+    gl.uniform1i(uniforms.degree, this.degree);
+    gl.uniform1i(uniforms.bands, 2);
+    [this.places, this.looks, this.bands].forEach((texture, unit) => {
+      gl.activeTexture(gl.TEXTURE0 + unit);
+      gl.bindTexture(gl.TEXTURE_2D, texture);
+    });
     gl.activeTexture(gl.TEXTURE0);
-    gl.bindTexture(gl.TEXTURE_2D, this.places);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.bindVertexArray(this.array);
