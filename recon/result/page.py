@@ -5,7 +5,7 @@ does not grow with the number of frames; the script in ``web/`` evaluates them i
 draws them with WebGL2 as :mod:`recon.raster` does.
 
 page.html, style.css   the page              engine: vectors.js, splines.js, motion.js, order.js, engine.js
-stepper.js, decode.js  engine, data          splats.js, lines.js, stage.js   what is drawn
+stepper.js, decode.js  engine, data          splats.js, lines.js, screens.js, stage.js   what is drawn
 view.js, clocks.js     from where, and when  strips.js, timeline.js, controls.js, main.js   all around it
 """
 
@@ -39,8 +39,8 @@ ENGINE = ("vectors.js", "splines.js", "motion.js", "order.js", "engine.js")
 """Scripts that the page and its worker read."""
 
 PAGE = (
-    *("decode.js", "clocks.js", "view.js", "strips.js", "timeline.js", "splats.js", "lines.js", "stage.js"),
-    *("stepper.js", "controls.js", "main.js"),
+    *("decode.js", "clocks.js", "view.js", "strips.js", "timeline.js", "splats.js", "lines.js", "screens.js"),
+    *("stage.js", "stepper.js", "controls.js", "main.js"),
 )
 
 PER_ROW = 1024
@@ -62,7 +62,10 @@ class Page(Exporter):
         write_page(out, scene)
 
     def write_result(self, result: SavedReconstruction, out: Path, times: Sequence[float]) -> None:
-        write_page(out, result, () if result.folder is None else read_strips(result.folder))
+        beside = result.folder is not None and (out.parent / "report.html").is_file()
+        beside = beside and out.parent.resolve() == Path(result.folder or "").resolve()
+        strips = () if result.folder is None else read_strips(result.folder)
+        write_page(out, result, strips, report="report.html" if beside else None)
 
 
 def write_page(
@@ -154,6 +157,7 @@ def header(packing: Packing, scene: Gaussians4D, result: SavedReconstruction | N
     # positions lie about the middle of what moves: float32 of a graphics card has no digits for far-off origins
     centre = np.median(middle, 0) if len(middle) else np.zeros(3)
     finest = FINEST * scene.footprint
+    layered = scene.static is not None and (result is None or result.layered)
     moving = _moving(packing, scene, centre, finest)
     still = _gaussians(packing, "static", scene.static, centre, finest)
     degrees = {"dynamic": scene.dynamic.sh_degree, "static": 0 if scene.static is None else scene.static.sh_degree}
@@ -168,8 +172,8 @@ def header(packing: Packing, scene: Gaussians4D, result: SavedReconstruction | N
         "start": scene.span[0] if not videos else float(videos[reference].times[0]),
         "step": scene.frame_step,
         "near": scene.near,
-        "moving_near": scene.moving_near,
-        "layered": True if result is None else result.layered,
+        "moving_near": scene.moving_near if layered else scene.near,
+        "layered": layered,
         "blur": Settings().eps2d,
         "degree": max(degrees.values()),
         "degrees": degrees,
@@ -244,9 +248,7 @@ def _strip_header(strip: Strip) -> dict[str, Any]:
     return {"times": times, "columns": strip.columns, "width": strip.size[0], "height": strip.size[1]}
 
 
-def _gaussians(
-    packing: Packing, part: str, gaussians: Gaussians | None, centre: np.ndarray, finest: float
-) -> int:
+def _gaussians(packing: Packing, part: str, gaussians: Gaussians | None, centre: np.ndarray, finest: float) -> int:
     """Packs how Gaussians look, and where they rest; how many they are. Those too faint to be drawn keep their place."""
     if gaussians is None or not len(gaussians):
         return 0

@@ -55,7 +55,9 @@ def write_reconstruction_report(
     parts = [
         "<h1>Reconstruction</h1>",
         f"<p>{_verdict(reconstruction, views)}</p>",
-        f'<p><a href="{escape(scene_page, quote=True)}">Fly round the scene, in slow motion</a></p>' if scene_page else "",
+        f'<p><a href="{escape(scene_page, quote=True)}">Fly round the scene, in slow motion</a></p>'
+        if scene_page
+        else "",
         "".join(f"<p class=no>{escape(note)}</p>" for note in notes),
         "<h2>Offsets</h2>",
         _offset_rows(reconstruction, coarse, truth),

@@ -16,8 +16,8 @@ class Engine {
   }
 
   /**
-   * @param ask `time`: world second. `axis`: gives depth, see DepthOrder. `still`: whether what is static is drawn.
-   *   `ghosts`: world seconds at which to place markers.
+   * @param ask `time`: world second. `axis`: gives depth, see DepthOrder. `still`: whether what is static is drawn, and
+   *   `near`: the depth before which it is not. `ghosts`: world seconds at which to place markers.
    * @returns `places` [N,8], or null where the time is that of the last step; `order`: what to draw, far to near;
    *   `ghosts`: positions of the markers at each time.
    */
@@ -26,7 +26,7 @@ class Engine {
     if (moved) this.motion.carry(ask.time, this.placed);
     this.time = ask.time;
     const moving = { positions: this.placed, stride: PLACE, count: this.count, first: 0, near: this.about.moving_near };
-    const still = { positions: this.still, stride: 3, count: this.still.length / 3, first: this.about.row_start, near: this.about.near };
+    const still = { positions: this.still, stride: 3, count: this.still.length / 3, first: this.about.row_start, near: ask.near };
     const layers = ask.still ? [still] : [];
     const order = new Uint32Array(this.count + (ask.still ? still.count : 0));
     let drawn = 0;
@@ -56,6 +56,7 @@ if (typeof document === 'undefined') {
   self.onmessage = ({ data: { id, call, ask } }) => {
     if (call === 'begin') engine = new Engine(ask.about, ask.arrays);
     const answer = call === 'begin' ? null : engine[call](ask);
-    self.postMessage({ id, answer }, answer?.places ? [answer.places.buffer] : []);
+    const given = [answer?.places, answer?.order].filter(Boolean).map((array) => array.buffer); // given away, not copied
+    self.postMessage({ id, answer }, given);
   };
 }

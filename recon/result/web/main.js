@@ -5,6 +5,7 @@
 // Okabe and Ito's colours, which the colour-blind tell apart; names stand beside them everywhere
 const COLORS = ['#e69f00', '#56b4e9', '#009e73', '#f0e442', '#0072b2', '#d55e00', '#cc79a7', '#b8bec9'];
 const REST_SECONDS = 0.25; // without change, before the picture is drawn with every pixel
+const FRUSTUM = 0.16; // depth of a camera's pyramid, as a share of the cameras' distance
 const PATH_SAMPLES = 90; // instants of a trajectory
 
 class Page {
@@ -86,7 +87,7 @@ class Page {
     if (this.busy) return;
     const { still, ghosts } = this.layers;
     const times_ = ghosts ? this.about.cameras.map((camera) => this.clocks.shown(camera, this.seconds)) : [];
-    const ask = { time: this.seconds, axis: shot.axis, still, ghosts: times_ };
+    const ask = { time: this.seconds, axis: shot.axis, still, near: this.view.near, ghosts: times_ };
     const key = JSON.stringify(ask);
     if (key === this.asked) return;
     this.asked = key;
@@ -117,10 +118,11 @@ class Page {
       blend: Number(part('blend').value),
       strip: filming ? this.strips[camera] : null,
     };
-    if (look.frusta) this.stage.putFrusta(poses, 0.11 * about.radius);
+    this.#tell();
+    const pictures = this.tiles.map(({ picture }, v) => (this.strips[v] ? picture : null));
+    if (look.frusta) this.stage.putFrusta(poses, FRUSTUM * about.radius, pictures);
     this.stage.draw(shot, look);
     this.stage.drawOver(shot, look);
-    this.#tell();
   }
 
   /** Everything around the picture that shows the present moment. */

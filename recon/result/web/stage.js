@@ -16,6 +16,7 @@ class Stage {
     if (!this.gl) throw new Error('this browser offers no WebGL2. Open the page in a current browser, with hardware acceleration on');
     this.splats = new Splats(this.gl, about, arrays);
     this.lines = new Lines(this.gl);
+    this.screens = new Screens(this.gl);
   }
 
   /** Fits both canvases to the window; `full`: whatever it takes, draw every pixel. Returns [width, height]. */
@@ -37,10 +38,15 @@ class Stage {
     if (factor < 0.8 || factor > 1.05) this.quality = clamp(this.quality * factor, LEAST_QUALITY, 1);
   }
 
-  /** Puts the frusta of all cameras: pyramids of `size` world units at the poses that they have now. */
-  putFrusta(poses, size) {
+  /**
+   * Puts the frusta of all cameras: pyramids of `size` world units at the poses that they have now. `pictures[v]`: a
+   * canvas with what the camera films, or null.
+   */
+  putFrusta(poses, size, pictures) {
     this.about.cameras.forEach((camera, v) => {
-      this.lines.put(`frustum-${v}`, segmentRows(frustum(camera, poses[v], size), camera.rgb, 0.9));
+      const corners = cornersOf(camera, poses[v], size);
+      this.lines.put(`frustum-${v}`, segmentRows(frustum(poses[v].eye, corners), camera.rgb, 0.9));
+      if (pictures[v]) this.screens.put(v, pictures[v], corners);
     });
   }
 
@@ -97,7 +103,11 @@ class Stage {
     if (look.paths) this.lines.draw('paths', shot, { trail: [look.seconds, TRAIL.before, TRAIL.after], near });
     if (look.ghosts) this.lines.draw('ghosts', shot, { dot: Math.max(4, shot.height / 110), near });
     if (look.frusta) {
-      this.about.cameras.forEach((_, v) => v !== look.camera && this.lines.draw(`frustum-${v}`, shot, { near }));
+      this.about.cameras.forEach((_, v) => {
+        if (v === look.camera) return;
+        this.screens.draw(v, shot, near);
+        this.lines.draw(`frustum-${v}`, shot, { near });
+      });
     }
   }
 
@@ -152,16 +162,19 @@ class Stage {
   }
 }
 
-/** The edges of a camera's pyramid, `size` world units deep, with a mark on its upper side. */
-function frustum(camera, pose, size) {
+/** Corners of a camera's image, `size` world units before it: upper left, upper right, lower right, lower left. */
+function cornersOf(camera, pose, size) {
   const [fx, fy, cx, cy] = camera.lens;
-  const back = transposed(pose.turn);
-  const corner = (u, v) => add(pose.eye, times(turn(back, [(u - cx) / fx, (v - cy) / fy, 1]), size));
   const [w, h] = [camera.width, camera.height];
-  const [a, b, c, d] = [corner(0, 0), corner(w, 0), corner(w, h), corner(0, h)];
-  const tip = corner(w / 2, -0.16 * h);
-  const rays = [a, b, c, d].map((end) => [pose.eye, end]);
-  return [...rays, [a, b], [b, c], [c, d], [d, a], [corner(0.38 * w, 0), tip], [tip, corner(0.62 * w, 0)]];
+  const back = transposed(pose.turn);
+  return [[0, 0], [w, 0], [w, h], [0, h]].map(([u, v]) => add(pose.eye, times(turn(back, [(u - cx) / fx, (v - cy) / fy, 1]), size)));
+}
+
+/** The edges of a camera's pyramid, with a mark on its upper side. */
+function frustum(eye, [a, b, c, d]) {
+  const tip = add(mix3(a, b, 0.5), times(subtract(a, d), 0.16));
+  const rays = [a, b, c, d].map((end) => [eye, end]);
+  return [...rays, [a, b], [b, c], [c, d], [d, a], [mix3(a, b, 0.38), tip], [tip, mix3(a, b, 0.62)]];
 }
 
 const shortened = (text, most) => (text.length > most ? `${text.slice(0, most - 1)}…` : text);

@@ -228,6 +228,13 @@ class View {
     this.pose = { ...this.pose, eye: add(this.focus, times(unit(away), distance)) };
   }
 
+  /** The depth before which nothing static is drawn: seen from behind the cameras, a wall would hide the scene. */
+  get near() {
+    if (this.mode === 'camera' && !this.way) return this.about.near;
+    const beyond = length(subtract(this.pose.eye, this.about.focus)) - this.about.radius;
+    return this.about.near + Math.max(0, beyond);
+  }
+
   /** What to draw on a canvas of this size. */
   shot(width, height) {
     const locked = this.mode === 'camera' && !this.way;

@@ -61,7 +61,12 @@ def blobs(points: np.ndarray, size: float, seed: int, degree: int) -> Gaussians:
 
 
 def scene_of(
-    kind: str = "scaffold", gaussians: int = 300, still: int = 200, seconds: float = 0.8, nodes: int = 30, degree: int = 0
+    kind: str = "scaffold",
+    gaussians: int = 300,
+    still: int = 200,
+    seconds: float = 0.8,
+    nodes: int = 30,
+    degree: int = 0,
 ) -> Gaussians4D:
     """A cloud that moves, before a cloud that does not."""
     rng = np.random.default_rng(3)
@@ -121,7 +126,5 @@ def footage_like(result: SavedReconstruction) -> tuple[Footage, ...]:
             images[k, 10:26, x : x + 16] = 250, 240, 60
         camera, bad = video.camera, np.zeros(count, bool)
         boxes = np.tile([0, 0, width, height], (count, 1))
-        found.append(
-            Footage(video.name, images, video.times, camera.K, camera.w2c, None, None, None, boxes, None, bad)
-        )
+        found.append(Footage(video.name, images, video.times, camera.K, camera.w2c, None, None, None, boxes, None, bad))
     return tuple(found)

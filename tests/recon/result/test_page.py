@@ -207,7 +207,9 @@ def test_gaussians_are_where_the_motion_carries_them(opened, tmp_path, kind):
         found = np.array(flat).reshape(-1, 8)
         moved = scene.moving(t)
         expected = moved.means.double().numpy() - np.median(middle, 0)
-        assert np.abs(found[:, :3] - expected).max() < 0.5 * scene.footprint  # half a pixel, where nodes turn by 30 degrees
+        assert (
+            np.abs(found[:, :3] - expected).max() < 0.5 * scene.footprint
+        )  # half a pixel, where nodes turn by 30 degrees
         q = torch.nn.functional.normalize(moved.quats, dim=1).numpy()
         r = found[:, 4:] / np.linalg.norm(found[:, 4:], axis=1, keepdims=True)
         assert np.abs((q * r).sum(1)).min() > np.cos(np.radians(1.0) / 2)
