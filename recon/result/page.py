@@ -229,7 +229,7 @@ def _camera(
 def _trust(video: FilmedBy, result: SavedReconstruction | None) -> dict[str, Any]:
     """How sure a video's offset is, in words."""
     if result is None or video.name not in result.offsets.names:
-        how = {"given": "held out; clock as given", "found": "held out; clock found on the scene"}
+        how = {"given": "held out", "found": "held out, found on the scene"}
         return {"sigma": None, "trust": how.get(video.clock.how, "held out"), "remedy": "", "doubtful": False}
     n = result.offsets.names.index(video.name)
     sigma, status = float(result.offsets.sigma[n]), result.offsets.status[n]

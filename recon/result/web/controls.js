@@ -88,7 +88,7 @@ function listen(actions) {
 }
 
 /** A tile for every video: its picture, name, offset and how far it can be trusted. Names are text, never markup. */
-function videoTiles(list, cameras, chosen) {
+function videoTiles(list, { cameras, step }, chosen) {
   return cameras.map((camera, v) => {
     const item = document.createElement('li');
     const button = document.createElement('button');
@@ -103,7 +103,7 @@ function videoTiles(list, cameras, chosen) {
     words.style.borderTopColor = camera.color;
     name.textContent = camera.name;
     offset.textContent = offsetWords(camera);
-    trust.textContent = camera.trust;
+    trust.textContent = camera.reference ? camera.trust : `${(camera.offset / step).toFixed(2)} frames · ${camera.trust}`;
     trust.title = camera.remedy;
     trust.className = camera.doubtful ? 'doubt' : '';
     words.append(name, offset, trust);

@@ -45,9 +45,17 @@ class Engine {
     };
   }
 
-  /** Positions of the markers at `seconds[i]`, one array each. */
-  paths({ seconds }) {
-    return seconds.map((t) => this.motion.markers(t));
+  /**
+   * Trajectories: positions at `seconds[i]`, one array each. `which`: indices of Gaussians to follow; without it, the
+   * markers.
+   */
+  paths({ seconds, which }) {
+    if (!which) return seconds.map((t) => this.motion.markers(t));
+    this.time = NaN; // `placed` no longer is the last step's
+    return seconds.map((t) => {
+      this.motion.carry(t, this.placed);
+      return picked(this.placed, which, PLACE);
+    });
   }
 }
 

@@ -6,17 +6,19 @@
 const COLORS = ['#e69f00', '#56b4e9', '#009e73', '#f0e442', '#0072b2', '#d55e00', '#cc79a7', '#b8bec9'];
 const REST_SECONDS = 0.25; // without change, before the picture is drawn with every pixel
 const FRUSTUM = 0.16; // depth of a camera's pyramid, as a share of the cameras' distance
-const PATH_SAMPLES = 90; // instants of a trajectory
+const PATH_SAMPLES = 72; // instants of a trajectory
+const DENSE = 1500; // Gaussians whose trajectories are shown
+const NODE_COLOR = [1, 0.93, 0.55];
 
 class Page {
-  constructor({ about, arrays }) {
+  constructor({ about, arrays }, stepper) {
     this.about = about;
-    prepareCameras(about, arrays);
+    this.arrays = arrays;
     this.strips = about.cameras.map(() => null);
     this.clocks = new Clocks(about.cameras);
     this.view = new View(about);
     this.stage = new Stage(part('view'), part('overlay'), about, arrays);
-    this.stepper = new Stepper(about, arrays);
+    this.stepper = stepper;
     this.seconds = openingMoment(about);
     this.speed = Number(part('speed').value);
     this.playing = false;
@@ -42,7 +44,8 @@ class Page {
   }
 
   get layers() {
-    return Object.fromEntries(['still', 'frusta', 'paths', 'ghosts'].map((id) => [id, part(id).checked]));
+    const chosen = Object.fromEntries(['still', 'frusta', 'ghosts'].map((id) => [id, part(id).checked]));
+    return { ...chosen, paths: part('paths').value !== 'none' };
   }
 
   #tick(now) {
@@ -177,12 +180,18 @@ class Page {
     this.change();
   }
 
+  /** Shows trajectories of the nodes, or of many Gaussians in their own colours. */
   async showPaths() {
-    if (part('paths').checked && !this.pathsPut) {
-      this.pathsPut = true;
+    const kind = part('paths').value;
+    if (kind !== 'none' && kind !== this.pathsPut) {
+      this.pathsPut = kind;
       const [first, last] = this.about.span;
       const seconds = Array.from({ length: PATH_SAMPLES }, (_, i) => mix(first, last, i / (PATH_SAMPLES - 1)));
-      this.stage.putPaths(await this.stepper.paths({ seconds }), seconds);
+      const which = kind === 'dense' ? someOf(this.about.moving, DENSE) : null;
+      const paths = await this.stepper.paths({ seconds, which });
+      const nodes = () => Float32Array.from({ length: paths[0].length }, (_, i) => NODE_COLOR[i % 3]);
+      this.stage.putPaths(paths, seconds, which ? picked(this.arrays.dynamic_colors, which, 3) : nodes());
+      this.asked = ''; // the engine was elsewhere in time
     }
     this.change();
   }
@@ -193,7 +202,7 @@ class Page {
     const select = part('camera');
     select.append(new Option('free', '-1'), ...about.cameras.map((camera, v) => new Option(camera.name, String(v))));
     select.addEventListener('change', () => this.lookThrough(Number(select.value)));
-    this.tiles = videoTiles(part('videos'), about.cameras, (v) => this.lookThrough(v));
+    this.tiles = videoTiles(part('videos'), about, (v) => this.lookThrough(v));
     this.timeline = new Timeline(part('timeline'), about, this.clocks, (t) => this.seek(t));
     [part('time').min, part('time').max] = this.timeline.range;
     part('time').addEventListener('input', () => this.seek(Number(part('time').value)));
@@ -238,7 +247,10 @@ class Page {
       c: () => this.chooseClocks(!this.clocks.synchronised),
       f: () => this.toggleTour(),
       h: () => (this.view.home(), this.change()),
-      t: toggle('paths'),
+      t: () => {
+        part('paths').selectedIndex = (part('paths').selectedIndex + 1) % 3;
+        this.showPaths();
+      },
       g: toggle('ghosts'),
       v: toggle('frusta'),
       b: toggle('still'),
@@ -323,7 +335,9 @@ function stop(error) {
 }
 
 async function begin() {
-  const page = new Page(await readScene());
+  const scene = await readScene();
+  prepareCameras(scene.about, scene.arrays);
+  const page = new Page(scene, await Stepper.of(scene.about, scene.arrays));
   part('message').textContent = '';
   page.change();
   page.strips = await readStrips(page.about.cameras);

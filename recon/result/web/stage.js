@@ -15,6 +15,7 @@ class Stage {
     this.gl = view.getContext('webgl2', { alpha: false, antialias: false, depth: false, preserveDrawingBuffer: true });
     if (!this.gl) throw new Error('this browser offers no WebGL2. Open the page in a current browser, with hardware acceleration on');
     this.splats = new Splats(this.gl, about, arrays);
+    view.addEventListener('webglcontextlost', () => stop(new Error('the graphics card took its memory back. Reload it')));
     this.lines = new Lines(this.gl);
     this.screens = new Screens(this.gl);
   }
@@ -50,15 +51,18 @@ class Stage {
     });
   }
 
-  /** Puts trajectories: `paths[s]` are the markers' positions at `seconds[s]`. */
-  putPaths(paths, seconds) {
-    const count = paths.length ? paths[0].length / 3 : 0;
-    const rows = new Float32Array(Math.max(0, paths.length - 1) * count * 2 * LINE_FLOATS);
+  /** Puts trajectories: `paths[s]` are positions [M,3] at `seconds[s]`; `colors` [M,3]. */
+  putPaths(paths, seconds, colors) {
+    const count = colors.length / 3;
+    const rows = new Float32Array((paths.length - 1) * count * 2 * LINE_FLOATS);
     let at = 0;
     for (let m = 0; m < count; m++) {
       for (let s = 0; s + 1 < paths.length; s++) {
         for (const k of [s, s + 1]) {
-          rows.set([...paths[k].subarray(3 * m, 3 * m + 3), 1, 0.93, 0.55, 0.8, seconds[k]], at);
+          rows.set(paths[k].subarray(3 * m, 3 * m + 3), at);
+          rows.set(colors.subarray(3 * m, 3 * m + 3), at + 3);
+          rows[at + 6] = 0.85;
+          rows[at + 7] = seconds[k];
           at += LINE_FLOATS;
         }
       }

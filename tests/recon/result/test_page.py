@@ -321,10 +321,11 @@ def test_clocks_as_filmed_and_synchronised(opened, scene_page):
 
 def test_layers_and_the_video_over_the_rendering(opened, scene_page):
     opened.open(scene_page, time=0.4)
-    for layer in ("still", "frusta", "paths", "ghosts"):
+    for key in "bvgtt":  # what stands still, cameras, dots, trajectories of nodes and dense ones
         before = opened.picture(".stage")
-        opened.page.click(f"#{layer}")
-        assert np.abs(opened.rested().picture(".stage") - before).max() > 60, layer
+        opened.press(key)
+        assert np.abs(opened.picture(".stage") - before).max() > 60, key
+    assert opened.page.input_value("#paths") == "dense"
     assert opened.page.is_disabled("#blend")
     opened.press("1")
     opened.page.fill("#blend", "1")
@@ -362,6 +363,12 @@ def test_a_phone_shows_everything_and_is_steered_by_touch(browser, scene_page):
     assert psnr(shown.rested().picture("#view"), before) < 35
     shown.close()
     assert not shown.complaints
+
+
+def test_where_a_browser_allows_no_worker_the_page_computes_itself(opened, scene_page):
+    expected = opened.open(scene_page, time=0.31).picture("#view")
+    opened.page.add_init_script("delete window.Worker")
+    np.testing.assert_array_equal(opened.open(scene_page, time=0.31).picture("#view"), expected)
 
 
 def test_a_scene_without_cameras_is_shown_too(opened, tmp_path):
