@@ -24,7 +24,7 @@ class Page {
     this.playing = false;
     this.answer = null; // what the engine said last
     this.asked = ''; // what it was asked
-    this.busy = false;
+    this.working = 0; // questions that the engine has not answered
     this.changedAt = 0;
     this.calm = matchMedia('(prefers-reduced-motion: reduce)').matches;
     this.#bind();
@@ -66,7 +66,7 @@ class Page {
     const [width, height] = this.stage.fit(resting);
     const shot = this.view.shot(width, height);
     this.#ask(shot);
-    const upToDate = !this.busy;
+    const upToDate = this.working === 0;
     if (this.answer && (this.dirty || (resting && upToDate && !this.full))) {
       this.#draw(shot);
       this.dirty = false;
@@ -87,16 +87,16 @@ class Page {
 
   /** Asks the engine for the present instant and view, unless it knows them or is at work. */
   #ask(shot) {
-    if (this.busy) return;
+    if (this.working > 0) return;
     const { still, ghosts } = this.layers;
     const times_ = ghosts ? this.about.cameras.map((camera) => this.clocks.shown(camera, this.seconds)) : [];
     const ask = { time: this.seconds, axis: shot.axis, still, near: this.view.near, ghosts: times_ };
     const key = JSON.stringify(ask);
     if (key === this.asked) return;
     this.asked = key;
-    this.busy = true;
+    this.working++;
     this.stepper.step(ask).then((answer) => {
-      this.busy = false;
+      this.working--;
       this.answer = answer;
       this.stage.splats.take(answer);
       if (ghosts) this.stage.putGhosts(answer.ghosts);
@@ -188,7 +188,10 @@ class Page {
       const [first, last] = this.about.span;
       const seconds = Array.from({ length: PATH_SAMPLES }, (_, i) => mix(first, last, i / (PATH_SAMPLES - 1)));
       const which = kind === 'dense' ? someOf(this.about.moving, DENSE) : null;
+      this.working++;
+      this.change();
       const paths = await this.stepper.paths({ seconds, which });
+      this.working--;
       const nodes = () => Float32Array.from({ length: paths[0].length }, (_, i) => NODE_COLOR[i % 3]);
       this.stage.putPaths(paths, seconds, which ? picked(this.arrays.dynamic_colors, which, 3) : nodes());
       this.asked = ''; // the engine was elsewhere in time
