@@ -29,7 +29,9 @@ FLASH, CLICK = 0.62, 0.81
 def frame_seconds(v: int) -> np.ndarray:
     """Of a video on its own clock: the second has a variable frame rate, the third begins late in its container."""
     even = np.arange(FRAMES) / FPS
-    return even + (0.009 * np.sin(np.arange(FRAMES)) * (np.arange(FRAMES) > 0) if v == 1 else 0) + (0.5 if v == 2 else 0)
+    return (
+        even + (0.009 * np.sin(np.arange(FRAMES)) * (np.arange(FRAMES) > 0) if v == 1 else 0) + (0.5 if v == 2 else 0)
+    )
 
 
 def picture(k: int, t: float) -> np.ndarray:
@@ -200,14 +202,20 @@ def test_images_become_sequences_in_the_timeline(tmp_path):
         for k in range(6):
             Image.fromarray(picture(k, 0)).save(tmp_path / name / f"shot_{k + 7:04d}.png")
         camera = {"K": [[90, 0, 48], [0, 90, 32], [0, 0, 1]], "w2c": np.eye(4).tolist()}
-        entries.append({"name": name, "frames": f"{name}/*.png", "fps": 25 + v, "camera": camera | {"width": 96, "height": 64}})
-    (tmp_path / "scene.json").write_text(json.dumps({"format": "otsync.scene", "version": 1, "frame": "w", "videos": entries}))
+        entries.append(
+            {"name": name, "frames": f"{name}/*.png", "fps": 25 + v, "camera": camera | {"width": 96, "height": 64}}
+        )
+    (tmp_path / "scene.json").write_text(
+        json.dumps({"format": "otsync.scene", "version": 1, "frame": "w", "videos": entries})
+    )
     Offsets.known(("a", "b"), np.array([0, 0.05]), 25).save(tmp_path / "o.json")
     args = ["export", str(tmp_path), "--offsets", str(tmp_path / "o.json"), "--out", str(tmp_path / "out")]
     assert main([*args, "--what", "timeline", "clips"]) == 0
     media = json.loads((tmp_path / "out" / "timeline.otio").read_text())["tracks"]["children"][0]["children"][1]
     media = media["media_references"]["DEFAULT_MEDIA"]
-    shown = {k: media[k] for k in ("target_url_base", "name_prefix", "name_suffix", "start_frame", "frame_zero_padding")}
+    shown = {
+        k: media[k] for k in ("target_url_base", "name_prefix", "name_suffix", "start_frame", "frame_zero_padding")
+    }
     assert list(shown.values()) == ["../a/", "shot_", ".png", 7, 4]
     with av.open(str(tmp_path / "out" / "clips" / "a.mp4")) as container:
         assert not container.streams.audio
