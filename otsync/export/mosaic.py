@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ from jaxtyping import UInt8
 
 from ..progress import counted
 from .encode import write_video
-from .slot import Aligned, Clip, Export, grid, reopened
+from .slot import Aligned, Export, grid, reopened
 
 GAP, BAR = 8, 30
 """Pixels between pictures, and of a line of text."""
@@ -32,9 +32,9 @@ class Mosaic(Export):
         return [folder / "mosaic.mp4"]
 
     def write(self, videos: Aligned, folder: Path, *, width: int, fps: float) -> list[str]:
-        own = min(float(c.own[0]) for c in videos.clips), max(float(c.own[-1]) for c in videos.clips)
-        times = grid(videos, (min(videos.span[0], own[0]), max(videos.span[1], own[1])), fps)
-        pictures = Pictures(videos.clips, width)
+        ends = [float(c.as_filmed(videos.origin)[-1]) for c in videos.clips]
+        times = grid(videos, (videos.span[0], max(videos.span[1], *ends)), fps)
+        pictures = Pictures(videos, width)
         write_video(folder / "mosaic.mp4", _frames(pictures, times, fps), fps)
         return []
 
@@ -51,12 +51,14 @@ class Pictures:
         width: pixels of one video's picture; all have the height of the tallest.
     """
 
-    def __init__(self, clips: Sequence[Clip], width: int):
+    def __init__(self, videos: Aligned, width: int):
         from PIL import ImageFont
+
+        clips = videos.clips
 
         if not 16 <= width <= 4096:
             raise ValueError(f"width: expected 16 to 4096 pixels; found {width}.")
-        self.clips, self.width = clips, width
+        self.clips, self.origin, self.width = clips, videos.origin, width
         self.height = max(round(width * c.video.camera.height / c.video.camera.width) for c in clips)
         self.columns = math.ceil(math.sqrt(len(clips)))
         rows = -(-len(clips) // self.columns)
@@ -80,7 +82,7 @@ class Pictures:
             for v, clip in enumerate(self.clips):
                 x = left + v % self.columns * (self.width + GAP)
                 y = BAR + v // self.columns * (self.height + GAP)
-                k = clip.nearest(t, filmed=half == 0)
+                k = clip.nearest(t, self.origin if half == 0 else None)
                 if k >= 0:
                     sheet.paste(self._picture(half, v, k), (x, y))
                 words = f"{clip.name}  {clip.video.times[k]:.3f} s  #{k}" if k >= 0 else f"{clip.name}  –"

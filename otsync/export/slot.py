@@ -54,12 +54,16 @@ class Clip:
             frames = frames.base
         return frames.path if isinstance(frames, VideoFrames) else None
 
-    def nearest(self, t: float, *, filmed: bool = False) -> int:
+    def as_filmed(self, origin: float) -> Float[np.ndarray, " S"]:
+        """Where the frames stand as if nothing had been synchronised: all videos begin at world second ``origin``."""
+        return self.own - self.own[0] + origin
+
+    def nearest(self, t: float, begins: float | None = None) -> int:
         """The frame of the video that shows world second ``t``: the nearest within a frame's length, else -1.
 
-        filmed: as if nothing had been synchronised: the own clock is taken for the world's.
+        begins: as filmed, when all videos begin at this world second; None: synchronised.
         """
-        seconds = self.own if filmed else self.world
+        seconds = self.world if begins is None else self.as_filmed(begins)
         k = int(np.clip(np.searchsorted(seconds, t), 1, max(len(seconds) - 1, 1))) if len(seconds) > 1 else 0
         if k and t - seconds[k - 1] <= seconds[k] - t:
             k -= 1
@@ -83,6 +87,11 @@ class Aligned:
     def span(self) -> tuple[float, float]:
         """First and last world second that any video shows."""
         return min(float(c.world[0]) for c in self.clips), max(float(c.world[-1]) for c in self.clips)
+
+    @property
+    def origin(self) -> float:
+        """World second of the reference's first frame, where all videos begin as filmed."""
+        return next((float(c.world[0]) for c in self.clips if c.name == self.reference), self.span[0])
 
     @property
     def shared(self) -> tuple[float, float]:
@@ -151,7 +160,7 @@ class Export(ABC):
 
 def grid(videos: Aligned, span: tuple[float, float], fps: float) -> Float[np.ndarray, " S"]:
     """World seconds over a span, ``fps`` a second, that hold the reference's own frames where ``fps`` is its own."""
-    origin = next((float(c.world[0]) for c in videos.clips if c.name == videos.reference), span[0])
+    origin = videos.origin
     first, last = np.ceil((span[0] - origin) * fps - 1e-6), np.floor((span[1] - origin) * fps + 1e-6)
     return origin + np.arange(first, last + 1) / fps
 

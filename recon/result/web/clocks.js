@@ -5,9 +5,11 @@
 const SLIDE_SECONDS = 0.7; // that the bars take to slide from one to the other
 
 class Clocks {
-  /** @param cameras the header's list: `offset` (s) and `rate` of each: t_world = rate * t_own + offset. */
-  constructor(cameras) {
+  /** @param about the header: of each camera `offset` and `rate`, t_world = rate * t_own + offset, and `first` second. */
+  constructor({ cameras, reference }) {
     this.cameras = cameras;
+    const first = cameras[reference];
+    this.origin = first ? first.rate * first.first + first.offset : 0; // where all begin, as filmed
     this.share = 1; // 0: as filmed. 1: synchronised.
     this.aim = 1;
   }
@@ -30,20 +32,22 @@ class Clocks {
     return true;
   }
 
-  /** 0..1, slow at both ends. */
-  get #eased() {
-    return this.share * this.share * (3 - 2 * this.share);
+  /** On the present clocks a video's own second is slope * t + start. */
+  #line({ first, offset, rate }) {
+    const s = this.share * this.share * (3 - 2 * this.share); // slow at both ends
+    return { slope: mix(1, 1 / rate, s), start: mix(first - this.origin, -offset / rate, s) };
   }
 
   /** The second of a video's own clock that stands at `t` on the present clocks. */
   own(camera, t) {
-    return mix(t, (t - camera.offset) / camera.rate, this.#eased);
+    const { slope, start } = this.#line(camera);
+    return slope * t + start;
   }
 
   /** Where a second of a video's own clock stands on the present clocks: the inverse of `own`. */
   at(camera, own) {
-    const slope = mix(1, 1 / camera.rate, this.#eased);
-    return (own + (this.#eased * camera.offset) / camera.rate) / slope;
+    const { slope, start } = this.#line(camera);
+    return (own - start) / slope;
   }
 
   /** The world second that a video shows at `t`: `t` itself once the clocks are synchronised. */

@@ -15,7 +15,7 @@ class Page {
     this.about = about;
     this.arrays = arrays;
     this.strips = about.cameras.map(() => null);
-    this.clocks = new Clocks(about.cameras);
+    this.clocks = new Clocks(about);
     this.view = new View(about);
     this.stage = new Stage(part('view'), part('overlay'), about, arrays);
     this.stepper = stepper;

@@ -10,7 +10,7 @@ class Timeline {
     this.canvas = canvas;
     this.about = about;
     this.clocks = clocks;
-    this.range = rangeOf(about);
+    this.range = rangeOf(about, clocks.origin);
     const at = (event) => {
       const box = canvas.getBoundingClientRect();
       seek(mix(this.range[0], this.range[1], clamp((event.clientX - box.left) / box.width, 0, 1)));
@@ -58,11 +58,11 @@ class Timeline {
 }
 
 /** World seconds from the first to the last moment of any bar, whichever clocks are chosen. */
-function rangeOf(about) {
+function rangeOf(about, origin) {
   let [low, high] = about.span;
   for (const { first, last, rate, offset } of about.cameras) {
-    low = Math.min(low, first, rate * first + offset);
-    high = Math.max(high, last, rate * last + offset);
+    low = Math.min(low, origin, rate * first + offset);
+    high = Math.max(high, origin + last - first, rate * last + offset);
   }
   return high > low ? [low, high] : [low, low + 1];
 }

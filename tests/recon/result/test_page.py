@@ -303,7 +303,7 @@ def test_the_view_is_turned_moved_and_brought_closer(opened, scene_page):
 
 
 def test_clocks_as_filmed_and_synchronised(opened, scene_page):
-    """As filmed every video shows its own second at the world's; synchronised, the one of the same moment."""
+    """As filmed all videos begin together; synchronised, they show the same moment."""
     opened.open(scene_page, time=0.5)
     tile, bars = "#videos li:nth-child(3) canvas", opened.picture("#timeline")
     before = opened.picture(tile)
@@ -314,7 +314,7 @@ def test_clocks_as_filmed_and_synchronised(opened, scene_page):
     opened.page.click("#clocks label:has([value=synchronised])")
     np.testing.assert_array_equal(opened.rested().picture(tile), before)
     np.testing.assert_array_equal(opened.picture("#videos li:nth-child(1) canvas"), reference)
-    own = "([v, t]) => { const c = new Clocks(JSON.parse(textOf('about')).cameras); return [c.own(c.cameras[v], t), c.at(c.cameras[v], c.own(c.cameras[v], t)), c.shown(c.cameras[v], t)]; }"
+    own = "([v, t]) => { const c = new Clocks(JSON.parse(textOf('about'))); return [c.own(c.cameras[v], t), c.at(c.cameras[v], c.own(c.cameras[v], t)), c.shown(c.cameras[v], t)]; }"
     shown = opened.page.evaluate(own, [2, 0.5])
     assert shown == pytest.approx([(0.5 - 0.16) / 1.02, 0.5, 0.5])
 
