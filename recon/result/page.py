@@ -25,7 +25,7 @@ import torch
 
 from otsync.files.arrays import atomic_write
 from recon.backdrop.surroundings import up_axis
-from recon.motion import PerGaussian, Scaffold
+from recon.motion import PerGaussian, Scaffold, Static
 from recon.raster import sh
 from recon.raster.rendering import ALPHA_MIN, Settings
 from recon.result.export import Exporter
@@ -272,17 +272,20 @@ def _gaussians(packing: Packing, part: str, gaussians: Gaussians | None, centre:
 def _moving(packing: Packing, scene: Gaussians4D, centre: np.ndarray, finest: float) -> dict[str, Any]:
     """Packs what moves, and how; the motion's part of the header."""
     motion = scene.motion
+    _gaussians(packing, "dynamic", scene.dynamic, centre, finest)
     if isinstance(motion, Scaffold):
-        _gaussians(packing, "dynamic", scene.dynamic, centre, finest)
         return _scaffold(packing, motion, centre, finest)
     if isinstance(motion, PerGaussian):
-        _gaussians(packing, "dynamic", scene.dynamic, centre, finest)
         packing.measured("own_knots", motion.own_knots.detach().cpu().numpy(), 16, finest)
         if motion.own_quats is not None:
             packing.measured("own_quats", _of_one_length(motion.own_quats), 16)
         return {"kind": "per-gaussian", "path": _path(motion)}
-    _gaussians(packing, "dynamic", scene.dynamic, centre, finest)
-    return {"kind": "static"}
+    if isinstance(motion, Static):
+        return {"kind": "static"}
+    raise ValueError(
+        f"scene.motion: expected a scaffold, a motion per Gaussian or none; found {type(motion).__name__}, which the "
+        "page cannot evaluate. Export a sequence of .ply."
+    )
 
 
 def _scaffold(packing: Packing, motion: Scaffold, centre: np.ndarray, finest: float) -> dict[str, Any]:

@@ -4,6 +4,7 @@
 'use strict';
 
 const FLY_SECONDS = 1.1; // from one view to another
+const HOME = { orbit: [-0.24, 0.16], zoom: 1.5 }; // from the reference's camera to the view that the page opens with
 const LEG_SECONDS = 3; // from camera to camera on the tour
 
 /** One image to draw: pose, lens and size in pixels of the canvas. */
@@ -131,11 +132,13 @@ class View {
     return [...row, ...row.slice(1, -1).reverse()];
   }
 
-  /** Back to the view that the page opens with. */
+  /** Back to the view that the page opens with: from behind the reference's camera, which is seen with the others. */
   home() {
     const camera = this.about.cameras[this.about.reference];
     this.free(camera ? camera.poses[0] : lookAt(this.about.eye, this.about.focus, this.about.up));
-    this.focus = this.about.focus;
+    if (!camera) return;
+    this.orbit(...HOME.orbit);
+    this.zoom(HOME.zoom);
   }
 
   /** A free view from a pose, with the focus straight ahead at the depth of the scene. */

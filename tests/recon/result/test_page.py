@@ -8,6 +8,7 @@ import json
 import re
 import zlib
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -375,3 +376,12 @@ def test_a_scene_without_cameras_is_shown_too(opened, tmp_path):
     write_page(tmp_path / "p.html", scene_of("own"))
     opened.open(tmp_path / "p.html")
     assert opened.picture("#view").std() > 20
+
+
+def test_a_motion_that_the_page_cannot_evaluate_is_refused(tmp_path):
+    class Strange:
+        warp = staticmethod(scene_of("static").motion.warp)
+
+    with pytest.raises(ValueError, match="found Strange, which the page cannot evaluate"):
+        write_page(tmp_path / "p.html", replace(scene_of("static"), motion=Strange()))
+    assert not (tmp_path / "p.html").exists()
