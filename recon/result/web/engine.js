@@ -3,6 +3,8 @@
 
 'use strict';
 
+const ORDER_ROW = 2048; // indices in a row of the texture that holds the order
+
 /** Everything that is computed per instant and per view. */
 class Engine {
   constructor(about, arrays) {
@@ -18,8 +20,8 @@ class Engine {
   /**
    * @param ask `time`: world second. `axis`: gives depth, see DepthOrder. `still`: whether what is static is drawn, and
    *   `near`: the depth before which it is not. `ghosts`: world seconds at which to place markers.
-   * @returns `places` [N,8], or null where the time is that of the last step; `order`: what to draw, far to near;
-   *   `ghosts`: positions of the markers at each time.
+   * @returns `places` [N,8], or null where the time is that of the last step; `order`: what to draw, far to
+   *   near, the first `drawn` of whole rows of a texture; `ghosts`: positions of the markers at each time.
    */
   step(ask) {
     const moved = ask.time !== this.time;
@@ -28,7 +30,7 @@ class Engine {
     const moving = { positions: this.placed, stride: PLACE, count: this.count, first: 0, near: this.about.moving_near };
     const still = { positions: this.still, stride: 3, count: this.still.length / 3, first: this.about.row_start, near: ask.near };
     const layers = ask.still ? [still] : [];
-    const order = new Uint32Array(this.count + (ask.still ? still.count : 0));
+    const order = new Uint32Array(Math.max(1, Math.ceil((this.count + still.count) / ORDER_ROW)) * ORDER_ROW);
     let drawn = 0;
     if (this.about.layered) {
       // what moves is drawn over what is static, as in the fit
@@ -40,7 +42,8 @@ class Engine {
     return {
       time: ask.time,
       places: moved ? this.placed.slice() : null,
-      order: order.subarray(0, drawn),
+      order,
+      drawn,
       ghosts: (ask.ghosts ?? []).map((seconds) => this.motion.markers(seconds)),
     };
   }

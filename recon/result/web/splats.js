@@ -2,15 +2,16 @@
 
 'use strict';
 
-const ROW_TEXELS = 2048; // of the data textures: two texels a Gaussian
+const ROW_TEXELS = ORDER_ROW; // of all textures; where they hold Gaussians, two texels each
 const PER_ROW = ROW_TEXELS / 2;
 
 const SPLAT_VERTEX = `#version 300 es
 precision highp float;
 precision highp int;
 precision highp sampler2D;
+precision highp usampler2D;
 
-layout(location = 0) in uint index;
+uniform usampler2D order;  // what to draw, far to near
 uniform sampler2D places;  // x, y, z, 0; quaternion wxyz
 uniform sampler2D looks;   // standard deviations along three axes, opacity; colour
 uniform mat3 turn;         // world to camera
@@ -37,14 +38,14 @@ mat3 rotation(vec4 q) {
     2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y));
 }
 
-vec3 band(int harmonic) {
+vec3 band(int index, int harmonic) {
   int count = (degree + 1) * (degree + 1) - 1;
-  int texel = int(index) * count + harmonic - 1;
+  int texel = index * count + harmonic - 1;
   return texelFetch(bands, ivec2(texel % ${ROW_TEXELS}, texel / ${ROW_TEXELS}), 0).rgb;
 }
 
 // What the harmonics beyond the constant add to the colour in a direction: recon/raster/sh.py.
-vec3 shade(vec3 direction) {
+vec3 shade(int index, vec3 direction) {
   vec3 sum = vec3(0.0);
   float cosine = 1.0, sine = 0.0;       // of m * azimuth, times sin(polar)^m
   float edge = 1.0;                     // Legendre polynomial l = m
@@ -56,9 +57,9 @@ vec3 shade(vec3 direction) {
       float norm = sqrt(float(2 * l + 1) / 6.283185307179586 * ratio);
       if (m > 0) {
         norm *= (m & 1) == 1 ? -1.0 : 1.0;
-        sum += norm * here * (cosine * band(l * l + l + m) + sine * band(l * l + l - m));
+        sum += norm * here * (cosine * band(index, l * l + l + m) + sine * band(index, l * l + l - m));
       } else if (l > 0) {
-        sum += norm * 0.7071067811865476 * here * band(l * l + l);
+        sum += norm * 0.7071067811865476 * here * band(index, l * l + l);
       }
       float next = (float(2 * l + 1) * direction.z * here - float(l + m) * before) / float(l - m + 1);
       before = here;
@@ -75,7 +76,9 @@ vec3 shade(vec3 direction) {
 
 void main() {
   gl_Position = vec4(2.0, 2.0, 2.0, 1.0);  // beyond the canvas: not drawn
-  ivec2 at = ivec2((int(index) % ${PER_ROW}) * 2, int(index) / ${PER_ROW});
+  int splat = gl_VertexID >> 2;
+  int index = int(texelFetch(order, ivec2(splat % ${ROW_TEXELS}, splat / ${ROW_TEXELS}), 0).r);
+  ivec2 at = ivec2((index % ${PER_ROW}) * 2, index / ${PER_ROW});
   vec4 look = texelFetch(looks, at, 0);
   if (look.w < LEAST_ALPHA) return;
   vec3 place = texelFetch(places, at, 0).xyz;
@@ -107,12 +110,12 @@ void main() {
   vec2 along = abs(uv) > 1e-9 * larger ? normalize(vec2(uv, larger - uu - blur)) : (uu >= vv ? vec2(1, 0) : vec2(0, 1));
 
   reach2 = 2.0 * log(look.w / LEAST_ALPHA);
-  vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.0 - 1.0;
+  vec2 corner = vec2(gl_VertexID & 1, (gl_VertexID >> 1) & 1) * 2.0 - 1.0;
   across = corner * sqrt(reach2);
   vec2 middle = lens.xy * tangent + lens.zw;
   vec2 pixel = middle + across.x * sqrt(larger) * along + across.y * sqrt(smaller) * vec2(-along.y, along.x);
   vec3 tint = texelFetch(looks, at + ivec2(1, 0), 0).rgb;
-  if (degree > 0) tint = max(tint + shade(normalize(place + transpose(turn) * shift)), 0.0);
+  if (degree > 0) tint = max(tint + shade(index, normalize(place + transpose(turn) * shift)), 0.0);
   paint = vec4(tint * gain, look.w);
   gl_Position = vec4(2.0 * pixel.x / size.x - 1.0, 1.0 - 2.0 * pixel.y / size.y, 0.0, 1.0);
 }`;
@@ -165,14 +168,21 @@ class Splats {
     this.looks = this.#texture(this.#looksOf(about, arrays));
     this.degree = about.degree;
     this.bands = this.#texture(this.#bandsOf(about, arrays));
-    this.array = gl.createVertexArray();
-    this.indices = gl.createBuffer();
-    gl.bindVertexArray(this.array);
-    gl.bindBuffer(gl.ARRAY_BUFFER, this.indices);
-    gl.enableVertexAttribArray(0);
-    gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
-    gl.vertexAttribDivisor(0, 1);
+    this.order = gl.createTexture();
+    this.array = this.#corners(about.row_start + about.still);
+  }
+
+  /** Two triangles for each of `count` splats, in one draw: tiny instances are slow, and on a CPU very slow. */
+  #corners(count) {
+    const { gl } = this;
+    const indices = new Uint32Array(6 * count);
+    for (let n = 0; n < count; n++) indices.set([4 * n, 4 * n + 1, 4 * n + 2, 4 * n + 2, 4 * n + 1, 4 * n + 3], 6 * n);
+    const array = gl.createVertexArray();
+    gl.bindVertexArray(array);
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, indices, gl.STATIC_DRAW);
     gl.bindVertexArray(null);
+    return array;
   }
 
   /** A texture of whole rows of four floats a texel. */
@@ -182,8 +192,13 @@ class Splats {
     const rows = values.length / (4 * ROW_TEXELS);
     gl.bindTexture(gl.TEXTURE_2D, texture);
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, ROW_TEXELS, rows, 0, gl.RGBA, gl.FLOAT, values);
-    for (const side of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, side, gl.NEAREST);
+    this.#unfiltered();
     return texture;
+  }
+
+  #unfiltered() {
+    const { gl } = this;
+    for (const side of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, side, gl.NEAREST);
   }
 
   /** Places of what is static; those of what moves follow with every instant. */
@@ -231,15 +246,16 @@ class Splats {
   }
 
   /** Takes what the engine computed for an instant and a view. */
-  take({ places, order }) {
+  take({ places, order, drawn }) {
     const { gl } = this;
     if (places?.length) {
       gl.bindTexture(gl.TEXTURE_2D, this.places);
       gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ROW_TEXELS, this.rows.moving, gl.RGBA, gl.FLOAT, places);
     }
-    gl.bindBuffer(gl.ARRAY_BUFFER, this.indices);
-    gl.bufferData(gl.ARRAY_BUFFER, order, gl.DYNAMIC_DRAW);
-    this.count = order.length;
+    gl.bindTexture(gl.TEXTURE_2D, this.order);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.R32UI, ROW_TEXELS, order.length / ROW_TEXELS, 0, gl.RED_INTEGER, gl.UNSIGNED_INT, order);
+    this.#unfiltered();
+    this.count = drawn;
   }
 
   /** Draws into the present framebuffer; `shot` is a Shot of view.js, `gain` three factors. */
@@ -258,7 +274,8 @@ class Splats {
     gl.uniform3fv(uniforms.gain, gain);
     gl.uniform1i(uniforms.degree, this.degree);
     gl.uniform1i(uniforms.bands, 2);
-    [this.places, this.looks, this.bands].forEach((texture, unit) => {
+    gl.uniform1i(uniforms.order, 3);
+    [this.places, this.looks, this.bands, this.order].forEach((texture, unit) => {
       gl.activeTexture(gl.TEXTURE0 + unit);
       gl.bindTexture(gl.TEXTURE_2D, texture);
     });
@@ -266,7 +283,7 @@ class Splats {
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.bindVertexArray(this.array);
-    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.count);
+    gl.drawElements(gl.TRIANGLES, 6 * this.count, gl.UNSIGNED_INT, 0);
     gl.bindVertexArray(null);
   }
 }

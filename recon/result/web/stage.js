@@ -11,7 +11,7 @@ class Stage {
     this.canvas = view;
     this.overlay = overlay;
     this.about = about;
-    this.quality = 1;
+    this.quality = 0.5; // until it is known how fast this computer draws
     this.gl = view.getContext('webgl2', { alpha: false, antialias: false, depth: false, preserveDrawingBuffer: true });
     if (!this.gl) throw new Error('this browser offers no WebGL2. Open the page in a current browser, with hardware acceleration on');
     this.splats = new Splats(this.gl, about, arrays);
