@@ -234,10 +234,10 @@ def _trust(video: FilmedBy, result: SavedReconstruction | None) -> dict[str, Any
     n = result.offsets.names.index(video.name)
     sigma, status = float(result.offsets.sigma[n]), result.offsets.status[n]
     if n == result.offsets.reference:
-        return {"sigma": 0.0, "trust": "its clock is the world's", "remedy": "", "doubtful": False}
+        return {"sigma": 0.0, "trust": "", "remedy": "", "doubtful": False}
     return {
         "sigma": sigma if np.isfinite(sigma) else None,
-        "trust": "trusted" if status.ok else f"⚠ {status.code.replace('_', ' ')}",
+        "trust": "✓ trusted" if status.ok else f"⚠ {status.code.replace('_', ' ')}",
         "remedy": "" if status.ok else str(status),
         "doubtful": not status.ok,
     }

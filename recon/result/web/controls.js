@@ -103,7 +103,8 @@ function videoTiles(list, { cameras, step }, chosen) {
     words.style.borderTopColor = camera.color;
     name.textContent = camera.name;
     offset.textContent = offsetWords(camera);
-    trust.textContent = camera.reference ? camera.trust : `${(camera.offset / step).toFixed(2)} frames · ${camera.trust}`;
+    offset.title = `${(camera.offset / step).toFixed(2)} frames of the reference`;
+    trust.textContent = camera.trust;
     trust.title = camera.remedy;
     trust.className = camera.doubtful ? 'doubt' : '';
     words.append(name, offset, trust);

@@ -5,7 +5,7 @@
 // Okabe and Ito's colours, which the colour-blind tell apart; names stand beside them everywhere
 const COLORS = ['#e69f00', '#56b4e9', '#009e73', '#f0e442', '#0072b2', '#d55e00', '#cc79a7', '#b8bec9'];
 const REST_SECONDS = 0.25; // without change, before the picture is drawn with every pixel
-const FRUSTUM = 0.16; // depth of a camera's pyramid, as a share of the cameras' distance
+const FRUSTUM = 0.13; // depth of a camera's pyramid, as a share of the cameras' distance
 const PATH_SAMPLES = 72; // instants of a trajectory
 const DENSE = 1500; // Gaussians whose trajectories are shown
 const NODE_COLOR = [1, 0.93, 0.55];

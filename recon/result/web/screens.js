@@ -24,10 +24,11 @@ const SCREEN_FRAGMENT = `#version 300 es
 precision mediump float;
 in vec2 texel;
 uniform sampler2D picture;
+uniform float cover;
 out vec4 color;
 
 void main() {
-  color = vec4(texture(picture, texel).rgb, 1.0);
+  color = vec4(texture(picture, texel).rgb, 1.0) * cover;
 }`;
 
 class Screens {
@@ -67,7 +68,8 @@ class Screens {
     ]) gl.texParameteri(gl.TEXTURE_2D, name, value);
   }
 
-  draw(v, shot, near) {
+  /** Draws the picture of camera `v`; `cover`: 0..1, how much of what lies behind it is hidden. */
+  draw(v, shot, near, cover) {
     const screen = this.screens.get(v);
     if (!screen) return;
     const { gl } = this;
@@ -81,7 +83,9 @@ class Screens {
     gl.uniform1i(uniforms.picture, 0);
     gl.activeTexture(gl.TEXTURE0);
     gl.bindTexture(gl.TEXTURE_2D, screen.texture);
-    gl.disable(gl.BLEND);
+    gl.uniform1f(uniforms.cover, cover);
+    gl.enable(gl.BLEND);
+    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.bindVertexArray(screen.array);
     gl.drawArrays(gl.TRIANGLE_STRIP, 0, 4);
     gl.bindVertexArray(null);

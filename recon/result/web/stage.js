@@ -109,7 +109,7 @@ class Stage {
     if (look.frusta) {
       this.about.cameras.forEach((_, v) => {
         if (v === look.camera) return;
-        this.screens.draw(v, shot, near);
+        this.screens.draw(v, shot, near, shot.depth(look.poses[v].eye) < shot.depth(this.about.focus) ? 0.45 : 1);
         this.lines.draw(`frustum-${v}`, shot, { near });
       });
     }

@@ -4,7 +4,7 @@
 'use strict';
 
 const FLY_SECONDS = 1.1; // from one view to another
-const HOME = { orbit: [-0.24, 0.16], zoom: 1.5 }; // from the reference's camera to the view that the page opens with
+const HOME = { orbit: [0.3, 0.2], zoom: 1.5 }; // from the reference's camera to the view that the page opens with
 const LEG_SECONDS = 3; // from camera to camera on the tour
 
 /** One image to draw: pose, lens and size in pixels of the canvas. */
@@ -20,6 +20,11 @@ class Shot {
   /** Gives the depth of a point, as the engine asks for it. */
   get axis() {
     return [...this.turn.slice(6), this.shift[2]];
+  }
+
+  /** Depth of a point: how far before the camera it lies. */
+  depth(point) {
+    return dot(this.turn.slice(6), point) + this.shift[2];
   }
 
   /** Pixels [x, y] of a point, or null behind the camera. */
