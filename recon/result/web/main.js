@@ -122,8 +122,7 @@ class Page {
       strip: filming ? this.strips[camera] : null,
     };
     this.#tell();
-    const pictures = this.tiles.map(({ picture }, v) => (this.strips[v] ? picture : null));
-    if (look.frusta) this.stage.putFrusta(poses, FRUSTUM * about.radius, pictures);
+    if (look.frusta) this.stage.putFrusta(poses, FRUSTUM * about.radius, this.tiles);
     this.stage.draw(shot, look);
     this.stage.drawOver(shot, look);
   }
@@ -137,12 +136,8 @@ class Page {
     part('now').textContent = `${seconds.toFixed(3)} s · frame ${frame.toFixed(2)}`;
     this.timeline.draw(seconds);
     about.cameras.forEach((camera, v) => {
-      const { button, picture } = this.tiles[v];
-      const own = this.clocks.own(camera, seconds);
-      button.setAttribute('aria-pressed', String(this.view.camera === v));
-      const context = picture.getContext('2d');
-      const shown = this.strips[v]?.draw(context, own, 0, 0, picture.width, picture.height);
-      if (shown === false) blank(context, own < camera.first ? 'not yet filming' : 'stopped filming');
+      this.tiles[v].button.setAttribute('aria-pressed', String(this.view.camera === v));
+      this.#showTile(v, this.clocks.own(camera, seconds));
     });
     part('tour').setAttribute('aria-pressed', String(this.view.mode === 'tour'));
     part('camera').value = String(this.view.camera);
@@ -150,6 +145,19 @@ class Page {
     part('play').setAttribute('aria-label', this.playing ? 'Pause' : 'Play');
     part('blend').disabled = this.view.camera < 0 || !this.strips[this.view.camera];
     part('blend-note').hidden = !part('blend').disabled;
+  }
+
+  /** Draws a video's picture of a second of its own clock, unless it is the one that its tile shows. */
+  #showTile(v, own) {
+    const [tile, strip, camera] = [this.tiles[v], this.strips[v], this.about.cameras[v]];
+    if (!strip) return;
+    const found = strip.nearest(own);
+    const shown = found >= 0 ? found : own < camera.first ? 'not yet filming' : 'stopped filming';
+    if (shown === tile.shown) return;
+    tile.shown = shown;
+    const context = tile.picture.getContext('2d');
+    if (found < 0) blank(context, shown);
+    else strip.draw(context, own, 0, 0, tile.picture.width, tile.picture.height);
   }
 
   seek(seconds) {

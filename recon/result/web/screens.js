@@ -52,14 +52,16 @@ class Screens {
     return screen;
   }
 
-  /** Puts the picture of camera `v`, a canvas, between four corners: upper left, upper right, lower right, lower left. */
-  put(v, canvas, [a, b, c, d]) {
+  /** Puts the picture of camera `v` between four corners: upper left, upper right, lower right, lower left. */
+  put(v, { picture, shown }, [a, b, c, d]) {
     const { gl } = this;
     const screen = this.screens.get(v) ?? this.#made(v);
     gl.bindBuffer(gl.ARRAY_BUFFER, screen.buffer);
     gl.bufferData(gl.ARRAY_BUFFER, new Float32Array([...a, 0, 0, ...b, 1, 0, ...d, 0, 1, ...c, 1, 1]), gl.DYNAMIC_DRAW);
+    if (screen.shown === shown) return;
+    screen.shown = shown;
     gl.bindTexture(gl.TEXTURE_2D, screen.texture);
-    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, gl.RGBA, gl.UNSIGNED_BYTE, canvas);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, gl.RGBA, gl.UNSIGNED_BYTE, picture);
     for (const [name, value] of [
       [gl.TEXTURE_MIN_FILTER, gl.LINEAR],
       [gl.TEXTURE_MAG_FILTER, gl.LINEAR],

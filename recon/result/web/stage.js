@@ -40,14 +40,14 @@ class Stage {
   }
 
   /**
-   * Puts the frusta of all cameras: pyramids of `size` world units at the poses that they have now. `pictures[v]`: a
-   * canvas with what the camera films, or null.
+   * Puts the frusta of all cameras: pyramids of `size` world units at the poses that they have now. `tiles[v].picture`
+   * is a canvas with what the camera films, and `.shown` tells which picture that is; undefined: none.
    */
-  putFrusta(poses, size, pictures) {
+  putFrusta(poses, size, tiles) {
     this.about.cameras.forEach((camera, v) => {
       const corners = cornersOf(camera, poses[v], size);
       this.lines.put(`frustum-${v}`, segmentRows(frustum(poses[v].eye, corners), camera.rgb, 0.9));
-      if (pictures[v]) this.screens.put(v, pictures[v], corners);
+      if (tiles[v].shown !== undefined) this.screens.put(v, tiles[v], corners);
     });
   }
 
