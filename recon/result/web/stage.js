@@ -109,10 +109,17 @@ class Stage {
     if (look.frusta) {
       this.about.cameras.forEach((_, v) => {
         if (v === look.camera) return;
-        this.screens.draw(v, shot, near, shot.depth(look.poses[v].eye) < shot.depth(this.about.focus) ? 0.45 : 1);
+        this.screens.draw(v, shot, near, this.#cover(shot, look.poses[v].eye));
         this.lines.draw(`frustum-${v}`, shot, { near });
       });
     }
+  }
+
+  /** How much the picture of a camera at `eye` hides: less before the scene, nothing where one flies through it. */
+  #cover(shot, eye) {
+    const before = shot.depth(eye) < shot.depth(this.about.focus);
+    const away = length(subtract(eye, shot.eye)) / this.about.radius;
+    return (before ? 0.45 : 1) * clamp(4 * away - 1, 0, 1);
   }
 
   /** Draws the video over the rendering, the edge of the camera's image, and the cameras' names. */

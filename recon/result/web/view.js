@@ -11,6 +11,7 @@ const LEG_SECONDS = 3; // from camera to camera on the tour
 class Shot {
   constructor(pose, lens, width, height) {
     this.turn = pose.turn;
+    this.eye = pose.eye;
     this.shift = times(turn(pose.turn, pose.eye), -1);
     this.width = width;
     this.height = height;
