@@ -12,6 +12,7 @@ OWN = {
     "init": "otsync.cli.recordings:Init",
     "check": "otsync.cli.recordings:Check",
     "sync": "otsync.cli.sync:Sync",
+    "export": "otsync.cli.export:Export",
     "bench": "otsync.cli.bench:Bench",
     "plugins": "otsync.cli.plugins:Plugins",
 }
