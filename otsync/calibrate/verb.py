@@ -1,0 +1,264 @@
+"""From a folder of videos to their cameras."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ..files.cache import Cache
+from ..progress import Progress, Tell
+from .clips import Clip, Lens, read_clips
+from .found import WALK, Calibration, FoundCamera
+from .mapping import Mapper, Model, Pictures, lenses_found, map_pictures
+from .poses import every_pose, key_pictures
+from .stills import Picture, background, key_frames, pictures_of, stands_still
+from .verdict import MOVING_PICTURES, disagreement, judged, nearest
+from .world import Similar, centres, upright
+
+MOVING = "moving"
+FLOW_SECONDS = 1 / 15
+"""Between the frames whose flow tells what moves before a moving camera."""
+
+
+@dataclass(frozen=True)
+class CalibrateOptions:
+    """How cameras are looked for."""
+
+    intrinsics: Path | None = None
+    """JSON with K and distortion by video, or another scene.json; held fixed. "*" stands for every video."""
+    distance: tuple[str, str, float] | None = None
+    """Two videos of static cameras, and the metres between them: the scene is in metres."""
+    key_frames: int = 24
+    """Frames of a clip whose camera moves that the mapping uses."""
+    width: int = 1000
+    """Pixels of the longer side of the pictures that the mapping uses."""
+    seed: int = 0
+    """Of the mappers' random numbers."""
+
+    def __post_init__(self) -> None:
+        if self.key_frames < 2:
+            raise ValueError(f"--key-frames: expected 2 and more; found {self.key_frames}.")
+        if self.width < 160:
+            raise ValueError(f"--width: expected 160 pixels and more; found {self.width}.")
+        if self.seed < 0:
+            raise ValueError(f"--seed: expected 0 or more; found {self.seed}.")
+        if self.distance is not None and not (np.isfinite(self.distance[2]) and self.distance[2] > 0):
+            raise ValueError(f"--distance: expected metres above 0; found {self.distance[2]}.")
+
+
+@dataclass(frozen=True, eq=False)
+class Filmed:
+    """A clip and its pictures for the mapping."""
+
+    clip: Clip
+    moves: bool
+    pictures: tuple[Picture, ...]
+    scale: float
+
+
+def calibrate(
+    folder: str | os.PathLike[str],
+    options: CalibrateOptions | None = None,
+    *,
+    cache: Cache | None = None,
+    tell: Tell = lambda text: None,
+) -> Calibration:
+    """Find the cameras of a folder of videos.
+
+    Videos called ``walk...`` only help: a phone that is carried past all others. Static cameras are found by the median
+    of their frames, moving ones by key frames without what moves, then frame by frame.
+
+    Args:
+        cache: where stages are kept; a run that was killed continues from there, with the same result.
+        tell: receives one line a stage.
+
+    The result names every camera that is not to be trusted, with the reason and what to film. ValueError for what
+    does not read. Needs the extra ``calibrate``.
+    """
+    options, cache = options or CalibrateOptions(), cache or Cache()
+    clips, _ = read_clips(folder, options.intrinsics)
+    clips = [clip for clip in clips if clip.kind != "board"]
+    return calibrate_clips(clips, options, cache=cache, tell=tell)
+
+
+def calibrate_clips(
+    clips: Sequence[Clip],
+    options: CalibrateOptions | None = None,
+    *,
+    cache: Cache | None = None,
+    tell: Tell = lambda text: None,
+) -> Calibration:
+    """The same for clips that are already described, walk clips among them."""
+    options, cache, progress = options or CalibrateOptions(), cache or Cache(), Progress(tell)
+    _check_distance(options, clips)
+    with progress.stage("pictures"):
+        filmed = [_filmed(clip, options, cache) for clip in clips]
+        for each in filmed:
+            how = f"moves, {len(each.pictures)} key frames" if each.moves else "stands still: the median of its frames"
+            tell(f"{each.clip.name}: {how}")
+    mapped = Pictures(
+        tuple(each.clip.name for each in filmed),
+        np.repeat(np.arange(len(filmed)), [len(each.pictures) for each in filmed]),
+        tuple(picture for each in filmed for picture in each.pictures),
+        tuple(each.clip.lens.scaled(each.scale) for each in filmed),
+        tuple(each.moves for each in filmed),
+        cache.root,
+    )
+    with progress.stage("features and matches"):
+        mapped.database(tell)
+    with progress.stage("mapping"):
+        models = _models(mapped, options.seed, cache)
+    method, model, other = chosen(models, mapped)
+    if model is None:
+        lost = tuple(_camera(each, each.clip.lens) for each in filmed)
+        return _split(
+            [camera.doubted(f"{camera.name} sees no background in common with the others.", WALK) for camera in lost],
+            clips, method, "arbitrary", progress,
+        )  # fmt: skip
+    with progress.stage("poses"):
+        cameras, world = _placed(filmed, mapped, model, options, cache)
+    turn, move = disagreement(model, other, mapped.of, len(filmed))
+    inliers = nearest(mapped.inliers(), mapped.of, len(filmed))
+    helped = any(clip.kind == "walk" for clip in clips)
+    points = [len(np.unique(model.seen[mapped.of[model.pictures[model.seen[:, 0]]] == v, 1])) for v in range(len(filmed))]
+    size = float(np.median(np.linalg.norm(centres(world.camera(model.w2c)), axis=1)))
+    cameras = [
+        judged(
+            replace(
+                camera,
+                inliers=inliers[v],
+                points=points[v],
+                sigma_degrees=float(turn[v]),
+                sigma_position=float(move[v]) * size,
+            ),
+            turn=float(turn[v]),
+            move=float(move[v]),
+            checked=other is not None,
+            helped=helped,
+        )
+        for v, camera in enumerate(cameras)
+    ]
+    return _split(cameras, clips, method, "arbitrary" if options.distance is None else "metres", progress)
+
+
+def chosen(models: dict[Mapper, Model | None], mapped: Pictures) -> tuple[Mapper, Model | None, Model | None]:
+    """(mapper, its model, the other's model): the one that knows more of the videos; of equals the better one.
+
+    Along clips the global mapper was the more accurate one, of stills the incremental one.
+    """
+
+    def worth(mapper: Mapper) -> tuple[int, int, bool]:
+        model = models[mapper]
+        if model is None:
+            return 0, 0, False
+        videos = len(set(mapped.of[model.pictures].tolist()))
+        return videos, len(model.pictures), (mapper == "global") == (mapped.kind == "clips")
+
+    first: Mapper = max(models, key=worth)
+    second: Mapper = "incremental" if first == "global" else "global"
+    return first, models[first], models[second]
+
+
+def _filmed(clip: Clip, options: CalibrateOptions, cache: Cache) -> Filmed:
+    """Whether the camera moves, and its pictures; kept, because decoding takes long."""
+    frames = pictures_of(clip.frames, clip.size, options.width)
+
+    def look() -> dict[str, np.ndarray]:
+        if stands_still(frames):
+            return {"moves": np.array(False), "frames": np.array([-1]), "images": background(frames).image[None]}
+        found = key_frames(frames, options.key_frames, max(1, round(clip.fps * FLOW_SECONDS)))
+        return {
+            "moves": np.array(True),
+            "frames": np.array([picture.frame for picture in found]),
+            "images": np.stack([picture.image for picture in found]),
+            "use": np.stack([picture.use for picture in found]),
+        }
+
+    kept = cache.arrays("pictures", (clip.key, options.width, options.key_frames), look)
+    use = kept.get("use", [None] * len(kept["frames"]))
+    pictures = tuple(Picture(int(k), i, u) for k, i, u in zip(kept["frames"], kept["images"], use, strict=True))
+    return Filmed(clip, bool(kept["moves"]), pictures, frames.scale)
+
+
+def _models(mapped: Pictures, seed: int, cache: Cache) -> dict[Mapper, Model | None]:
+    """What both mappers make of the pictures; lenses are found too where enough pictures move."""
+    refine = sum(mapped.moving[int(v)] for v in mapped.of) >= MOVING_PICTURES
+    models: dict[Mapper, Model | None] = {}
+    mappers: tuple[Mapper, ...] = ("incremental", "global")
+    for mapper in mappers:
+
+        def make(mapper: Mapper = mapper) -> dict[str, np.ndarray]:
+            model = map_pictures(mapped, mapper, refine=refine, seed=seed)
+            return {} if model is None else model.arrays()
+
+        arrays = cache.arrays("model", (mapped.key, mapper, refine, seed), make)
+        models[mapper] = Model.of(arrays) if arrays else None
+    return models
+
+
+def _placed(
+    filmed: Sequence[Filmed], mapped: Pictures, model: Model, options: CalibrateOptions, cache: Cache
+) -> tuple[list[FoundCamera], Similar]:
+    """The cameras in the world's frame, every frame of those that move; and how that follows from the mapper's."""
+    lenses = lenses_found(model, mapped.lenses)
+    frames_of = [picture.frame for picture in mapped.pictures]
+    cameras = []
+    for v, each in enumerate(filmed):
+        camera = _camera(each, lenses[v].scaled(1 / each.scale))
+        at, pictures = key_pictures(mapped.of, frames_of, model, v)
+        if len(at) and not each.moves:
+            camera = replace(camera, w2c=model.w2c[pictures[0]])
+        elif len(at):
+
+            def follow(v: int = v, each: Filmed = each, at: np.ndarray = at, pictures: np.ndarray = pictures) -> dict:
+                frames = pictures_of(each.clip.frames, each.clip.size, options.width)
+                return vars(every_pose(frames, lenses[v], at, model, pictures))
+
+            if each.clip.kind == "walk":  # it helps by its key frames alone
+                camera = replace(camera, w2c=model.w2c[pictures])
+            else:
+                key = (each.clip.key, options.width, model.w2c, model.uv, lenses[v].K, lenses[v].distortion)
+                kept = cache.arrays("poses", key, follow)
+                camera = replace(camera, w2c=kept["w2c"], bridged=1 - float(kept["found"].mean()))
+        cameras.append(camera)
+    known = [(camera.w2c, each.clip.turned) for camera, each in zip(cameras, filmed, strict=True)]
+    poses = [(w2c, turned) for w2c, turned in known if w2c is not None]
+    metres = None
+    if options.distance is not None:
+        a, b, length = options.distance
+        ends = [camera.w2c for name in (a, b) for camera in cameras if camera.name == name]
+        if len(ends) == 2 and all(w2c is not None and w2c.ndim == 2 for w2c in ends):
+            metres = (centres(ends[0]), centres(ends[1]), length)  # type: ignore[arg-type]
+        else:
+            raise ValueError(
+                f"--distance: expected two static cameras that were found; found {a} and {b} otherwise. Name others, "
+                "or leave it out."
+            )
+    world = upright([w2c for w2c, _ in poses], [turned for _, turned in poses], metres)
+    return [c if c.w2c is None else replace(c, w2c=world.camera(c.w2c)) for c in cameras], world
+
+
+def _camera(each: Filmed, lens: Lens) -> FoundCamera:
+    return FoundCamera(each.clip.name, *each.clip.size, lens.K, lens.distortion, lens.source)
+
+
+def _split(
+    cameras: Sequence[FoundCamera], clips: Sequence[Clip], method: str, unit: str, progress: Progress
+) -> Calibration:
+    """The cameras of the scene, and those that only helped."""
+    kinds = {clip.name: clip.kind for clip in clips}
+    scene = tuple(camera for camera in cameras if kinds[camera.name] == "scene")
+    helpers = tuple(camera for camera in cameras if kinds[camera.name] != "scene")
+    return Calibration(scene, method, unit, helpers, dict(progress.seconds))
+
+
+def _check_distance(options: CalibrateOptions, clips: Sequence[Clip]) -> None:
+    names = [clip.name for clip in clips if clip.kind == "scene"]
+    if options.distance is not None:
+        a, b, _ = options.distance
+        if a not in names or b not in names or a == b:
+            raise ValueError(f"--distance: expected two of {', '.join(names)}; found {a} and {b}.")
