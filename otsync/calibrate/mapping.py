@@ -30,8 +30,12 @@ NEAR = 6
 FEATURES = {"stills": 8192, "clips": 3000}
 """Features of a picture. With few stills every one counts; a clip has many pictures."""
 
-PEAK = {"stills": 0.002, "clips": 0.004}
+PEAK = {"stills": 0.0005, "clips": 0.004}
 """Thresholds of SIFT's peaks: low, for walls with thin texture (measured on the dome and in rooms)."""
+
+EDGE = {"stills": 40.0, "clips": 10.0}
+"""Ratios of curvatures up to which a peak is none of an edge. Of stills larger: on the dome the matches of right pairs
+grew by half, those of wrong ones by a quarter."""
 
 
 @dataclass(frozen=True)
@@ -39,12 +43,12 @@ class Thresholds:
     """What a mapper asks for before it believes. Strict: on the dome looser ones added wrong cameras, no right ones.
 
     Args:
-        matches: verified matches of a pair of pictures. pose: matches that agree on a new picture's pose, and
+        matches: verified matches of a pair of pictures; of several numbers each is tried. pose: matches that agree on a new picture's pose, and
         share: which part of all of them that must be. first: matches of the first pair, and angle: degrees between its
         rays.
     """
 
-    matches: int = 30
+    matches: tuple[int, ...] = (30, 45, 60, 80)
     pose: int = 30
     share: float = 0.25
     first: int = 40
@@ -52,7 +56,7 @@ class Thresholds:
 
 
 STILLS = Thresholds()
-CLIPS = Thresholds(matches=20, pose=20)
+CLIPS = Thresholds(matches=(20,), pose=20)
 """Along a clip many pictures support each other."""
 
 
@@ -116,11 +120,15 @@ class Pictures:
         return "clips" if any(self.moving) else "stills"
 
     @property
+    def thresholds(self) -> Thresholds:
+        return CLIPS if self.kind == "clips" else STILLS
+
+    @property
     def key(self) -> str:
         """A hash of everything that features and matches follow from."""
         lenses = [(lens.K, lens.distortion, lens.source) for lens in self.lenses]
         pictures = [(p.image, p.use) for p in self.pictures]
-        return content_key("sift 2", self.of, pictures, lenses, self.kind, NEAR, FEATURES, PEAK)
+        return content_key("sift 2", self.of, pictures, lenses, self.kind, NEAR, FEATURES, PEAK, EDGE)
 
     def file(self, p: int) -> str:
         """The name of picture ``p`` among the files: a folder a video, without the names that people give."""
@@ -157,6 +165,7 @@ class Pictures:
         extraction.use_gpu, extraction.num_threads = False, 1
         sift = extraction.sift
         sift.max_num_features, sift.peak_threshold = FEATURES[self.kind], PEAK[self.kind]
+        sift.edge_threshold = EDGE[self.kind]
         if self.kind == "stills":
             sift.estimate_affine_shape, sift.domain_size_pooling = True, True
         else:
@@ -196,31 +205,38 @@ class Pictures:
             if self.of[a] != self.of[b] or (self.moving[int(self.of[a])] and b - a <= NEAR)
         ]
 
-    def inliers(self) -> dict[tuple[int, int], int]:
-        """Verified matches of every pair of pictures that has any."""
+    def matches(self) -> dict[tuple[int, int], Float[np.ndarray, "N 4"]]:
+        """Verified matches of every pair of pictures that has any: pixels (u, v) in the one, then in the other."""
         import pycolmap
 
         with quiet(pycolmap), opened(pycolmap, self.database()) as database:
             index = {image.image_id: int(image.name.split("/")[1][:6]) for image in database.read_all_images()}
+            uv = {p: database.read_keypoints(image)[:, :2].astype(float) for image, p in index.items()}
             ids, counts = database.read_two_view_geometry_num_inliers()
             found = {}
             for pair, count in zip(ids, counts, strict=True):
-                a, b = pair if isinstance(pair, tuple | list) else pycolmap.pair_id_to_image_pair(pair)
-                found[min(index[a], index[b]), max(index[a], index[b])] = int(count)
+                one, two = pair if isinstance(pair, tuple | list) else pycolmap.pair_id_to_image_pair(pair)
+                if not count:
+                    continue
+                same = np.asarray(database.read_two_view_geometry(one, two).inlier_matches, int)
+                a, b = index[one], index[two]
+                seen = np.concatenate([uv[a][same[:, 0]], uv[b][same[:, 1]]], 1)
+                found[min(a, b), max(a, b)] = seen if a < b else seen[:, [2, 3, 0, 1]]
             return found
 
 
-def map_pictures(pictures: Pictures, mapper: Mapper, *, refine: bool, seed: int = 0) -> Model | None:
+def map_pictures(pictures: Pictures, mapper: Mapper, *, least: int, refine: bool, seed: int = 0) -> Model | None:
     """The largest model that a mapper makes; None where it makes none.
 
     Args:
+        least: verified matches of the pairs that it heeds (see :class:`Thresholds`).
         refine: whether focal lengths and radial distortion of lenses that are not known are found too.
         seed: of its random numbers.
     """
     import pycolmap
 
     source = pictures.database()
-    thresholds = CLIPS if any(pictures.moving) else STILLS
+    thresholds = pictures.thresholds
     with quiet(pycolmap), tempfile.TemporaryDirectory(prefix="otsync-mapping-") as work:
         path = Path(work) / "features.db"
         shutil.copy(source, path)
@@ -229,7 +245,7 @@ def map_pictures(pictures: Pictures, mapper: Mapper, *, refine: bool, seed: int 
         held = {camera for camera, v in folders.items() if not refine or pictures.lenses[v].known}
         make = _incremental if mapper == "incremental" else _global
         try:
-            found = make(pycolmap, path, Path(work), thresholds, refine=refine, held=held, seed=seed)
+            found = make(pycolmap, path, Path(work), thresholds, least=least, refine=refine, held=held, seed=seed)
         except (RuntimeError, ValueError):  # COLMAP's own checks: too little to map
             return None
         if not found:
@@ -242,12 +258,12 @@ def map_pictures(pictures: Pictures, mapper: Mapper, *, refine: bool, seed: int 
 
 
 def _incremental(
-    pycolmap: Any, path: Path, work: Path, thresholds: Thresholds, *, refine: bool, held: set[int], seed: int
+    pycolmap: Any, path: Path, work: Path, thresholds: Thresholds, *, least: int, refine: bool, held: set[int], seed: int
 ) -> Any:
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed, options.extract_colors = 1, seed, False
     options.min_model_size, options.multiple_models = 2, False
-    options.min_num_matches = thresholds.matches
+    options.min_num_matches = least
     options.ba_refine_focal_length = options.ba_refine_extra_params = refine
     options.constant_cameras = held
     options.triangulation.ignore_two_view_tracks = False
@@ -260,11 +276,11 @@ def _incremental(
 
 
 def _global(
-    pycolmap: Any, path: Path, work: Path, thresholds: Thresholds, *, refine: bool, held: set[int], seed: int
+    pycolmap: Any, path: Path, work: Path, thresholds: Thresholds, *, least: int, refine: bool, held: set[int], seed: int
 ) -> Any:
     options = pycolmap.GlobalPipelineOptions()
     options.num_threads, options.random_seed, options.min_model_size = 1, seed, 2
-    options.min_num_matches = thresholds.matches
+    options.min_num_matches = least
     mapper = options.mapper
     mapper.global_positioning.use_gpu = mapper.bundle_adjustment.ceres.use_gpu = False
     mapper.bundle_adjustment.refine_focal_length = mapper.bundle_adjustment.refine_extra_params = refine

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,13 +15,30 @@ from .clips import Clip, Lens, read_clips
 from .found import WALK, Calibration, FoundCamera
 from .mapping import Mapper, Model, Pictures, lenses_found, map_pictures
 from .poses import every_pose, key_pictures
-from .stills import Picture, background, key_frames, pictures_of, stands_still
-from .verdict import MOVING_PICTURES, disagreement, judged, nearest
+from .stills import (
+    LOOKS,
+    RESIDUAL,
+    SAMPLES,
+    SPARE,
+    STAYING,
+    STILL,
+    Picture,
+    background,
+    key_frames,
+    pictures_of,
+    stands_still,
+)
+from .verdict import MOVING_PICTURES, agreement, judged, support
 from .world import Similar, centres, upright
 
-MOVING = "moving"
+SHARED, FEWEST = 3, 8
+"""Key frames of all clips together, in those of one, and the fewest of one: time grows with the square of them all."""
+
 FLOW_SECONDS = 1 / 15
 """Between the frames whose flow tells what moves before a moving camera."""
+
+Matches = Mapping[tuple[int, int], np.ndarray]
+"""Verified matches by pair of pictures."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +50,7 @@ class CalibrateOptions:
     distance: tuple[str, str, float] | None = None
     """Two videos of static cameras, and the metres between them: the scene is in metres."""
     key_frames: int = 24
-    """Frames of a clip whose camera moves that the mapping uses."""
+    """Frames of a clip whose camera moves that the mapping uses; of many clips fewer each, but of walk clips."""
     width: int = 1000
     """Pixels of the longer side of the pictures that the mapping uses."""
     seed: int = 0
@@ -48,6 +65,11 @@ class CalibrateOptions:
             raise ValueError(f"--seed: expected 0 or more; found {self.seed}.")
         if self.distance is not None and not (np.isfinite(self.distance[2]) and self.distance[2] > 0):
             raise ValueError(f"--distance: expected metres above 0; found {self.distance[2]}.")
+
+    def pictures_of(self, clip: Clip, clips: int) -> int:
+        """How many key frames a clip of so many gives, if its camera moves."""
+        shared = SHARED * self.key_frames // clips
+        return self.key_frames if clip.kind == "walk" else min(self.key_frames, max(FEWEST, shared))
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +118,7 @@ def calibrate_clips(
     options, cache, progress = options or CalibrateOptions(), cache or Cache(), Progress(tell)
     _check_distance(options, clips)
     with progress.stage("pictures"):
-        filmed = [_filmed(clip, options, cache) for clip in clips]
+        filmed = [_filmed(clip, options, options.pictures_of(clip, len(clips)), cache) for clip in clips]
         for each in filmed:
             how = f"moves, {len(each.pictures)} key frames" if each.moves else "stands still: the median of its frames"
             tell(f"{each.clip.name}: {how}")
@@ -111,8 +133,9 @@ def calibrate_clips(
     with progress.stage("features and matches"):
         mapped.database(tell)
     with progress.stage("mapping"):
-        models = _models(mapped, options.seed, cache)
-    method, model, other = chosen(models, mapped)
+        matches = mapped.matches()
+        models = _models(mapped, matches, options.seed, cache)
+    method, model, other = chosen(models, mapped, matches)
     if model is None:
         lost = tuple(_camera(each, each.clip.lens) for each in filmed)
         return _split(
@@ -121,23 +144,25 @@ def calibrate_clips(
         )  # fmt: skip
     with progress.stage("poses"):
         cameras, world = _placed(filmed, mapped, model, options, cache)
-    turn, move = disagreement(model, other, mapped.of, len(filmed))
-    inliers = nearest(mapped.inliers(), mapped.of, len(filmed))
+    agreed = agreement(model, other, mapped.of, len(filmed))
+    backed = support(model, matches, mapped.of, mapped.lenses)
     helped = any(clip.kind == "walk" for clip in clips)
-    points = [len(np.unique(model.seen[mapped.of[model.pictures[model.seen[:, 0]]] == v, 1])) for v in range(len(filmed))]
+    seen = mapped.of[model.pictures[model.seen[:, 0]]]
     size = float(np.median(np.linalg.norm(centres(world.camera(model.w2c)), axis=1)))
     cameras = [
         judged(
             replace(
                 camera,
-                inliers=inliers[v],
-                points=points[v],
-                sigma_degrees=float(turn[v]),
-                sigma_position=float(move[v]) * size,
+                inliers=int(backed.nearest[v]),
+                points=len(np.unique(model.seen[seen == v, 1])),
+                sigma_degrees=float(agreed.turn[v]),
+                sigma_position=float(agreed.move[v]) * size,
             ),
-            turn=float(turn[v]),
-            move=float(move[v]),
+            turn=float(agreed.turn[v]),
+            move=float(agreed.move[v]),
+            whole=agreed.whole,
             checked=other is not None,
+            health=float(backed.health[v]),
             helped=helped,
         )
         for v, camera in enumerate(cameras)
@@ -145,32 +170,36 @@ def calibrate_clips(
     return _split(cameras, clips, method, "arbitrary" if options.distance is None else "metres", progress)
 
 
-def chosen(models: dict[Mapper, Model | None], mapped: Pictures) -> tuple[Mapper, Model | None, Model | None]:
+def chosen(
+    models: dict[Mapper, Model | None], mapped: Pictures, matches: Matches
+) -> tuple[Mapper, Model | None, Model | None]:
     """(mapper, its model, the other's model): the one that knows more of the videos; of equals the better one.
 
-    Along clips the global mapper was the more accurate one, of stills the incremental one.
+    Along clips the global mapper was the more accurate one; of stills the one that more matches obey.
     """
 
-    def worth(mapper: Mapper) -> tuple[int, int, bool]:
+    def worth(mapper: Mapper) -> tuple[int, int, int]:
         model = models[mapper]
         if model is None:
-            return 0, 0, False
-        videos = len(set(mapped.of[model.pictures].tolist()))
-        return videos, len(model.pictures), (mapper == "global") == (mapped.kind == "clips")
+            return 0, 0, 0
+        backed = support(model, matches, mapped.of, mapped.lenses).worth
+        if mapped.kind == "stills":
+            return backed, len(model.pictures), 0
+        return len(set(mapped.of[model.pictures].tolist())), len(model.pictures), int(mapper == "global")
 
     first: Mapper = max(models, key=worth)
     second: Mapper = "incremental" if first == "global" else "global"
     return first, models[first], models[second]
 
 
-def _filmed(clip: Clip, options: CalibrateOptions, cache: Cache) -> Filmed:
-    """Whether the camera moves, and its pictures; kept, because decoding takes long."""
+def _filmed(clip: Clip, options: CalibrateOptions, count: int, cache: Cache) -> Filmed:
+    """Whether the camera moves, and its pictures, at most ``count``; kept, because decoding takes long."""
     frames = pictures_of(clip.frames, clip.size, options.width)
 
     def look() -> dict[str, np.ndarray]:
         if stands_still(frames):
             return {"moves": np.array(False), "frames": np.array([-1]), "images": background(frames).image[None]}
-        found = key_frames(frames, options.key_frames, max(1, round(clip.fps * FLOW_SECONDS)))
+        found = key_frames(frames, count, max(1, round(clip.fps * FLOW_SECONDS)))
         return {
             "moves": np.array(True),
             "frames": np.array([picture.frame for picture in found]),
@@ -178,25 +207,33 @@ def _filmed(clip: Clip, options: CalibrateOptions, cache: Cache) -> Filmed:
             "use": np.stack([picture.use for picture in found]),
         }
 
-    kept = cache.arrays("pictures", (clip.key, options.width, options.key_frames), look)
+    constants = (STILL, STAYING, LOOKS, SAMPLES, RESIDUAL, SPARE, FLOW_SECONDS)
+    kept = cache.arrays("pictures", (clip.key, options.width, count, *constants), look)
     use = kept.get("use", [None] * len(kept["frames"]))
     pictures = tuple(Picture(int(k), i, u) for k, i, u in zip(kept["frames"], kept["images"], use, strict=True))
     return Filmed(clip, bool(kept["moves"]), pictures, frames.scale)
 
 
-def _models(mapped: Pictures, seed: int, cache: Cache) -> dict[Mapper, Model | None]:
-    """What both mappers make of the pictures; lenses are found too where enough pictures move."""
+def _models(mapped: Pictures, matches: Matches, seed: int, cache: Cache) -> dict[Mapper, Model | None]:
+    """What both mappers make of the pictures; lenses are found too where enough pictures move.
+
+    Of the models that a mapper makes of pairs with more and with fewer matches, the one that more matches obey.
+    """
     refine = sum(mapped.moving[int(v)] for v in mapped.of) >= MOVING_PICTURES
     models: dict[Mapper, Model | None] = {}
     mappers: tuple[Mapper, ...] = ("incremental", "global")
     for mapper in mappers:
+        made = []
+        for least in mapped.thresholds.matches:
 
-        def make(mapper: Mapper = mapper) -> dict[str, np.ndarray]:
-            model = map_pictures(mapped, mapper, refine=refine, seed=seed)
-            return {} if model is None else model.arrays()
+            def make(mapper: Mapper = mapper, least: int = least) -> dict[str, np.ndarray]:
+                model = map_pictures(mapped, mapper, least=least, refine=refine, seed=seed)
+                return {} if model is None else model.arrays()
 
-        arrays = cache.arrays("model", (mapped.key, mapper, refine, seed), make)
-        models[mapper] = Model.of(arrays) if arrays else None
+            arrays = cache.arrays("model", (mapped.key, mapped.thresholds, mapper, least, refine, seed), make)
+            if arrays:
+                made.append(Model.of(arrays))
+        models[mapper] = max(made, key=lambda m: support(m, matches, mapped.of, mapped.lenses).worth, default=None)
     return models
 
 

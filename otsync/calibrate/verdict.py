@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
+from ..geometry import fundamental, sampson, undistort
+from ..types import Camera
+from .clips import Lens
 from .found import WALK, FoundCamera
-from .mapping import Model
+from .mapping import Model, lenses_found
 from .world import centres, degrees, laid_over
 
 FEW_INLIERS = 50
@@ -17,6 +21,12 @@ FEW_INLIERS = 50
 MAPPERS_TURN, MAPPERS_MOVE = 2.0, 0.05
 """How far two mappers may disagree: degrees, and shares of the distance to the middle of the cameras."""
 
+COUNTING, OBEYS = 30, 4.0
+"""Matches of a pair from which on it is heard about a model, and pixels within which they obey it."""
+
+HEALTHY = 0.5
+"""Share of a camera's matches with other videos that must obey the model: of a wrong model the right pairs break it."""
+
 BRIDGED = 0.1
 """Share of a moving camera's frames that may lie between their neighbours."""
 
@@ -24,19 +34,28 @@ MOVING_PICTURES = 12
 """Registered key frames of moving cameras from which on they determine focal lengths."""
 
 
-def disagreement(
-    one: Model, other: Model | None, of: np.ndarray, videos: int
-) -> tuple[Float[np.ndarray, " V"], Float[np.ndarray, " V"]]:
-    """Degrees, and shares of the distance to the cameras' middle, by which two models differ on every video's pictures.
+@dataclass(frozen=True, eq=False)
+class Agreement:
+    """How two models of the same pictures differ, when the one is laid over the other.
 
-    The median over the video's pictures; nan for a video that either lacks.
+    Args:
+        turn, move: (V,) degrees, and shares of the distance to the middle of the cameras: the median over each video's
+            pictures; nan for a video that either model lacks.
+        whole: whether most pictures agree. If not, no camera is confirmed: two worlds can always be laid over each other
+            so that some few do.
     """
+
+    turn: Float[np.ndarray, " V"]
+    move: Float[np.ndarray, " V"]
+    whole: bool
+
+
+def agreement(one: Model, other: Model | None, of: np.ndarray, videos: int) -> Agreement:
+    """How the second model differs from the first."""
     turn, move = np.full(videos, np.nan), np.full(videos, np.nan)
-    if other is None:
-        return turn, move
-    both = sorted(set(one.pictures.tolist()) & set(other.pictures.tolist()))
-    if len(both) < 2:
-        return turn, move
+    both = [] if other is None else sorted(set(one.pictures.tolist()) & set(other.pictures.tolist()))
+    if other is None or len(both) < 3:
+        return Agreement(turn, move, False)
     a = np.stack([other.w2c[int(np.flatnonzero(other.pictures == p)[0])] for p in both])
     b = np.stack([one.w2c[int(np.flatnonzero(one.pictures == p)[0])] for p in both])
     moved = laid_over(a, b).camera(a)
@@ -47,32 +66,72 @@ def disagreement(
     video = of[np.array(both)]
     for v in set(video.tolist()):
         turn[v], move[v] = np.median(turns[video == v]), np.median(shifts[video == v])
-    return turn, move
+    agree = int(((turns < MAPPERS_TURN) & (shifts < MAPPERS_MOVE)).sum())
+    return Agreement(turn, move, agree >= 3 and 2 * agree > max(len(one.pictures), len(other.pictures)))
 
 
-def nearest(inliers: Mapping[tuple[int, int], int], of: np.ndarray, videos: int) -> list[int]:
-    """Of every video: the most verified matches that a picture of it has with one of another video."""
-    best = [0] * videos
-    for (a, b), count in inliers.items():
-        if of[a] != of[b]:
-            for v in (int(of[a]), int(of[b])):
-                best[v] = max(best[v], count)
-    return best
+@dataclass(frozen=True, eq=False)
+class Support:
+    """What the verified matches between videos say of a model.
+
+    Args:
+        kept, broken: (V,) matches of each video with others that obey, or break, the geometry of the model.
+        nearest: (V,) the most matches that a picture has with one of another video.
+    """
+
+    kept: Int[np.ndarray, " V"]
+    broken: Int[np.ndarray, " V"]
+    nearest: Int[np.ndarray, " V"]
+
+    @property
+    def worth(self) -> int:
+        """Of two models the one with more matches that obey it, and fewer that break it, is the better one."""
+        return int(self.kept.sum()) - int(self.broken.sum())
+
+    @property
+    def health(self) -> Float[np.ndarray, " V"]:
+        """Share of each video's matches that obey the model; nan where there are none."""
+        total = self.kept + self.broken
+        return np.where(total > 0, self.kept / np.maximum(total, 1), np.nan)
+
+
+def support(
+    model: Model | None,
+    matches: Mapping[tuple[int, int], Float[np.ndarray, "N 4"]],
+    of: np.ndarray,
+    lenses: Sequence[Lens],
+) -> Support:
+    """Hold a model against all verified matches between videos, those that its mapper left out too."""
+    kept, broken, most = (np.zeros(len(lenses), int) for _ in range(3))
+    at = {} if model is None else {int(p): n for n, p in enumerate(model.pictures)}
+    found = lenses if model is None else lenses_found(model, lenses)
+    for (a, b), uv in matches.items():
+        va, vb = int(of[a]), int(of[b])
+        if va == vb:
+            continue
+        most[va], most[vb] = max(most[va], len(uv)), max(most[vb], len(uv))
+        if model is None or a not in at or b not in at or len(uv) < COUNTING:
+            continue
+        one, two = (
+            Camera(found[v].K, model.w2c[at[p]], 1, 1, found[v].distortion) for v, p in ((va, a), (vb, b))
+        )
+        off = np.abs(sampson(fundamental(one, two), undistort(one, uv[:, :2]), undistort(two, uv[:, 2:])))
+        good = int((off < OBEYS).sum())
+        for v in (va, vb):
+            kept[v] += good
+            broken[v] += len(uv) - good
+    return Support(kept, broken, most)
 
 
 def judged(
-    camera: FoundCamera,
-    *,
-    turn: float,
-    move: float,
-    checked: bool,
-    helped: bool,
+    camera: FoundCamera, *, turn: float, move: float, whole: bool, checked: bool, health: float, helped: bool
 ) -> FoundCamera:
     """A camera with the reason to doubt it, where there is one.
 
     Args:
-        turn, move: how far the mappers disagree (see :func:`disagreement`); nan: the other one lacks it.
-        checked: whether the other mapper made a model at all. helped: whether a walk clip is there.
+        turn, move, whole: how far the mappers differ (see :class:`Agreement`).
+        checked: whether the other mapper made a model at all.
+        health: share of its matches that obey the model. helped: whether a walk clip is there.
     """
     name, more = camera.name, "Film a longer and slower walk past all cameras." if helped else WALK
     if camera.w2c is None:
@@ -82,10 +141,14 @@ def judged(
     if not np.isfinite(turn):
         why = "leaves it out" if checked else "makes no model"
         camera = camera.doubted(f"the second mapper {why}, so nothing confirms where {name} stands.", more)
+    elif not whole:
+        camera = camera.doubted("two mappers make different models of the whole, so neither is confirmed.", more)
     elif turn > MAPPERS_TURN or move > MAPPERS_MOVE:
         camera = camera.doubted(
             f"two mappers disagree on {name}: by {turn:.1f} degrees and {100 * move:.0f} % of its distance.", more
         )
+    if health < HEALTHY:
+        camera = camera.doubted(f"{100 * (1 - health):.0f} % of the matches of {name} contradict where it stands.", more)
     if camera.lens == "guessed":
         camera = camera.doubted(
             f"the focal length of {name} is a guess.",
