@@ -79,6 +79,36 @@ def calibrate_folder(folder: Path, out: Path, options: CalibrateOptions, *, forc
     return found
 
 
+def prepared(path: Path, *, allow_outside: bool = False) -> int:
+    """Make a folder of videos that nobody calibrated ready to be synchronised: init, calibrate, check; 1 for doubts.
+
+    A folder with a scene.json, or whose reader knows the cameras, stays as it is: 0. What is done is printed on stderr.
+    ValueError where fewer than two cameras can be found.
+    """
+    if not path.is_dir() or (path / "scene.json").exists():
+        return 0
+    from ..files.claim import claimed
+    from ..io.scene import read_document
+    from ..recordings.check import check_scene
+
+    document, _ = read_document(path)
+    if all((video.get("camera") or {}).get("w2c") is not None for video in document["videos"]):
+        return 0
+    tell(f"{path}: no scene.json and no cameras: looking for them (otsync calibrate {path})")
+    with claimed(path / "calibration", "otsync calibrate") as out:
+        found = calibrate_folder(path, out, CalibrateOptions())
+    tell(camera_table(found))
+    doubts = told_doubts(found)
+    if len(found.found) < 2:
+        raise ValueError(
+            f"{path}: expected cameras of two videos and more; found {len(found.found)}. {found.cameras[0].remedy}"
+        )
+    for finding in check_scene(path, every_frame=False, allow_outside=allow_outside):
+        print(f"{finding.severity}: {finding.video or 'scene'}: {finding.what} {finding.remedy}", file=sys.stderr)
+    tell(f"wrote {path / 'scene.json'}; synchronising (otsync sync {path})")
+    return doubts
+
+
 def has_poses(document: dict[str, Any]) -> bool:
     """Whether a scene document has the pose of a camera."""
     return any((video.get("camera") or {}).get("w2c") is not None for video in document["videos"])

@@ -129,8 +129,8 @@ def scene_from_document(
     entries = document["videos"]
     if document.get("missing"):
         raise ValueError(
-            f"{file}: still missing: {shown(document['missing'])}. Write the file with otsync init, fill it in, "
-            "then delete 'missing'."
+            f"{file}: still missing: {shown(document['missing'])}. Find the cameras (otsync calibrate), or fill "
+            "it in, then delete 'missing'."
         )
     names = names_of(entries)
     twice = sorted({n for n in names if names.count(n) > 1})
@@ -207,7 +207,7 @@ def video_frames(entry: dict[str, Any], paths: Paths) -> tuple[LazyFrames, np.nd
 def camera_from(value: Any) -> Camera:
     """A camera of the document. ValueError says which field is missing."""
     if not isinstance(value, dict):
-        raise ValueError("camera: expected K, w2c, width and height; found none. Add the calibration.")
+        raise ValueError("camera: expected K, w2c, width and height; found none. Add the calibration, or let it be found: otsync calibrate.")
     missing = [f for f in ("K", "w2c", "width", "height") if value.get(f) is None]
     if missing:
         own = " Or, with depth for every video, let the poses be found: otsync sync --frames own."

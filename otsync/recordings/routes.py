@@ -32,7 +32,7 @@ from ..files.digest import content_key, sequence_key
 from ..geometry import seen_pixels
 from ..io.scene import Scene
 from ..priors.slots import cache_key
-from ..priors.stereo import Rig
+from ..priors.stereo import EmptyHull, Rig
 from ..progress import Deadline, Progress, Tell
 from ..sync.method import Method
 from ..sync.verb import synchronize
@@ -124,7 +124,14 @@ def synchronize_scene(
         tell(doubt)
         return replace(epipolar, why=(*why, doubt))
     with progress.stage("stereo"):
-        depth = stereo_depth(scene, flat, first, stages, cache, map)
+        try:
+            depth = stereo_depth(scene, flat, first, stages, cache, map)
+        except EmptyHull as error:
+            if asked:
+                raise
+            doubt = f"no stereo: {error} The epipolar answer stands"
+            tell(doubt)
+            return replace(epipolar, why=(*why, doubt))
         lifted = [stages.lift(t, z) for t, z in zip(flat, depth, strict=True)]
     bare = [t.name for t in lifted if len(t) == 0]
     if bare:
