@@ -143,7 +143,9 @@ def _clip(name: str, entry: Mapping[str, Any], paths: Paths, given: Mapping[str,
     used = frames if (first, stop) == (0, len(frames)) else FrameRange(frames, range(first, stop))
     if len(used) == 0:
         raise ValueError(f"{where}: range: expected frames; found none. Correct it.")
-    rate = fps or (1 / float(np.median(np.diff(timestamps))) if timestamps is not None and len(timestamps) > 1 else 30.0)
+    rate = fps or (
+        1 / float(np.median(np.diff(timestamps))) if timestamps is not None and len(timestamps) > 1 else 30.0
+    )
     height, width = used[0].shape[:2]
     told = _metadata(frames.path) if isinstance(frames, VideoFrames) else {}
     lens = _lens(entry.get("camera") or {}, (width, height), told, given.get(name, given.get("*")))
@@ -187,8 +189,9 @@ def _metadata(path: Path) -> dict[str, float]:
                 told["turned"] = float(value) % 360
         if "turned" not in told:
             frame = next(container.decode(stream), None)
-            if frame is not None and getattr(frame, "rotation", 0):
-                told["turned"] = -float(frame.rotation) % 360
+            turned = 0 if frame is None else float(getattr(frame, "rotation", 0))
+            if turned:
+                told["turned"] = -turned % 360
     return told
 
 

@@ -50,6 +50,14 @@ class FoundCamera:
         """Whether the camera is to be trusted."""
         return self.w2c is not None and not self.doubt
 
+    @property
+    def places(self) -> Float[np.ndarray, "T 3"]:
+        """Where the camera stands, one place where it does not move. ValueError where no pose was found."""
+        if self.w2c is None:
+            raise ValueError(f"{self.name}: expected a pose; none was found.")
+        poses = self.w2c.reshape(-1, 4, 4)
+        return -np.einsum("tji,tj->ti", poses[:, :3, :3], poses[:, :3, 3])
+
     def doubted(self, doubt: str, remedy: str) -> FoundCamera:
         """The same camera with a reason to doubt it; the first reason stays."""
         return self if self.doubt else replace(self, doubt=doubt, remedy=remedy)
@@ -63,8 +71,8 @@ class Calibration:
         cameras: one a video, in the videos' order.
         method: how they were found: "incremental", "global" or "board".
         unit: "metres", or "arbitrary": then the median distance from a camera to where all look is 3.
-        up: which way is up in the world is known; then it is +z.
         helpers: cameras of clips that only helped (walk.mp4), which belong to no scene.
+        points: (M,3) of the background, in the world (z up).
         seconds: wall time per stage.
     """
 
@@ -72,6 +80,7 @@ class Calibration:
     method: str
     unit: str = "arbitrary"
     helpers: tuple[FoundCamera, ...] = ()
+    points: Float[np.ndarray, "M 3"] = field(default_factory=lambda: np.zeros((0, 3)))
     seconds: dict[str, float] = field(default_factory=dict)
 
     def __len__(self) -> int:

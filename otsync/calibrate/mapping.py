@@ -89,7 +89,8 @@ class Model:
     @classmethod
     def of(cls, arrays: Mapping[str, np.ndarray]) -> Model:
         """The inverse of :meth:`arrays`."""
-        return cls(**{**arrays, "error": float(arrays["error"])})
+        of: dict[str, Any] = {**arrays, "error": float(arrays["error"])}
+        return cls(**of)
 
     @property
     def centres(self) -> Float[np.ndarray, "P 3"]:
@@ -172,16 +173,14 @@ class Pictures:
             sift.first_octave = 0
         with quiet(pycolmap):
             for v in range(len(self.names)):
-                files = [self.file(int(p)) for p in np.flatnonzero(self.of == v)]
+                names = [self.file(int(p)) for p in np.flatnonzero(self.of == v)]
                 reader = pycolmap.ImageReaderOptions()
                 reader.camera_model, reader.camera_params = colmap_camera(self.lenses[v])
                 if any(self.pictures[int(p)].use is not None for p in np.flatnonzero(self.of == v)):
                     reader.mask_path = str(work / "masks")
-                pycolmap.extract_features(
-                    path, work / "pictures", files, pycolmap.CameraMode.PER_FOLDER, reader, extraction,
-                    pycolmap.Device.cpu,
-                )  # fmt: skip
-                tell(f"features {v + 1}/{len(self.names)}: {self.names[v]}, {len(files)} pictures")
+                mode, device = pycolmap.CameraMode.PER_FOLDER, pycolmap.Device.cpu
+                pycolmap.extract_features(path, work / "pictures", names, mode, reader, extraction, device)
+                tell(f"features {v + 1}/{len(self.names)}: {self.names[v]}, {len(names)} pictures")
             pairs = self.pairs()
             listed = work / "pairs.txt"
             listed.write_text("".join(f"{self.file(a)} {self.file(b)}\n" for a, b in pairs))
@@ -258,7 +257,15 @@ def map_pictures(pictures: Pictures, mapper: Mapper, *, least: int, refine: bool
 
 
 def _incremental(
-    pycolmap: Any, path: Path, work: Path, thresholds: Thresholds, *, least: int, refine: bool, held: set[int], seed: int
+    pycolmap: Any,
+    path: Path,
+    work: Path,
+    thresholds: Thresholds,
+    *,
+    least: int,
+    refine: bool,
+    held: set[int],
+    seed: int,
 ) -> Any:
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed, options.extract_colors = 1, seed, False
@@ -276,7 +283,15 @@ def _incremental(
 
 
 def _global(
-    pycolmap: Any, path: Path, work: Path, thresholds: Thresholds, *, least: int, refine: bool, held: set[int], seed: int
+    pycolmap: Any,
+    path: Path,
+    work: Path,
+    thresholds: Thresholds,
+    *,
+    least: int,
+    refine: bool,
+    held: set[int],
+    seed: int,
 ) -> Any:
     options = pycolmap.GlobalPipelineOptions()
     options.num_threads, options.random_seed, options.min_model_size = 1, seed, 2

@@ -73,6 +73,7 @@ def _followed(
     import cv2
 
     cv2.setNumThreads(1)
+    follow: Any = cv2.calcOpticalFlowPyrLK
     step = 1 if stop > key else -1
     if abs(stop - key) < 2 or not len(uv):
         return
@@ -80,8 +81,8 @@ def _followed(
     before, here = frames.gray(key), (uv - 0.5).astype(np.float32).reshape(-1, 1, 2)
     for k in range(key + step, stop, step):
         after = frames.gray(k)
-        there, ok, _ = cv2.calcOpticalFlowPyrLK(before, after, here, None, winSize=(size, size), maxLevel=3)
-        back, again, _ = cv2.calcOpticalFlowPyrLK(after, before, there, None, winSize=(size, size), maxLevel=3)
+        there, ok, _ = follow(before, after, here, None, winSize=(size, size), maxLevel=3)
+        back, again, _ = follow(after, before, there, None, winSize=(size, size), maxLevel=3)
         keep = (ok.ravel() > 0) & (again.ravel() > 0)
         keep &= np.linalg.norm((back - here).reshape(-1, 2), axis=1) < DRIFT * frames.unit
         here, xyz, before = there[keep], xyz[keep], after
@@ -97,7 +98,7 @@ def _pnp(
     import poselib
 
     name, parameters = colmap_camera(lens)
-    camera = {
+    camera: dict[str, Any] = {
         "model": name,
         "width": frames.size[0],
         "height": frames.size[1],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, UInt8
@@ -52,13 +53,14 @@ def stands_still(frames: WorkingFrames) -> bool:
     """Whether the camera does not move: some of the first frame's corners stay where they were."""
     import cv2
 
+    follow: Any = cv2.calcOpticalFlowPyrLK
     first = frames.gray(0)
     corners = cv2.goodFeaturesToTrack(first, 500, 0.01, 8 * frames.unit)
     if corners is None or len(frames) == 1:
         return True
     staying = []
     for k in evenly(len(frames), LOOKS + 1)[1:]:
-        moved, ok, _ = cv2.calcOpticalFlowPyrLK(first, frames.gray(int(k)), corners, None, winSize=(15, 15))
+        moved, ok, _ = follow(first, frames.gray(int(k)), corners, None, winSize=(15, 15))
         near = np.linalg.norm((moved - corners).reshape(-1, 2), axis=1) < STILL * max(frames.unit, 0.5)
         staying.append(float((near & (ok.ravel() > 0)).mean()))
     return bool(np.median(staying) >= STAYING and min(staying) >= STAYING / 2)

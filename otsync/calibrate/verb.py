@@ -12,7 +12,7 @@ import numpy as np
 from ..files.cache import Cache
 from ..progress import Progress, Tell
 from .clips import Clip, Lens, read_clips
-from .found import WALK, Calibration, FoundCamera
+from .found import Calibration, FoundCamera
 from .mapping import Mapper, Model, Pictures, lenses_found, map_pictures
 from .poses import every_pose, key_pictures
 from .stills import (
@@ -137,11 +137,9 @@ def calibrate_clips(
         models = _models(mapped, matches, options.seed, cache)
     method, model, other = chosen(models, mapped, matches)
     if model is None:
-        lost = tuple(_camera(each, each.clip.lens) for each in filmed)
-        return _split(
-            [camera.doubted(f"{camera.name} sees no background in common with the others.", WALK) for camera in lost],
-            clips, method, "arbitrary", progress,
-        )  # fmt: skip
+        helped = any(clip.kind == "walk" for clip in clips)
+        lost = [judged(_camera(each, each.clip.lens), helped=helped) for each in filmed]
+        return _split(lost, clips, method, "arbitrary", progress)
     with progress.stage("poses"):
         cameras, world = _placed(filmed, mapped, model, options, cache)
     agreed = agreement(model, other, mapped.of, len(filmed))
@@ -167,7 +165,8 @@ def calibrate_clips(
         )
         for v, camera in enumerate(cameras)
     ]
-    return _split(cameras, clips, method, "arbitrary" if options.distance is None else "metres", progress)
+    unit = "arbitrary" if options.distance is None else "metres"
+    return replace(_split(cameras, clips, method, unit, progress), points=world(model.points))
 
 
 def chosen(
@@ -204,7 +203,7 @@ def _filmed(clip: Clip, options: CalibrateOptions, count: int, cache: Cache) -> 
             "moves": np.array(True),
             "frames": np.array([picture.frame for picture in found]),
             "images": np.stack([picture.image for picture in found]),
-            "use": np.stack([picture.use for picture in found]),
+            "use": np.stack([picture.use for picture in found if picture.use is not None]),
         }
 
     constants = (STILL, STAYING, LOOKS, SAMPLES, RESIDUAL, SPARE, FLOW_SECONDS)
@@ -268,8 +267,9 @@ def _placed(
     if options.distance is not None:
         a, b, length = options.distance
         ends = [camera.w2c for name in (a, b) for camera in cameras if camera.name == name]
-        if len(ends) == 2 and all(w2c is not None and w2c.ndim == 2 for w2c in ends):
-            metres = (centres(ends[0]), centres(ends[1]), length)  # type: ignore[arg-type]
+        static = [w2c for w2c in ends if w2c is not None and w2c.ndim == 2]
+        if len(static) == 2:
+            metres = (centres(static[0]), centres(static[1]), length)
         else:
             raise ValueError(
                 f"--distance: expected two static cameras that were found; found {a} and {b} otherwise. Name others, "
@@ -290,7 +290,7 @@ def _split(
     kinds = {clip.name: clip.kind for clip in clips}
     scene = tuple(camera for camera in cameras if kinds[camera.name] == "scene")
     helpers = tuple(camera for camera in cameras if kinds[camera.name] != "scene")
-    return Calibration(scene, method, unit, helpers, dict(progress.seconds))
+    return Calibration(scene, method, unit, helpers, seconds=dict(progress.seconds))
 
 
 def _check_distance(options: CalibrateOptions, clips: Sequence[Clip]) -> None:

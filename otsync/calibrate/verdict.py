@@ -112,9 +112,7 @@ def support(
         most[va], most[vb] = max(most[va], len(uv)), max(most[vb], len(uv))
         if model is None or a not in at or b not in at or len(uv) < COUNTING:
             continue
-        one, two = (
-            Camera(found[v].K, model.w2c[at[p]], 1, 1, found[v].distortion) for v, p in ((va, a), (vb, b))
-        )
+        one, two = (Camera(found[v].K, model.w2c[at[p]], 1, 1, found[v].distortion) for v, p in ((va, a), (vb, b)))
         off = np.abs(sampson(fundamental(one, two), undistort(one, uv[:, :2]), undistort(two, uv[:, 2:])))
         good = int((off < OBEYS).sum())
         for v in (va, vb):
@@ -124,7 +122,14 @@ def support(
 
 
 def judged(
-    camera: FoundCamera, *, turn: float, move: float, whole: bool, checked: bool, health: float, helped: bool
+    camera: FoundCamera,
+    *,
+    turn: float = np.nan,
+    move: float = np.nan,
+    whole: bool = False,
+    checked: bool = False,
+    health: float = np.nan,
+    helped: bool = False,
 ) -> FoundCamera:
     """A camera with the reason to doubt it, where there is one.
 
@@ -135,7 +140,7 @@ def judged(
     """
     name, more = camera.name, "Film a longer and slower walk past all cameras." if helped else WALK
     if camera.w2c is None:
-        return camera.doubted(f"{name} sees too little background that another camera sees.", more)
+        return camera.doubted(f"{name} sees no background in common with the others, or too little of it.", more)
     if camera.inliers < FEW_INLIERS:
         camera = camera.doubted(f"{name} shares {camera.inliers} matches with its nearest picture, which is few.", more)
     if not np.isfinite(turn):
@@ -148,7 +153,9 @@ def judged(
             f"two mappers disagree on {name}: by {turn:.1f} degrees and {100 * move:.0f} % of its distance.", more
         )
     if health < HEALTHY:
-        camera = camera.doubted(f"{100 * (1 - health):.0f} % of the matches of {name} contradict where it stands.", more)
+        camera = camera.doubted(
+            f"{100 * (1 - health):.0f} % of the matches of {name} contradict where it stands.", more
+        )
     if camera.lens == "guessed":
         camera = camera.doubted(
             f"the focal length of {name} is a guess.",
@@ -160,9 +167,3 @@ def judged(
             "Move it more slowly, keep the scene's background in view, or give more key frames (--key-frames).",
         )
     return camera
-
-
-def lost_together(lost: Sequence[str]) -> str:
-    """The message about cameras without a pose."""
-    names = " and ".join([", ".join(lost[:-1]), lost[-1]] if len(lost) > 1 else lost)
-    return f"{names} {'see' if len(lost) > 1 else 'sees'} no background in common with the others."

@@ -66,6 +66,7 @@ def calibrate_folder(folder: Path, out: Path, options: CalibrateOptions, *, forc
     from ..calibrate.document import calibrated_document
     from ..files.arrays import write_json
     from ..files.cache import Cache
+    from ..report.cameras import write_cameras
 
     document = uncalibrated(folder)
     if has_poses(document) and not force:
@@ -76,6 +77,7 @@ def calibrate_folder(folder: Path, out: Path, options: CalibrateOptions, *, forc
     found = calibrate(folder, options, cache=Cache(out / "stages"), tell=tell)
     if found.found:
         write_json(folder / "scene.json", calibrated_document(document, found))
+    write_cameras(out / "calibration.html", found)
     return found
 
 
@@ -118,7 +120,9 @@ def camera_table(found: Calibration) -> str:
     """The cameras as text."""
     width = max(5, *(len(c.name) for c in found.cameras))
     unit = {"metres": "m", "arbitrary": "units"}[found.unit]
-    lines = [f"{'video':{width}}  {'focal':>7} {'lens':>7} {'turn':>8} {'place':>10} {'matches':>7} {'points':>6}  status"]
+    lines = [
+        f"{'video':{width}}  {'focal':>7} {'lens':>7} {'turn':>8} {'place':>10} {'matches':>7} {'points':>6}  status"
+    ]
     for c in found.cameras:
         turn = f"±{c.sigma_degrees:.2f}°" if c.sigma_degrees == c.sigma_degrees else "–"
         place = f"±{c.sigma_position:.3f} {unit}" if c.sigma_position == c.sigma_position else "–"
@@ -201,7 +205,7 @@ class Film:
         cameras = [(name, camera) for name, camera in zip(truth.names, truth.cameras, strict=True)]
         if truth.walk is not None:
             cameras.append(("walk", truth.walk))
-        videos = [
+        videos: list[dict[str, Any]] = [
             {
                 "name": name,
                 "file": f"{name}.mp4",

@@ -20,7 +20,6 @@ from ..types import Camera, Video
 from .working import WorkingFrames
 
 
-
 class EmptyHull(ValueError):
     """No place in space is foreground in enough views."""
 

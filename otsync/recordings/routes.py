@@ -39,6 +39,7 @@ from ..sync.verb import synchronize
 from ..types import Offsets, Status, TrackSet, Video
 from .kept_pairs import KeptPairs
 from .lift import depth_at
+from .placement import misplaced, with_doubts
 from .stages import Stages, with_labels, with_method
 from .tracking import pixel_tracks, track_labels
 
@@ -108,11 +109,13 @@ def synchronize_scene(
         with progress.stage("lift"):
             lifted = lift_given(scene, raw, stages, cache, map)
         with progress.stage("synchronise"):
-            offsets = pairs_in_space(lifted, reference, stages, cache, map)
+            offsets = with_doubts(pairs_in_space(lifted, reference, stages, cache, map), scene.doubtful)
         return Synchronized(without_times(offsets), tuple(lifted), chosen, why, None, progress.seconds)
     with progress.stage("epipolar"):
         flat = [select(video, r, stages, scene.frame) for video, r in zip(scene.videos, raw, strict=True)]
         first = without_times(pairs_in_pixels(flat, reference, stages, cache, map))
+        astray = misplaced(first) | set(scene.doubtful)
+        first = with_doubts(first, astray)
     epipolar = Synchronized(first, tuple(flat), "epipolar", why, None, progress.seconds)
     if chosen == "epipolar":
         return epipolar
@@ -140,7 +143,7 @@ def synchronize_scene(
         tell(doubt)
         return replace(epipolar, why=(*why, doubt))
     with progress.stage("synchronise"):
-        offsets = without_times(pairs_in_space(lifted, reference, stages, cache, map))
+        offsets = with_doubts(without_times(pairs_in_space(lifted, reference, stages, cache, map)), astray)
     if _flagged(offsets) > _flagged(first) and not named:
         doubt = "the lifted tracks leave more doubt than the pixels did: the epipolar answer stands"
         tell(doubt)

@@ -6,10 +6,10 @@ Nobody calibrated them and nobody pressed record at once: :func:`film` writes vi
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from jaxtyping import Float
@@ -165,21 +165,22 @@ def _clip(
     return Camera(K, w2c, *size)
 
 
-def write_video(path: str | os.PathLike[str], images: Sequence[np.ndarray] | object, fps: float, *, crf: int = 16) -> None:
+def write_video(path: str | os.PathLike[str], images: Iterable[np.ndarray], fps: float, *, crf: int = 16) -> None:
     """Write RGB images as H.264 in an MP4 file. ``crf``: x264's quality, 0 (lossless) to 51."""
     import av
 
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(path), "w") as container:
-        stream_: object = None
-        for image in images:  # type: ignore[attr-defined]
-            if stream_ is None:
-                stream_ = container.add_stream("libx264", rate=round(fps), options={"crf": str(crf), "threads": "1"})
-                stream_.height, stream_.width = image.shape[:2]
-                stream_.pix_fmt = "yuv420p"
-            container.mux(stream_.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
-        container.mux(stream_.encode())
+        video: Any = None
+        for image in images:
+            if video is None:
+                video = container.add_stream("libx264", rate=round(fps), options={"crf": str(crf), "threads": "1"})
+                video.height, video.width = image.shape[:2]
+                video.pix_fmt = "yuv420p"
+            container.mux(video.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        if video is not None:
+            container.mux(video.encode())
 
 
 def _stand(azimuth: float, height: float) -> Float[np.ndarray, " 3"]:

@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from ..types import Camera
 from .observation import stream
 
 TEXTURE = (1000, 800)
@@ -125,9 +124,7 @@ class RoomCamera:
         rays, image, depth = self._background(w2c)
         image, depth = image.copy(), depth.copy()
         moving = np.zeros(depth.shape, bool)
-        for b, (centre, radius) in enumerate(
-            zip(self.room.places(np.array([t]))[:, 0], self.room.radii, strict=True)
-        ):
+        for b, (centre, radius) in enumerate(zip(self.room.places(np.array([t]))[:, 0], self.room.radii, strict=True)):
             where, hit = self._ball(w2c, rays, image, depth, centre, float(radius), b)
             image[where][hit] = 0.55 * image[where][hit] + 0.45 * self.room.colours[b]
             moving[where] |= hit
@@ -226,8 +223,3 @@ def look_at(
     w2c = np.eye(4)
     w2c[:3, :3], w2c[:3, 3] = R, -R @ eye
     return w2c
-
-
-def camera_of(K: np.ndarray, w2c: np.ndarray, size: tuple[int, int]) -> Camera:
-    """The true camera, as a value."""
-    return Camera(K, w2c, *size)
