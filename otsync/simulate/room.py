@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -68,7 +69,6 @@ def draw_room(seed: int, *, things: int = 7, contrast: float = 1.0) -> Room:
         raise ValueError(
             f"things, contrast: expected at least 1, and a number from 0 to 1; found {things}, {contrast}."
         )
-    pictures = tuple(dead_leaves(stream(seed, "wall", n), contrast) for n in range(6))
     rng = stream(seed, "things")
     waves = [(f, rng.normal(size=(things, 1, 3)), rng.uniform(0, 2 * np.pi, (things, 1, 3))) for f in (0.4, 0.9, 1.7)]
     rest = 0.4 * rng.normal(size=(things, 1, 3))
@@ -79,7 +79,12 @@ def draw_room(seed: int, *, things: int = 7, contrast: float = 1.0) -> Room:
         return MIDDLE + 0.9 * np.tanh(path / 0.9) * [1, 0.8, 1]
 
     colours = stream(seed, "colours").integers(0, 2, (things, 3)) * 200.0 + 25
-    return Room(pictures, stream(seed, "radii").uniform(0.14, 0.24, things), colours, places)
+    return Room(_pictures(seed, contrast), stream(seed, "radii").uniform(0.14, 0.24, things), colours, places)
+
+
+@lru_cache(4)
+def _pictures(seed: int, contrast: float) -> tuple[UInt8[np.ndarray, "h w 3"], ...]:
+    return tuple(dead_leaves(stream(seed, "wall", n), contrast) for n in range(6))
 
 
 def dead_leaves(rng: np.random.Generator, contrast: float = 1.0) -> UInt8[np.ndarray, "h w 3"]:
