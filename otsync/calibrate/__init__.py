@@ -1,6 +1,7 @@
 """From a folder of videos that nobody calibrated to cameras. Needs the extra ``calibrate``.
 
 clips.py      which videos there are, and what is known of their lenses
+boards.py     lenses from clips of a checkerboard or a ChArUco board
 stills.py     backgrounds of static cameras, masked key frames of moving ones
 mapping.py    structure from motion by two mappers that check each other (pycolmap)
 poses.py      every frame of a moving camera (poselib)

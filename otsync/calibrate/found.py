@@ -69,7 +69,7 @@ class Calibration:
 
     Args:
         cameras: one a video, in the videos' order.
-        method: how they were found: "incremental", "global" or "board".
+        method: how they were found: "incremental" or "global": whose model it is.
         unit: "metres", or "arbitrary": then the median distance from a camera to where all look is 3.
         helpers: cameras of clips that only helped (walk.mp4), which belong to no scene.
         points: (M,3) of the background, in the world (z up).

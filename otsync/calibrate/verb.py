@@ -11,6 +11,7 @@ import numpy as np
 
 from ..files.cache import Cache
 from ..progress import Progress, Tell
+from .boards import Board, with_boards
 from .clips import Clip, Lens, read_clips
 from .found import Calibration, FoundCamera
 from .mapping import Mapper, Model, Pictures, lenses_found, map_pictures
@@ -47,6 +48,8 @@ class CalibrateOptions:
 
     intrinsics: Path | None = None
     """JSON with K and distortion by video, or another scene.json; held fixed. "*" stands for every video."""
+    board: str | None = None
+    """Which board clips called board... show: 9x6 (inner corners of a checkerboard) or 5x7:DICT_4X4_50 (ChArUco)."""
     distance: tuple[str, str, float] | None = None
     """Two videos of static cameras, and the metres between them: the scene is in metres."""
     key_frames: int = 24
@@ -59,6 +62,8 @@ class CalibrateOptions:
     def __post_init__(self) -> None:
         if self.key_frames < 2:
             raise ValueError(f"--key-frames: expected 2 and more; found {self.key_frames}.")
+        if self.board is not None:
+            Board.parse(self.board)
         if self.width < 160:
             raise ValueError(f"--width: expected 160 pixels and more; found {self.width}.")
         if self.seed < 0:
@@ -91,7 +96,8 @@ def calibrate(
 ) -> Calibration:
     """Find the cameras of a folder of videos.
 
-    Videos called ``walk...`` only help: a phone that is carried past all others. Static cameras are found by the median
+    Videos called ``walk...`` only help: a phone that is carried past all others. So do those called ``board...``, which
+    show a board to one lens or to all (see :mod:`otsync.calibrate.boards`). Static cameras are found by the median
     of their frames, moving ones by key frames without what moves, then frame by frame.
 
     Args:
@@ -103,7 +109,7 @@ def calibrate(
     """
     options, cache = options or CalibrateOptions(), cache or Cache()
     clips, _ = read_clips(folder, options.intrinsics)
-    clips = [clip for clip in clips if clip.kind != "board"]
+    clips = with_boards(clips, options.board, tell)
     return calibrate_clips(clips, options, cache=cache, tell=tell)
 
 

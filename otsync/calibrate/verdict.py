@@ -159,7 +159,7 @@ def judged(
     if camera.lens == "guessed":
         camera = camera.doubted(
             f"the focal length of {name} is a guess.",
-            "Give it by --intrinsics, film a board as board.mp4, or: " + WALK[0].lower() + WALK[1:],
+            "Give it by --intrinsics, film a board (board.mp4, --board), or: " + WALK[0].lower() + WALK[1:],
         )
     if camera.bridged > BRIDGED:
         camera = camera.doubted(

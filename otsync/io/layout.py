@@ -67,7 +67,7 @@ class CalibratedFile(Document, frozen=True, kw_only=True):
 class CalibrationFile(Document, frozen=True, kw_only=True):
     """What ``otsync calibrate`` found out, by video; videos without a camera too."""
 
-    method: Literal["incremental", "global", "board"]
+    method: Literal["incremental", "global"]
     unit: Literal["arbitrary", "metres"]
     cameras: Annotated[dict[Name, CalibratedFile], Meta(max_length=MAX_VIDEOS)]
 

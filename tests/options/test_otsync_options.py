@@ -614,6 +614,8 @@ def test_options_of_calibrate(phones, tmp_path):
     code, _, err = run(["calibrate", str(phones), "--out", str(out)])
     assert code == 2 and "--force" in err
     assert "calibration" in json.loads(calibrated("--force")[0])
+    code, _, err = run(["calibrate", str(phones), "--board", "9x6"])  # what it does is in test_boards.py
+    assert code == 2 and "--board" in err and "board.mp4" in err
     code, _, err = run(["calibrate", str(tmp_path / "nowhere")])
     assert code == 2 and "nowhere" in err
 
@@ -682,7 +684,7 @@ def rows() -> set[str]:
         "demo": "out motion preset videos seed",
         "simulate": "out motion preset videos frames fps max_offset own_frames seed",
         "film": "out phones gap handheld walk frames fps width height max_offset contrast seed",
-        "calibrate": "folder out force options.intrinsics options.distance options.key_frames options.width "
+        "calibrate": "folder out force options.intrinsics options.board options.distance options.key_frames options.width "
         "options.seed json",
         "init": "folder out reader fps force",
         "check": "scene every_frame allow_outside",
