@@ -241,6 +241,7 @@ def map_pictures(pictures: Pictures, mapper: Mapper, *, least: int, refine: bool
         shutil.copy(source, path)
         with opened(pycolmap, path) as database:
             folders = {image.camera_id: int(image.name[:4]) for image in database.read_all_images()}
+            given = {camera: np.array(database.read_camera(camera).params) for camera in folders}
         held = {camera for camera, v in folders.items() if not refine or pictures.lenses[v].known}
         make = _incremental if mapper == "incremental" else _global
         try:
@@ -252,6 +253,8 @@ def map_pictures(pictures: Pictures, mapper: Mapper, *, least: int, refine: bool
         best = max(found.values(), key=lambda r: (r.num_reg_images(), r.num_points3D()))
         if best.num_reg_images() < 2 or best.num_points3D() < thresholds.pose:
             return None
+        for camera in held & set(best.cameras):  # the global mapper refines all lenses or none
+            best.cameras[camera].params = given[camera]
         _adjust(pycolmap, best, held)
         return _model(best, pictures, folders)
 

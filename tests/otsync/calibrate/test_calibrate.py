@@ -105,6 +105,19 @@ def test_the_document_is_sound_and_names_every_camera(world, found, tmp_path):
     assert "4 of 4" in page and page.count("<svg") == 3
 
 
+@pytest.mark.slow
+def test_a_lens_that_is_given_is_held_while_the_others_are_found(world):
+    clips, poses, focal = world
+    known = replace(clips[0], lens=pinhole(focal["phone0"], SIZE, "given"))
+    some = calibrate_clips([known, *clips[1:]], OPTIONS)
+    assert some["phone0"].K[0, 0] == focal["phone0"] and some["phone0"].lens == "given"
+    assert some.ok and [some[f"phone{n}"].lens for n in (1, 2, 3)] == ["found"] * 3
+    moved = np.stack([some[f"phone{n}"].w2c for n in range(4)])
+    true = np.stack([poses[f"phone{n}"][0] for n in range(4)])
+    again = laid_over(moved, true).camera(moved)
+    assert degrees(again[:, :3, :3] @ np.swapaxes(true[:, :3, :3], 1, 2)).max() < 0.5
+
+
 def test_without_the_walk_far_cameras_are_refused_with_what_to_film(world, tmp_path):
     alone = calibrate_clips([clip for clip in world[0] if clip.kind == "scene"], replace(OPTIONS, width=300))
     assert not any(camera.ok for camera in alone.cameras)
