@@ -96,6 +96,9 @@ def prepared(path: Path, *, allow_outside: bool = False) -> int:
     document, _ = read_document(path)
     if all((video.get("camera") or {}).get("w2c") is not None for video in document["videos"]):
         return 0
+    clockless = [item for item in document.get("missing") or () if "fps" in item]
+    if clockless:
+        raise ValueError(f"{path}: still missing: {'; '.join(clockless)}. Give it first: otsync init {path} --fps 30.")
     tell(f"{path}: no scene.json and no cameras: looking for them (otsync calibrate {path})")
     with claimed(path / "calibration", "otsync calibrate") as out:
         found = calibrate_folder(path, out, CalibrateOptions())
