@@ -11,7 +11,7 @@ import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -36,6 +36,10 @@ PEAK = {"stills": 0.0005, "clips": 0.004}
 EDGE = {"stills": 40.0, "clips": 10.0}
 """Ratios of curvatures up to which a peak is none of an edge. Of stills larger: on the dome the matches of right pairs
 grew by half, those of wrong ones by a quarter."""
+
+
+LEAST_OF_A_HALF = 8
+"""Points that every picture must see when half of them are left out."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +75,8 @@ class Model:
         points: (M,3).
         seen: (O,2) indices into ``pictures`` and ``points``. uv: (O,2) pixels where the pictures see them.
         error: mean reprojection error in pixels.
+        halves: (2,P,4,4) the same poses adjusted to either half of the points alone: how far they lie apart tells how
+            sure the whole is. Empty where a half has too few points.
     """
 
     pictures: Int[np.ndarray, " P"]
@@ -81,6 +87,7 @@ class Model:
     seen: Int[np.ndarray, "O 2"]
     uv: Float[np.ndarray, "O 2"]
     error: float
+    halves: Float[np.ndarray, "2 P 4 4"] = field(default_factory=lambda: np.zeros((0, 0, 4, 4)))
 
     def arrays(self) -> dict[str, np.ndarray]:
         """For a cache."""
@@ -256,7 +263,7 @@ def map_pictures(pictures: Pictures, mapper: Mapper, *, least: int, refine: bool
         for camera in held & set(best.cameras):  # the global mapper refines all lenses or none
             best.cameras[camera].params = given[camera]
         _adjust(pycolmap, best, held)
-        return _model(best, pictures, folders)
+        return replace(_model(best, pictures, folders), halves=_halves(pycolmap, best, held, Path(work)))
 
 
 def _incremental(
@@ -321,6 +328,27 @@ def _adjust(pycolmap: Any, model: Any, held: set[int]) -> None:
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     pycolmap.create_default_bundle_adjuster(options, config, model).solve()
     model.update_point_3d_errors()
+
+
+def _halves(pycolmap: Any, model: Any, held: set[int], work: Path) -> Float[np.ndarray, "2 P 4 4"]:
+    """The poses of a model adjusted to every other of its points, and to the others."""
+    kept = work / "whole"
+    kept.mkdir()
+    model.write(kept)
+    found = []
+    for half in (0, 1):
+        part = pycolmap.Reconstruction(kept)
+        for point in sorted(part.points3D)[half::2]:
+            part.delete_point3D(point)
+        _adjust(pycolmap, part, held)
+        images = sorted((image.name, image) for image in part.images.values() if image.has_pose)
+        if any(sum(p.has_point3D() for p in image.points2D) < LEAST_OF_A_HALF for _, image in images):
+            return np.zeros((0, 0, 4, 4))
+        w2c = np.tile(np.eye(4), (len(images), 1, 1))
+        for n, (_, image) in enumerate(images):
+            w2c[n, :3] = image.cam_from_world().matrix()
+        found.append(w2c)
+    return np.stack(found)
 
 
 def _model(model: Any, pictures: Pictures, folders: Mapping[int, int]) -> Model:

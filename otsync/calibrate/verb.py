@@ -29,7 +29,7 @@ from .stills import (
     pictures_of,
     stands_still,
 )
-from .verdict import MOVING_PICTURES, agreement, judged, support
+from .verdict import MOVING_PICTURES, agreement, judged, spread, support
 from .world import Similar, centres, upright
 
 SHARED, FEWEST = 3, 8
@@ -152,6 +152,7 @@ def calibrate_clips(
     backed = support(model, matches, mapped.of, mapped.lenses)
     helped = any(clip.kind == "walk" for clip in clips)
     seen = mapped.of[model.pictures[model.seen[:, 0]]]
+    turns, moves = spread(model, mapped.of, len(filmed))
     size = float(np.median(np.linalg.norm(centres(world.camera(model.w2c)), axis=1)))
     cameras = [
         judged(
@@ -159,8 +160,8 @@ def calibrate_clips(
                 camera,
                 inliers=int(backed.nearest[v]),
                 points=len(np.unique(model.seen[seen == v, 1])),
-                sigma_degrees=float(agreed.turn[v]),
-                sigma_position=float(agreed.move[v]) * size,
+                sigma_degrees=float(np.hypot(turns[v], agreed.turn[v])),
+                sigma_position=float(np.hypot(world.scale * moves[v], agreed.move[v] * size)),
             ),
             turn=float(agreed.turn[v]),
             move=float(agreed.move[v]),
@@ -235,7 +236,7 @@ def _models(mapped: Pictures, matches: Matches, seed: int, cache: Cache) -> dict
                 model = map_pictures(mapped, mapper, least=least, refine=refine, seed=seed)
                 return {} if model is None else model.arrays()
 
-            arrays = cache.arrays("model", (mapped.key, mapped.thresholds, mapper, least, refine, seed), make)
+            arrays = cache.arrays("model", ("halves", mapped.key, mapped.thresholds, mapper, least, refine, seed), make)
             if arrays:
                 made.append(Model.of(arrays))
         models[mapper] = max(made, key=lambda m: support(m, matches, mapped.of, mapped.lenses).worth, default=None)

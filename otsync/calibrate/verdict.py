@@ -70,6 +70,30 @@ def agreement(one: Model, other: Model | None, of: np.ndarray, videos: int) -> A
     return Agreement(turn, move, agree >= 3 and 2 * agree > max(len(one.pictures), len(other.pictures)))
 
 
+def spread(model: Model, of: np.ndarray, videos: int) -> tuple[Float[np.ndarray, " V"], Float[np.ndarray, " V"]]:
+    """Standard deviations of every video's pose: degrees, and units of the model; nan where they are not known.
+
+    Poses from either half of the points differ by twice the standard deviation of those from all of them. Each video's is
+    the root of the mean square over its pictures, and no less than a third of that over all: two halves of one picture
+    may agree by chance.
+    """
+    turn, move = np.full(videos, np.nan), np.full(videos, np.nan)
+    if len(model.halves) != 2 or len(model.pictures) < 3:
+        return turn, move
+    a, b = model.halves
+    over = laid_over(a, b)
+    moved = over.camera(a)
+    scale = laid_over(b, model.w2c).scale
+    turns = degrees(moved[:, :3, :3] @ np.swapaxes(b[:, :3, :3], 1, 2)) / 2
+    moves = scale * np.linalg.norm(centres(moved) - centres(b), axis=1) / 2
+    video = of[model.pictures]
+    for values, out in ((turns, turn), (moves, move)):
+        least = float(np.sqrt(np.mean(values**2))) / 3
+        for v in set(video.tolist()):
+            out[v] = max(float(np.sqrt(np.mean(values[video == v] ** 2))), least)
+    return turn, move
+
+
 @dataclass(frozen=True, eq=False)
 class Support:
     """What the verified matches between videos say of a model.

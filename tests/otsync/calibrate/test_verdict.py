@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from otsync.calibrate.clips import pinhole
 from otsync.calibrate.found import WALK, FoundCamera
 from otsync.calibrate.mapping import Model
-from otsync.calibrate.verdict import FEW_INLIERS, agreement, judged, support
+from otsync.calibrate.verdict import FEW_INLIERS, agreement, judged, spread, support
+from otsync.calibrate.world import centres
 from tests.otsync.calibrate.test_world import similar
 from tests.recording_world import H, W, ring
 
@@ -81,6 +85,25 @@ def test_a_video_that_one_mapper_lacks_is_not_compared():
     assert np.isnan(found.turn[4]) and np.isfinite(found.turn[:4]).all()
     assert not agreement(model(w2c), None, np.arange(5), 5).whole
     assert not agreement(model(w2c[:2]), model(w2c[:2]), np.arange(5), 5).whole  # two can always be laid over
+
+
+def test_two_halves_tell_how_sure_the_whole_is():
+    """Poses from half of the points scatter by sqrt 2 of the whole's deviation each: they are drawn so here."""
+    w2c, rng, sigma, size = np.stack([c.w2c for c in ring(40)]), np.random.default_rng(0), 0.2, 0.02
+    halves = []
+    for world in (similar(0), similar(1)):
+        turned = w2c.copy()
+        for pose in turned:
+            vector = np.radians(np.sqrt(2) * sigma) * rng.normal(size=3) / np.sqrt(3)
+            place = centres(pose) + np.sqrt(2) * size * rng.normal(size=3) / np.sqrt(3)
+            pose[:3, :3] = Rotation.from_rotvec(vector).as_matrix() @ pose[:3, :3]
+            pose[:3, 3] = -pose[:3, :3] @ place
+        halves.append(world.camera(turned))
+    of = np.arange(40) // 4
+    turn, move = spread(replace(model(w2c), halves=np.stack(halves)), of, 10)
+    assert np.sqrt(np.mean(turn**2)) == pytest.approx(sigma, rel=0.25)
+    assert np.sqrt(np.mean(move**2)) == pytest.approx(size, rel=0.25)
+    assert np.isnan(spread(model(w2c), of, 10)[0]).all()
 
 
 def test_matches_tell_a_camera_in_a_wrong_place():
