@@ -99,7 +99,11 @@ def row(what: str, seed: int, found: Calibration, truth: dict[str, Camera], seco
     """One line of the table."""
     worst, focal = errors(found, truth)
     right = {name for name, (turn, place) in worst.items() if turn < RIGHT_TURN and place < RIGHT_PLACE}
-    good = sorted(right)
+
+    def most(values: list[float]) -> float | None:
+        """Of cameras that are right; None where none is."""
+        return round(max(values), 4) if values else None
+
     return {
         "what": what,
         "seed": seed,
@@ -108,9 +112,9 @@ def row(what: str, seed: int, found: Calibration, truth: dict[str, Camera], seco
         "right": len(right),
         "trusted": sum(camera.ok for camera in found.cameras),
         "wrong_unflagged": sum(c.ok and c.name not in right for c in found.cameras),
-        "degrees_max": round(max((worst[name][0] for name in good), default=float("nan")), 3),
-        "metres_max": round(max((worst[name][1] for name in good), default=float("nan")), 4),
-        "focal_max": round(max((focal[name] for name in good), default=float("nan")), 4),
+        "degrees_max": most([worst[name][0] for name in right]),
+        "metres_max": most([worst[name][1] for name in right]),
+        "focal_max": most([focal[name] for name in right]),
         "cpu_seconds": round(seconds),
     }
 
