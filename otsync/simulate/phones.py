@@ -21,6 +21,9 @@ from .room import MIDDLE, Room, RoomCamera, draw_room, look_at
 TARGET = MIDDLE + np.array([0.1, 0.05, 0.1])
 """Where phones on tripods look, m."""
 
+ONE = "threads=1:lookahead-threads=1:sliced-threads=0:rc-lookahead=0:mbtree=0:bframes=0"
+"""x264 on one thread, without a look ahead: the same images make the same bytes."""
+
 
 class Held(Protocol):
     """How a phone is held: poses at the times of its frames."""
@@ -175,9 +178,10 @@ def write_video(path: str | os.PathLike[str], images: Iterable[np.ndarray], fps:
         video: Any = None
         for image in images:
             if video is None:
-                video = container.add_stream("libx264", rate=round(fps), options={"crf": str(crf), "threads": "1"})
+                video = container.add_stream("libx264", rate=round(fps), options={"crf": str(crf), "x264-params": ONE})
                 video.height, video.width = image.shape[:2]
                 video.pix_fmt = "yuv420p"
+                video.codec_context.thread_count = 1
             container.mux(video.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
         if video is not None:
             container.mux(video.encode())
