@@ -74,7 +74,7 @@ class Progress:
     """Says what happens, remembers what the user should know, and times the stages.
 
     Args:
-        tell: receives one line a note and a stage.
+        tell: receives one line a note, and two a stage: as it begins and as it ends.
 
     ``notes``: what was noted, in order. ``seconds``: wall time per stage.
     """
@@ -92,7 +92,8 @@ class Progress:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Time what happens inside; times of the same name add up. Tells the total at the end."""
+        """Time what happens inside; times of the same name add up. Tells its beginning, and the total at its end."""
+        self.tell(f"{name} ...")
         started = time.perf_counter()
         yield
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - started

@@ -34,7 +34,7 @@ match align refine
 epipolar frames calibrate
 sync
 recordings
-report bench cli
+report export bench cli
 """
 """Floors of otsync, ground first: a folder (or file) knows what stands on floors below, and what ``BESIDE`` allows."""
 
@@ -59,7 +59,7 @@ BESIDE = {
         "priors": {"geometry"},
         "metrics": {"simulate"},
         "bench": {"report"},
-        "cli": {"report", "bench"},
+        "cli": {"report", "export", "bench"},
     },
     "recon": {
         "backdrop": {"fit"},

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -33,13 +34,43 @@ NEAR = 8 / 30
 LEAST_COMMON, LEAST_SEEN = 40 / 30, 8
 """Seconds that must be common, and moments at which both must be seen."""
 
+AS_GOOD = 1.05
+"""Distance of the tracks at another time, over that at the answer, below which that time is as good: carousels .4 to
+1.06, exact loops .9 to 1; presets mid 2 and more, hard 1.22, like people 1.29, brutal 1 to 1.22, real cameras 1.14 and
+more (24 pairs; 10 each of the others)."""
 
-def rival(a: TrackSet, b: TrackSet, matches: Matches, offset: float) -> float:
-    """The least distance of tracks to their nearest likely partners at any other offset, over that at ``offset``.
+AS_LITTLE_LEFT, LITTLE = 1.3, 0.02
+"""Times as much of the motion may be left unexplained at another time as at the answer, and a share beside it, if it is
+to suit as well. Left at the answer and at the best of the near times: carousels .00 and .01, exact loops .02 and .02 to
+.06 and .06, belts .00 and .02; noisy tracks that are near by chance .03 and .39 (mid), .07 and .14 (hard), .24 and 1.2
+(brutal). Seeds below 10."""
 
-    Distances are those of the nearest :data:`NEAREST` of the tracks in the better half of the matches: others may show
-    what the other video does not see. Positions are in one declared world frame; both sets have features. 1: another
-    time fits as well; inf: none is far enough to be tried.
+MOST_TRIED = 8
+"""Times whose motion is looked at, the nearest ones."""
+
+AT_ONCE = 2_000_000
+"""Pairs of samples that are compared at once."""
+
+
+@dataclass(frozen=True)
+class Rival:
+    """How well another time suits.
+
+    Args:
+        ratio: the least distance of tracks to their nearest likely partners at any other offset, over that at the
+            answer. 1: they are as near; inf: no offset is far enough to be tried.
+        as_good: whether there is an offset at which they are as near and move alike, too.
+    """
+
+    ratio: float
+    as_good: bool
+
+
+def rival(a: TrackSet, b: TrackSet, matches: Matches, offset: float) -> Rival:
+    """How well any other offset suits the tracks of the better half of the matches that move.
+
+    Distances are those of the nearest :data:`NEAREST` of the tracks: others may show what the other video does not see.
+    Positions are in one declared world frame; both sets have features.
     """
     some = np.unique(matches.best(max((len(matches) + 1) // 2, FEWEST)).pairs[:, 0])
     with np.errstate(invalid="ignore"), warnings.catch_warnings():
@@ -53,13 +84,25 @@ def rival(a: TrackSet, b: TrackSet, matches: Matches, offset: float) -> float:
     xa, xb = a.positions()[some], b.positions()
     here = _distance(xa, xb, a.times, b.times, likely, offset)
     steps = np.arange(math.ceil(NEAR / STEP), round(REACH / STEP) + 1)
-    others = [
-        _distance(xa, xb, a.times, b.times, likely, offset + s * k * STEP) for k in steps.tolist() for s in (-1, 1)
-    ]
-    known = [d for d in others if math.isfinite(d)]
-    if not known or not here > 0:
-        return math.inf
-    return min(known) / here
+    others = offset + STEP * np.concatenate([-steps, steps])
+    apart = np.array([_distance(xa, xb, a.times, b.times, likely, at) for at in others])
+    if not np.isfinite(apart).any() or not here > 0:
+        return Rival(math.inf, False)
+    ratio = apart / here
+    near = [at for at, r in sorted(zip(others, ratio, strict=True), key=lambda x: x[1]) if r < AS_GOOD][:MOST_TRIED]
+    allowed = AS_LITTLE_LEFT * _left(xa, xb, a.times, b.times, offset) + LITTLE if near else 0.0
+    # a share that nobody can tell (nan) speaks for nobody: the time counts as good
+    as_good = any(not _left(xa, xb, a.times, b.times, at) > allowed for at in near)
+    return Rival(float(np.nanmin(ratio)), as_good)
+
+
+def _common_moments(ta: np.ndarray, tb: np.ndarray, offset: float) -> tuple[np.ndarray, np.ndarray] | None:
+    """Moments that both videos have at an offset, as indices into each; None where too little is common."""
+    at = np.flatnonzero((ta - offset >= tb[0]) & (ta - offset <= tb[-1]))
+    if not len(at) or ta[at[-1]] - ta[at[0]] < LEAST_COMMON:
+        return None
+    at = at[evenly(len(at), MOMENTS)]
+    return at, np.abs(np.interp(ta[at] - offset, tb, np.arange(len(tb)))).round().astype(np.int64)
 
 
 def _distance(
@@ -68,16 +111,49 @@ def _distance(
     """Rms distance of a's tracks to the nearest of their likely partners, the quantile :data:`NEAREST` of the tracks;
     nan where too little is common.
     """
-    at = np.flatnonzero((ta - offset >= tb[0]) & (ta - offset <= tb[-1]))
-    if not len(at) or ta[at[-1]] - ta[at[0]] < LEAST_COMMON:
+    common = _common_moments(ta, tb, offset)
+    if common is None:
         return math.nan
-    at = at[evenly(len(at), MOMENTS)]
-    with_b = np.abs(np.interp(ta[at] - offset, tb, np.arange(len(tb)))).round().astype(np.int64)
-    apart = xa[:, None, at] - xb[:, with_b][likely]
-    square = (apart**2).sum(3)
-    seen = np.isfinite(square)
-    count = seen.sum(2)
-    rms = np.sqrt(np.where(seen, square, 0.0).sum(2) / np.maximum(count, 1))
-    nearest = np.where(count >= LEAST_SEEN, rms, np.inf).min(1)
+    at, with_b = common
+    nearest = np.sqrt(_mean_square(xa[:, None, at] - xb[:, with_b][likely])).min(1)
     known = nearest[np.isfinite(nearest)]
     return float(np.quantile(known, NEAREST)) if len(known) >= LEAST_SEEN else math.nan
+
+
+def _mean_square(x: np.ndarray, axis: int = 2) -> np.ndarray:
+    """Of vectors over the moments of an axis that are seen; inf where these are fewer than :data:`LEAST_SEEN`."""
+    square = (x**2).sum(-1)
+    seen = np.isfinite(square)
+    count = seen.sum(axis)
+    return np.where(count >= LEAST_SEEN, np.where(seen, square, 0.0).sum(axis) / np.maximum(count, 1), np.inf)
+
+
+def _left(xa: np.ndarray, xb: np.ndarray, ta: np.ndarray, tb: np.ndarray, offset: float) -> float:
+    """Share of the motion of a's tracks and of their nearest partners that the two do not have in common; nan where too
+    little is common. All tracks may be partners: features that are noise leave out the right ones.
+    """
+    common = _common_moments(ta, tb, offset)
+    if common is None:
+        return math.nan
+    at, with_b = common
+    a, b = xa[:, at], xb[:, with_b]
+    rows = max(1, AT_ONCE // max(b.shape[0] * b.shape[1], 1))
+    parts = [_mean_square(a[i : i + rows, None] - b) for i in range(0, len(a), rows)]
+    apart = np.concatenate(parts)
+    partner = apart.argmin(1)
+    known = np.isfinite(apart[np.arange(len(a)), partner])
+    if known.sum() < LEAST_SEEN:
+        return math.nan
+    u, v = a[known], b[partner[known]]
+    seen = np.isfinite(u[..., 0]) & np.isfinite(v[..., 0])
+    power, left = (float(_variance(x, seen)) for x in (np.concatenate([u, v], -1), u - v))
+    return left / power if power > 0 else math.nan
+
+
+def _variance(x: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Of every track over the moments that are seen, summed over coordinates and tracks."""
+    count = np.maximum(seen.sum(1), 1)
+    filled = np.where(seen[..., None], x, 0.0)
+    mean = filled.sum(1) / count[:, None]
+    apart = np.where(seen[..., None], x - mean[:, None], 0.0)
+    return np.asarray(((apart**2).sum((1, 2)) / count).sum())

@@ -32,11 +32,6 @@ more of the one and less of the other is how a calibration or a tracker drifts, 
 m over a static scene: share .96 to .997, size .02 to .1; the moving classes, all presets: a share of .8 is reached with
 sizes of .6 and more (a box that flies), sizes below .3 with shares of .1 to .55."""
 
-RIVAL = 1.05
-"""Distance of the tracks at another time, over that at the answer, below which that time is as good: carousels .4 to
-1.06, exact loops .9 to 1; presets mid 2 and more, hard 1.22, like people 1.29, brutal 1 to 1.22, real cameras 1.14 and
-more (24 pairs; 10 each of the others)."""
-
 LOOKS, ENOUGH = 30, 6
 """Moments at which the common motion is taken, and tracks that must be seen at one."""
 
@@ -78,8 +73,9 @@ def vouch(alignment: Alignment, a: TrackSet, b: TrackSet, matches: Matches, alig
             flags.append(Status.AMBIGUOUS)
         told = {"apart": distance}
         if a.features is not None and b.features is not None:
-            told["rival"] = rival(a, b, matches, alignment.offset)
-            if told["rival"] < RIVAL:
+            other = rival(a, b, matches, alignment.offset)
+            told |= {"rival": other.ratio, "rival_as_good": float(other.as_good)}
+            if other.as_good:
                 flags.append(Status.AMBIGUOUS)
         alignment = replace(alignment, stats=alignment.stats | told)
     return replace(alignment, flags=in_order(flags))

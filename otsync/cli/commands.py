@@ -14,6 +14,7 @@ OWN = {
     "calibrate": "otsync.cli.calibrate:Calibrate",
     "check": "otsync.cli.recordings:Check",
     "sync": "otsync.cli.sync:Sync",
+    "export": "otsync.cli.export:Export",
     "bench": "otsync.cli.bench:Bench",
     "plugins": "otsync.cli.plugins:Plugins",
 }

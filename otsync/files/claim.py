@@ -31,6 +31,7 @@ MARKS = {
 
 OF_A_RESULT = frozenset(name for command in ("otsync run", "recon fit", "otsync sync") for name in MARKS[command]) | {
     "metrics.json",
+    "strips.npz",
     "report.html",
     "sync.html",
 }

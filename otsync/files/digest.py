@@ -44,8 +44,8 @@ def _feed(digest: hashlib.blake2b, x: Any, inside: tuple[int, ...]) -> None:
     """Add ``x``; inside: ids of the objects that hold it, from the outermost on."""
     if type(x) in PLAIN:
         return _say(digest, x)
-    torch = sys.modules.get("torch")  # whoever has a tensor has loaded it
-    if torch is not None and isinstance(x, torch.Tensor):
+    torch = sys.modules.get("torch")  # whoever has a tensor has loaded it; another thread may be loading it just now
+    if torch is not None and hasattr(torch, "Tensor") and isinstance(x, torch.Tensor):
         _say(digest, "tensor", str(x.dtype), tuple(x.shape))
         x = x.detach().cpu().reshape(-1).view(torch.uint8).numpy()  # numpy does not know all of torch's numbers
     if isinstance(x, np.ndarray) and not x.dtype.hasobject:

@@ -50,9 +50,12 @@ def clock_bars(offsets: Offsets, clips: Sequence[tuple[float, float]]) -> str:
 def pair_figure(
     pair: Alignment, cost: np.ndarray | None, path: np.ndarray | None, origin: float, truth: float | None
 ) -> str:
-    """Left: the frame-to-frame cost with the warping path and the chosen offset. Right: the score over offsets."""
-    figure, (left, right) = axes_of(7.2, 2.5, 2)
-    if cost is not None:
+    """Left: the frame-to-frame cost with the warping path and the chosen offset; nothing where there is no cost.
+    Right: the score over offsets."""
+    if cost is None:
+        figure, right = axes_of(7.2, 2.2)
+    else:
+        figure, (left, right) = axes_of(7.2, 2.5, 2)
         step = max(1, -(-max(cost.shape) // MAP_PIXELS))
         extent = (-0.5, cost.shape[1] - 0.5, cost.shape[0] - 0.5, -0.5)
         known = cost[np.isfinite(cost)]
@@ -68,9 +71,9 @@ def pair_figure(
         left.set(
             xlim=(-0.5, cost.shape[1] - 0.5), ylim=(cost.shape[0] - 0.5, -0.5), xlabel="frame of b", ylabel="frame of a"
         )
-        left.legend(fontsize=6, loc="lower right")
-    else:
-        left.set_axis_off()
+        left.legend(
+            fontsize=6, loc="lower left", bbox_to_anchor=(0, 1), ncols=3, facecolor="#31363f", labelcolor="white"
+        )
     if pair.curve is not None and len(pair.curve):
         draw_score(right, pair)
         draw_choice(right, pair, truth)

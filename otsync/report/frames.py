@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..types.drawing import clips_of
 from .figures import effort
 from .page import write_report
 
@@ -39,6 +40,7 @@ def write_recording_report(
         truth=truth,
         title="Synchronisation of a recording",
         extra=sections(scene, answer, truth),
+        clips=clips_of(scene.videos, len(scene.videos)),
     )
 
 

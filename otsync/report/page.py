@@ -11,7 +11,7 @@ import numpy as np
 
 from ..files.arrays import atomic_write
 from ..types import Alignment, Matches, Offsets, Status, TrackSet
-from ..types.drawing import clips_of
+from ..types.drawing import clips_of, judged
 from ..types.similarity import IDENTITY
 from . import figures
 
@@ -36,6 +36,7 @@ def write_report(
     truth: Sequence[float] | None = None,
     title: str = "Synchronisation report",
     extra: str = "",
+    clips: Sequence[tuple[float, float]] | None = None,
 ) -> None:
     """Write the report page, atomically.
 
@@ -44,6 +45,7 @@ def write_report(
         tracks: what they were made from; with it the page shows cost maps and DTW paths.
         truth: true offsets in seconds on the reference's clock, for simulated worlds.
         extra: further sections as HTML, after the graph (a recording's pictures).
+        clips: first second and duration of every video on its own clock; default: those of the tracks.
     """
     page = [
         f"<h1>{escape(title)}</h1>",
@@ -54,7 +56,7 @@ def write_report(
         "<p class=s>A positive offset means that the video started later than its reference. "
         "t<sub>world</sub> = rate · t<sub>video</sub> + offset.</p>",
         "<h2>On the common clock</h2>",
-        figures.clock_bars(offsets, clips_of(tracks, len(offsets))),
+        figures.clock_bars(offsets, clips_of(tracks, len(offsets)) if clips is None else clips),
         _remedies(offsets),
         _graph(offsets),
         extra,
@@ -80,25 +82,24 @@ def write_page(path: str | os.PathLike[str], title: str, parts: Sequence[str]) -
 
 
 def _verdict(offsets: Offsets) -> str:
-    trusted = sum(s.ok for s in offsets.status)
-    answered = int(np.isfinite(offsets.seconds).sum())
-    text = f"<b>{trusted} of {len(offsets)} videos are to be trusted"
-    text += (
-        ""
-        if trusted == len(offsets)
-        else f"; {answered - trusted} answers are doubtful, {len(offsets) - answered} missing"
-    )
+    trusted, count = judged(offsets)
+    missing = int((~np.isfinite(offsets.seconds)).sum())
+    text = f"<b>{trusted} of {count} offsets {'is' if count == 1 else 'are'} to be trusted"
+    if trusted < count:
+        text += f"; {count - missing - trusted} doubtful, {missing} missing"
     return text + f".</b> The clock is that of <b>{escape(offsets.names[offsets.reference])}</b>."
 
 
 def _offset_table(offsets: Offsets, truth: Sequence[float] | None) -> str:
-    head = ["<th>video", "<th>offset, frames", "<th>± sigma", "<th>offset, s", "<th>rate"]
+    head = ["<th>video", "<th class=t>status", "<th>offset, frames", "<th>± sigma", "<th>offset, s", "<th>rate"]
     head += ["<th>true, frames", "<th>error"] if truth is not None else []
     rows = []
     for v, name in enumerate(offsets.names):
         fps = offsets.fps[offsets.component[v]]
+        status = "reference" if v == offsets.reference else status_words(offsets.status[v], offsets.flags[v])
         cells = [
             f"<td>{escape(name)}",
+            f"<td class=t>{status}",
             f"<td>{number(offsets.frames[v], 3)}",
             f"<td>{number(offsets.sigma[v] * fps, 3)}",
             f"<td>{number(offsets.seconds[v], 5)}",
@@ -106,10 +107,10 @@ def _offset_table(offsets: Offsets, truth: Sequence[float] | None) -> str:
         ]
         if truth is not None:
             cells += [f"<td>{number(truth[v] * fps, 3)}", f"<td>{number((offsets.seconds[v] - truth[v]) * fps, 3)}"]
-        rows.append("<tr>" + "".join(cells) + f"<td class=t>{status_words(offsets.status[v], offsets.flags[v])}")
+        rows.append("<tr>" + "".join(cells))
     notes = "".join(f"<li>{escape(note)}" for note in offsets.clock_notes())
     told = f"<ul>{notes}</ul>" if notes else ""
-    return f"<div class=scroll><table><tr>{''.join(head)}<th class=t>status{''.join(rows)}</table></div>{told}"
+    return f"<div class=scroll><table><tr>{''.join(head)}{''.join(rows)}</table></div>{told}"
 
 
 def _frames_table(offsets: Offsets) -> str:

@@ -43,14 +43,20 @@ MOVING, RESTING = 0.6, 0.4
 SEARCH = 2.0
 """Seconds around a break's coarse place in which it is looked for, at most, beside :data:`AROUND`."""
 
-ENOUGH = 15
-"""Frames that tell where a match's own constant difference lies."""
+ENOUGH, LEAST_BESIDE = 15, 4
+"""Frames that tell where a match's own constant difference lies; and that are asked beside a break, at least."""
 
 BACK = 1.5
 """Seconds that a video must go back by to be taken for cut; less is lost frames."""
 
 SNAP = 0.3
 """Frames within which the length of a freeze is a whole number of frames."""
+
+BESIDE, OFF, OTHERS = 0.45, 1.5 / 30, 10 / 30
+"""Seconds on either side of a mended break in which no offset that differs by more than :data:`OFF` s, of those within
+:data:`OTHERS`, may suit the positions better than the answer. Beside freezes, lost frames and cuts one within a frame
+of the answer is the best (46 worlds of mid noise); beside a slow motion that is taken for lost frames one that is 2 to
+7 frames off (10 of 10)."""
 
 MOST = 4
 """Breaks that are mended, at most."""
@@ -209,12 +215,16 @@ def _suits(a: Raw, b: Raw, offset: float, t: np.ndarray, inside: np.ndarray) -> 
 
     Every match has a constant difference of its own, its median ``inside`` (S,) the part where the offset holds.
     """
-    apart = a.at(t) - b.at(t - offset)
+    return _agreement(a.at(t) - b.at(t - offset), inside)
+
+
+def _agreement(apart: np.ndarray, inside: np.ndarray) -> np.ndarray:
+    """(S,) how well positions agree, from the differences (M,S,3) of matched tracks: see :func:`_suits`."""
     seen = np.isfinite(apart[..., 0])
     known = seen & inside
     use = known.sum(1) >= 5
     if not use.any():
-        return np.zeros(len(t))
+        return np.zeros(apart.shape[1])
     apart, seen, known = apart[use], seen[use], known[use]
     middle = np.nanmedian(np.where(known[..., None], apart, np.nan), 1)
     off = np.where(seen, ((apart - middle[:, None]) ** 2).sum(2), 0.0)
@@ -284,3 +294,37 @@ def remeasured(answer: Answer, a: TrackSet, b: TrackSet, moment: float) -> tuple
         return 0.0, math.nan
     sigma = math.hypot(*(math.sqrt(float(f.covariance[0, 0])) for f in (one, two)))
     return two.clock.offset - one.clock.offset, sigma
+
+
+def runs_on(answer: Answer, a: TrackSet, b: TrackSet, before: float, behind: float) -> bool:
+    """Whether a mended clock has the answer's offset right beside the break: one that changed its speed has not.
+
+    Args:
+        before, behind: the moments on a's clock up to which the first part goes, and from which on the second one does.
+    """
+    pairs = strongest(answer.matches, LIMIT).pairs
+    raw = Raw.of(a, pairs[:, 0]), Raw.of(b, pairs[:, 1])
+    clock = Clock(answer.refined.offset, answer.refined.rate)
+    first, last = clock.world(float(b.times[0])), clock.world(float(b.times[-1]))
+    t = a.times[(a.times >= first) & (a.times <= last)]
+    away = (t < before - BESIDE) | (t > behind + BESIDE)
+    if away.sum() < ENOUGH:
+        return True  # nothing tells how well the positions agree elsewhere
+    steps = np.arange(-round(OTHERS * 30), round(OTHERS * 30) + 1) / 30
+    for low, high in ((before - BESIDE, before - MARGIN), (behind + MARGIN, behind + BESIDE)):
+        near = (t >= low) & (t <= high)
+        if near.sum() < LEAST_BESIDE:
+            continue
+        suits = [_level(*raw, clock, s, t[away], t[near]) for s in steps]
+        if abs(steps[int(np.argmax(suits))]) > OFF:
+            return False
+    return True
+
+
+def _level(a: Raw, b: Raw, clock: Clock, late: float, known: np.ndarray, asked: np.ndarray) -> float:
+    """How well positions agree at the moments ``asked`` of a's clock and an offset that is larger by ``late`` s, where
+    the differences at ``known`` moments, at the clock's own offset, are what is usual: see :func:`_suits`.
+    """
+    times = np.concatenate([known, asked])
+    at_b = np.concatenate([clock.own(known), clock.own(asked - late)])
+    return float(_agreement(a.at(times) - b.at(at_b), np.arange(len(times)) < len(known))[len(known) :].mean())

@@ -107,7 +107,8 @@ def _adjacency(n: int, edges: Sequence[Edge] | Sequence[Pair], weight: Any = Non
     """The graph as scipy's sparse matrix; weights must not be 0, which would be no edge."""
     from scipy.sparse import coo_array
 
-    ends = np.array([(e.a, e.b) if isinstance(e, Edge) else e for e in edges], int).reshape(-1, 2)
+    # int32: older trees of scipy take no other index
+    ends = np.array([(e.a, e.b) if isinstance(e, Edge) else e for e in edges], np.int32).reshape(-1, 2)
     values = np.ones(len(ends)) if weight is None else np.asarray(weight, float)
     return coo_array((values, (ends[:, 0], ends[:, 1])), shape=(n, n)).tocsr()
 

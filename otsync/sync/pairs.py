@@ -26,8 +26,8 @@ DOUBTS = frozenset({Status.NO_MATCH, Status.AMBIGUOUS})
 """Doubts about matches: the pair's answer carries them, so that nobody trusts it, and is there to be looked at."""
 
 
-PLACED, CLEAR = 1.05, 40.0
-"""How much further apart the tracks must be at any other time, and nats a match, that answer a doubt about features."""
+CLEAR = 40.0
+"""Nats a match that answer a doubt about features."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +73,7 @@ def without_answered_doubt(refined: Alignment) -> Alignment:
     tracks are at one place at the answer, and that no other time suits them as well, is the stronger evidence.
     """
     stats = refined.stats
-    placed = stats.get("rival", 0.0) > PLACED and stats.get("apart", math.inf) < 1.0
+    placed = stats.get("rival_as_good") == 0.0 and stats.get("apart", math.inf) < 1.0
     told = placed and stats.get("evidence", 0.0) > CLEAR
     if refined.flags == (Status.NO_MATCH,) and told:
         return dataclasses.replace(refined, flags=())

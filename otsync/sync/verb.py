@@ -17,14 +17,16 @@ from ..compute.threads import MapLike
 from ..costs.epipolar import EpipolarDistance
 from ..costs.linear import Cosine
 from ..costs.positions import SynchronousDistance
+from ..epipolar.scan import EpipolarScan
+from ..epipolar.steady import unsteady
 from ..frames import OwnFrames
 from ..match.slot import Matcher, MatcherLike
 from ..match.synchronous import SynchronousMatching
 from ..match.unbalanced import UnbalancedOT
 from ..refine.slot import Rate, Refiner, RefinerLike
 from ..refine.splines import SplineRefine
-from ..types import Alignment, Break, Clock, Matches, Offsets, Status, TrackSet
-from .breaks import MOST, culprit, mended, remeasured, suspects
+from ..types import Alignment, Break, Clock, Matches, Offsets, Status, TrackSet, in_order
+from .breaks import MOST, culprit, mended, remeasured, runs_on, suspects
 from .graph import Graph, Pair
 from .method import Method, with_costs
 from .own_frames import Frames, refuse_common, solver_from, synchronize_own
@@ -119,6 +121,11 @@ def synchronize(
             break
         fresh = {answer.pair: answer for answer in map(run, again)}
         verdict = judged([_still_broken(fresh.get(a.pair, a), a) for a in verdict.answers])
+    if isinstance(aligning, EpipolarScan):
+        sound = {a.pair: a.matches for a in verdict.answers if a.sound}
+        breaking = set(unsteady(aligning, tracks, sound, verdict.x))
+        if breaking:
+            verdict = judged([_doubted(a) if breaking & set(a.pair) else a for a in verdict.answers])
     return to_offsets(original, verdict, time.perf_counter() - started, broken)
 
 
@@ -126,9 +133,7 @@ def _still_broken(fresh: Answer, first: Answer) -> Answer:
     """Matches that were made at one offset agree with it: they do not lift the doubt whether there is only one."""
     if Status.BROKEN_CLOCK not in first.refined.flags:
         return fresh
-    return dataclasses.replace(
-        fresh, refined=dataclasses.replace(fresh.refined, flags=(*fresh.refined.flags, Status.BROKEN_CLOCK))
-    )
+    return _doubted(fresh)
 
 
 def mend_clocks(
@@ -143,6 +148,7 @@ def mend_clocks(
     ``tracks`` is changed in place. A mend is kept where it adds to the evidence of the video's pairs.
     """
     broken: dict[int, tuple[Break, ...]] = {}
+    unsteady: set[int] = set()
     fps = [nominal_fps(t) for t in tracks]
     for _ in range(MOST):
         doubtful = [a for a in verdict.answers if len(a.scanned.parts) and not NOTHING_COMMON & set(a.scanned.flags)]
@@ -158,7 +164,33 @@ def mend_clocks(
         earlier = broken.get(v, ())
         broken[v] = (*earlier, _on_own_clock(exact, earlier))
         verdict = judged([fresh.get(a.pair, a) for a in verdict.answers])
+        if not steady_beside(fresh, tracks, v, exact):
+            unsteady.add(v)
+    if unsteady:
+        verdict = judged([_doubted(a) if unsteady & set(a.pair) else a for a in verdict.answers])
     return jobs, verdict, broken
+
+
+def _doubted(answer: Answer) -> Answer:
+    """The answer with the flag of a clock that breaks otherwise than it was mended."""
+    refined = answer.refined
+    return dataclasses.replace(
+        answer, refined=dataclasses.replace(refined, flags=in_order((*refined.flags, Status.BROKEN_CLOCK)))
+    )
+
+
+def steady_beside(fresh: Mapping[Pair, Answer], tracks: Sequence[TrackSet], v: int, found: Break) -> bool:
+    """Whether most pairs of video v agree that its mended clock runs evenly up to the break and from it on."""
+    told = []
+    for (i, j), answer in fresh.items():
+        if not np.isfinite(answer.refined.offset) or not answer.sound:
+            continue
+        shown = found.at + found.jump
+        moments = (shown if found.still > 0 else found.at), shown
+        clock = Clock(answer.refined.offset, answer.refined.rate)
+        before, behind = moments if v == i else (clock.world(m) for m in moments)
+        told.append(runs_on(answer, tracks[i], tracks[j], before, behind))
+    return 2 * sum(told) >= len(told)
 
 
 def with_break(

@@ -60,8 +60,14 @@ def offsets_line(o: Any) -> str:
         for name, frames in zip(o.names[:SHOWN], o.frames, strict=False)
     ]
     more = [f"{len(o) - SHOWN} more"] if len(o) > SHOWN else []
-    trusted = sum(status.ok for status in o.status)
-    return f"Offsets(frames: {', '.join([*shown, *more])}; {trusted} of {len(o)} to be trusted)"
+    trusted, count = judged(o)
+    return f"Offsets(frames: {', '.join([*shown, *more])}; {trusted} of {count} to be trusted)"
+
+
+def judged(o: Any) -> tuple[int, int]:
+    """How many offsets are to be trusted, and of how many: the reference's own is none."""
+    others = [status.ok for v, status in enumerate(o.status) if v != o.reference]
+    return sum(others), len(others)
 
 
 def table(caption: str, head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

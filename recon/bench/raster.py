@@ -29,12 +29,10 @@ from otsync.files.arrays import atomic_write, read_json
 from otsync.progress import counted, say
 from recon.raster import Rendering, render, warmup
 
-# Torch's OpenMP threads would spin for a while after each operation and take the cores from the kernels that follow.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-
 SIZES = ((128, 96, 2_000), (160, 120, 5_000), (320, 180, 20_000), (640, 360, 100_000))  # width, height, Gaussians
 TOLERANCE = 0.35  # of the baseline's ratio: what a busy machine may cost before the gate closes
 LEAST_RATIO = {3: 15.0, 32: 8.0}  # times the torch back end, by channels: the floor whatever the baseline
+SETTLE = 0.01  # seconds before each measurement: torch's threads spin for a while after work, on other threads' cores
 FLOPS_PER_PAIR = (30, 6)  # of a splat at a pixel, forward and backward: fixed part, and part per channel
 
 
@@ -176,6 +174,7 @@ def measure(size: tuple[int, int, int], channels: int, repeats: int, names: Sequ
         for name, case in cases.items():
             # the torch back end is measured a third as often: it takes most of the time of a run
             if name != "torch" or r % 3 == 0:
+                time.sleep(SETTLE)
                 times[name].append(case.both())
     truth = cases["torch"].forward()
     pairs = splats_per_pixel(tensors, width, height) * width * height

@@ -7,24 +7,25 @@ interrupted: the same command continues where it stopped.
 
 from __future__ import annotations
 
-import sys
+from contextlib import suppress
 
-from otsync.cli.shell import missing_package, run_command
+from otsync.cli.shell import run_command
 from recon.cli.commands import commands
 
 
 def main(args: list[str] | None = None) -> int:
     """Entry point of the ``recon`` command."""
-    try:
+    refused: tuple[type[Exception], ...] = (FloatingPointError,)
+    # without torch the commands say what to install; the help and the version need none
+    with suppress(ModuleNotFoundError):
         from recon.fit.run import Diverged
-    except ModuleNotFoundError as error:  # torch, most likely
-        print(f"recon: {missing_package(error)}", file=sys.stderr)
-        return 2
+
+        refused = (Diverged, FloatingPointError)
     return run_command(
         "recon",
         commands,
         args,
         description=__doc__ or "",
-        refused=(Diverged, FloatingPointError),
+        refused=refused,
         interrupted="the same command continues from here.",
     )

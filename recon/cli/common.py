@@ -77,6 +77,7 @@ def reconstructed(
     from otsync.types import Offsets
     from recon.pipeline.verb import reconstruct
     from recon.result.folder import metrics_of
+    from recon.result.page import SCENE_PAGE
 
     if workers < 0:
         raise ValueError(f"--workers: expected 0 (one per core) or more; found {workers}.")
@@ -95,7 +96,8 @@ def reconstructed(
             progress=progress or Progress(tell),
             deadline=deadline,
         )
-    wrote = f"wrote {out / 'scene.npz'}, {out / 'offsets.json'}, {out / 'metrics.json'} and {out / 'report.html'}"
+    parts = [out / name for name in ("scene.npz", "offsets.json", "metrics.json", "report.html")]
+    wrote = f"wrote {', '.join(map(str, parts))} and {out / SCENE_PAGE}, which plays the scene in a browser"
     doubtful = [n for n, s in zip(outcome.coarse.names, outcome.coarse.status, strict=True) if not s.ok]
     if as_json:
         figures = metrics_of(outcome.views, outcome.fitted.stats, outcome.lpips_reason)

@@ -178,12 +178,15 @@ class Export:
     Every frame: recon export result --format ply-sequence --out sequence
 
     Dense trajectories: recon export result --format tracks --out tracks.npz
+
+    To fly round the scene in a browser: recon export result --format page --out scene.html
     """
 
     result: tyro.conf.Positional[Path]
     """Folder that recon fit or otsync run wrote."""
     format: one_of("exporters", EXPORTERS) = "ply"
-    """ply and splat hold a moment, ply-sequence every frame, checkpoint the whole scene, tracks an otsync track set."""
+    """ply and splat hold a moment, ply-sequence every frame, checkpoint the whole scene, tracks an otsync track set,
+    page an HTML file that plays the scene in a browser."""
     at: float | None = None
     """World second of the moment; default: the middle."""
     fps: float | None = None
@@ -192,7 +195,7 @@ class Export:
     """File or folder; default: named by the format, in the result."""
 
     def run(self) -> int:
-        from recon.result.export import export, frame_times
+        from recon.result.export import export_result, frame_times
         from recon.result.folder import load_result
 
         exporter = made(self.format, available("exporters", EXPORTERS), "--format")
@@ -212,6 +215,6 @@ class Export:
         out = self.out or self.result / exporter.file
         refuse_parts_of_a_result(out)
         with claimed(out, "recon export", keep=False) if exporter.name == "ply-sequence" else nullcontext():
-            export(result.scene, exporter, out, times, result.frame)
+            export_result(result, exporter, out, times)
         print(f"wrote {out}")
         return 0

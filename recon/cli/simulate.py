@@ -21,9 +21,10 @@ class Simulate:
     cameras: int = 5
     held_out: int = 1
     """Cameras between the others, for evaluation: they film at true world time."""
-    frames: int = 24
-    width: int = 160
-    height: int = 96
+    frames: int = 48
+    """Frames of every camera; fewer than 40 are few to synchronise by."""
+    width: int = 320
+    height: int = 192
     max_offset: float = 1.0
     """Largest offset, in frames."""
     gain: float = 0.0
@@ -40,7 +41,9 @@ class Simulate:
 
     def run(self) -> int:
         from otsync.files.claim import claimed
+        from otsync.progress import tell
 
+        tell(f"filming {self.cameras + self.held_out} cameras, {self.frames} frames of each ...")
         with claimed(self.out, "recon simulate"):
             return self._run()
 
@@ -70,8 +73,9 @@ class Simulate:
         write_capture(capture, self.out)
         held = " ".join(f.name for f in capture.held_out)
         print(f"{self.out}: {len(capture.footage)} cameras, held out: {held or 'none'}; truth.json, start.json")
+        print(f"try: otsync sync {self.out} --truth {self.out}/truth.json --out synchronised")
         print(
-            f"try: recon fit {self.out} --offsets {self.out}/start.json --tracks {self.out}/tracks/*.npz "
+            f"or:  recon fit {self.out} --offsets {self.out}/start.json --tracks {self.out}/tracks/*.npz "
             f"--truth {self.out}/truth.json --width {self.width} --steps 1500 --out result"
             + (f" --held-out {held}" if held else "")
         )

@@ -30,8 +30,10 @@ from recon.pipeline.intake import given_clocks, readable, trained
 from recon.pipeline.plan import Plan
 from recon.pipeline.prepare import Prepared, prepare
 from recon.pipeline.stages import read_footage
-from recon.result.folder import FilmedBy, SavedReconstruction, metrics_of, save_run
+from recon.result.folder import FilmedBy, SavedReconstruction, load_result, metrics_of, save_run
+from recon.result.page import SCENE_PAGE, write_page
 from recon.result.report import write_reconstruction_report
+from recon.result.strips import Strip, strips_of, write_strips
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,6 +198,8 @@ def _write(
         "layered": ready.layered,
         "optics": kept([own for effect in effects if (own := effect.alone(None, fitted.parameters)) is not None]),
     }
+    strips = _strips(ready, progress)
+    write_strips(out, strips)
     save_run(
         out,
         videos,
@@ -214,7 +218,18 @@ def _write(
         notes=progress.notes,
         truth=outcome.truth,
         lpips_reason=outcome.lpips_reason,
+        scene_page=SCENE_PAGE,
     )
+    write_page(out / SCENE_PAGE, load_result(out), strips, report="report.html")
+
+
+def _strips(ready: Prepared, progress: Progress) -> tuple[Strip, ...]:
+    """Small pictures of all videos, for the scene page."""
+    try:
+        return strips_of((*ready.footage, *ready.held_out))
+    except ModuleNotFoundError:  # a page without pictures is better than none
+        progress.note("the scene page has no pictures of the videos: they need pillow; pip install 'otsync[video]'")
+        return ()
 
 
 def offset_figures(offsets: Offsets, true: np.ndarray) -> dict[str, Any]:
@@ -285,8 +300,7 @@ def evaluate(
     frames = result.options.get("frames")
     if frames is not None:
         part = cut(part, int(frames[0]), int(frames[1]))
-    if offsets is not None:
-        part = on_mended_clocks(part, offsets)
+    part = on_mended_clocks(part, result.offsets if offsets is None else offsets)
     part = readable(part, cache, map, progress)
     known = {v.name: v for v in result.videos}
     scores = []

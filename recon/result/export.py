@@ -19,6 +19,7 @@ import numpy as np
 
 from otsync.files.arrays import write_json
 from otsync.types import TrackSet
+from recon.result.folder import SavedReconstruction
 from recon.scene.gaussians4d import Gaussians4D
 from recon.scene.ply import save_ply, save_splat
 
@@ -93,6 +94,10 @@ class Exporter(ABC):
             frame: name of the world frame that the recording declares.
         """
 
+    def write_result(self, result: SavedReconstruction, out: Path, times: Sequence[float]) -> None:
+        """Write a whole reconstruction to ``out``: for formats that hold cameras and clocks too. Default: its scene."""
+        self.write(result.scene, out, times, result.frame)
+
 
 class Ply(Exporter):
     """A moment as 3DGS .ply, which every viewer of Gaussians opens."""
@@ -143,10 +148,23 @@ def export(
     scene: Gaussians4D, exporter: Exporter, out: str | os.PathLike[str], times: Sequence[float], frame: str = "world"
 ) -> None:
     """Write ``scene`` in a format. ValueError for times that it cannot hold, or that the videos do not cover."""
+    _check(scene, exporter, times)
+    exporter.write(scene, Path(out), times, frame)
+
+
+def export_result(
+    result: SavedReconstruction, exporter: Exporter, out: str | os.PathLike[str], times: Sequence[float] = ()
+) -> None:
+    """Write a reconstruction in a format. ValueError as of :func:`export`."""
+    _check(result.scene, exporter, times)
+    exporter.write_result(result, Path(out), times)
+
+
+def _check(scene: Gaussians4D, exporter: Exporter, times: Sequence[float]) -> None:
+    """ValueError for times that a format cannot hold, or that the videos do not cover."""
     if exporter.holds != "everything":
         check_times(scene, times)
     if exporter.holds == "moment" and len(times) != 1:
         raise ValueError(
             f"times: expected one moment for {exporter.name}; found {len(times)}. Use a sequence for more."
         )
-    exporter.write(scene, Path(out), times, frame)

@@ -3,6 +3,7 @@
 scene.npz      the 4D scene          offsets.json   the refined clocks
 run.json       cameras, clocks, colour gains and effects of every video, options, wall times, notes
 metrics.json   figures of the views  report.html    all of it to look at
+scene.html     the scene to fly round  strips.npz   small pictures of the videos, for scene.html
 fit.npz        the fit's last state  stages/        earlier results, from which a killed run continues
 """
 
@@ -82,6 +83,7 @@ class SavedReconstruction:
     Args:
         options: those of the fit, as run.json has them. frame: name of the world frame.
         optics: the effects that any other camera is looked through, apart from the shutter that it declares.
+        folder: where it was read from; None: it was not.
     """
 
     scene: Gaussians4D
@@ -90,6 +92,7 @@ class SavedReconstruction:
     options: dict[str, Any] = field(default_factory=dict)
     frame: str = "world"
     optics: tuple[Effect, ...] = ()
+    folder: Path | None = None
 
     @property
     def layered(self) -> bool:
@@ -200,7 +203,7 @@ def load_result(folder: str | os.PathLike[str]) -> SavedReconstruction:
             f"{folder / 'run.json'}: not a sound reconstruction; {in_words(error)}. Run the fit again."
         ) from None
     scene, offsets = Gaussians4D.load(folder / "scene.npz"), Offsets.load(folder / "offsets.json")
-    return SavedReconstruction(scene, offsets, videos, options, frame, optics)
+    return SavedReconstruction(scene, offsets, videos, options, frame, optics, folder)
 
 
 def _options(given: dict[str, Any]) -> dict[str, Any]:

@@ -39,6 +39,7 @@ def write_reconstruction_report(
     notes: Sequence[str] = (),
     truth: np.ndarray | None = None,
     lpips_reason: str = "",
+    scene_page: str | None = None,
 ) -> None:
     """Write the page, atomically.
 
@@ -49,10 +50,14 @@ def write_reconstruction_report(
         seconds: wall time of every stage. notes: in words, what was missing or assumed.
         truth: (V,) true offsets in seconds relative to the reference, where they are known.
         lpips_reason: why there is no LPIPS; "" where there is.
+        scene_page: address of the page that plays the scene, relative to the report; None: no link.
     """
     parts = [
         "<h1>Reconstruction</h1>",
         f"<p>{_verdict(reconstruction, views)}</p>",
+        f'<p><a href="{escape(scene_page, quote=True)}">Fly round the scene, in slow motion</a></p>'
+        if scene_page
+        else "",
         "".join(f"<p class=no>{escape(note)}</p>" for note in notes),
         "<h2>Offsets</h2>",
         _offset_rows(reconstruction, coarse, truth),

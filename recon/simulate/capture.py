@@ -33,6 +33,7 @@ class Capture:
         gains: (V + held out, 3) the cameras' true colour gains (1 without :class:`Exposure`).
         world: the truth at every time.
         near: m; static things nearer than this to a camera are not drawn.
+        held_depth: as ``depth``, of the held-out cameras: for a synchronisation that sees them too.
     """
 
     footage: tuple[Footage, ...]
@@ -43,6 +44,7 @@ class Capture:
     gains: Float[np.ndarray, "C 3"]
     world: World
     near: float = STATIC_NEAR
+    held_depth: tuple[Float[np.ndarray, "T h w"], ...] = ()
 
     def __repr__(self) -> str:
         frames = len(self.footage[0])
@@ -92,9 +94,17 @@ def synthetic(
     for c in range(cameras):
         tracks.append(noisy_tracks(world, lenses[c], filmed[c].depth, times + shift[c], f"cam{c}", seed, c))
         depth.append(noisy_depth(filmed[c], stream(seed, c, "depth")))
+    held_depth = [noisy_depth(filmed[c], stream(seed, c, "depth")) for c in range(cameras, cameras + held_out)]
     gains = np.stack([f.gain for f in filming])
     return Capture(
-        tuple(footage[:cameras]), tuple(footage[cameras:]), tuple(tracks), tuple(depth), shift[:cameras], gains, world
+        tuple(footage[:cameras]),
+        tuple(footage[cameras:]),
+        tuple(tracks),
+        tuple(depth),
+        shift[:cameras],
+        gains,
+        world,
+        held_depth=tuple(held_depth),
     )
 
 

@@ -24,7 +24,7 @@ DEPTH_STEP = 0.0005
 
 
 def write_capture(capture: Capture, folder: str | os.PathLike[str], *, masks: bool = True, depth: bool = True) -> None:
-    """Write ``scene.json``, ``truth.json``, ``start.json``, images, masks, and the training cameras' depth and tracks.
+    """Write ``scene.json``, ``truth.json``, ``start.json``, images, masks, depth, and the training cameras' tracks.
 
     start.json holds offsets for a fit to begin with: zero for every camera. Held-out cameras film at true world time,
     as both files say. ValueError for a folder that holds another recording.
@@ -34,10 +34,11 @@ def write_capture(capture: Capture, folder: str | os.PathLike[str], *, masks: bo
         raise ValueError(f"{folder}: expected a folder without a recording; found scene.json in it. Choose another.")
     videos = []
     every = [*capture.footage, *capture.held_out]
+    maps = [*capture.depth, *capture.held_depth]
     for n, footage in enumerate(every):
         entry = _images(footage, folder, masks)
-        if depth and n < len(capture.depth):
-            for k, z in enumerate(capture.depth[n]):
+        if depth and n < len(maps):
+            for k, z in enumerate(maps[n]):
                 steps = np.rint(np.asarray(z, float) / DEPTH_STEP).clip(0, 65535).astype(np.uint16)
                 _png(folder / "depth" / footage.name / f"{k:04d}.png", steps)
             entry["depth"] = {"frames": f"depth/{footage.name}/*.png", "scale": DEPTH_STEP}

@@ -25,6 +25,7 @@ def test_a_wheel_holds_types_marks_and_baselines(tmp_path, monkeypatch):
     code = {path.relative_to(ROOT).as_posix() for name in ("otsync", "recon") for path in (ROOT / name).rglob("*.py")}
     data = {path.relative_to(ROOT).as_posix() for path in (ROOT / "otsync/bench/baselines").glob("*.json")}
     assert len(data) >= 4
+    data |= {path.relative_to(ROOT).as_posix() for path in (ROOT / "recon/result/web").iterdir()}
     assert held == code | data | {"otsync/py.typed", "recon/py.typed"}
 
 

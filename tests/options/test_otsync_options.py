@@ -21,6 +21,7 @@ from otsync.cli import main
 from otsync.cli.commands import OWN
 from otsync.plugins import short_name
 from otsync.simulate import matching_world, simulate
+from otsync.types import Offsets
 from tests.options.walk import options_of
 from tests.recording_world import write_recording
 
@@ -508,6 +509,45 @@ def test_options_of_init(recording, tmp_path):
     assert run(["init", str(tmp_path / "nowhere")])[0] == 2
 
 
+def test_options_of_export(recording, tmp_path):
+    names = [video["name"] for video in json.loads((recording / "scene.json").read_text())["videos"]]
+    Offsets.known(names, np.linspace(0, 0.1, len(names)), 30).save(tmp_path / "o.json")
+    Offsets.known(names, np.linspace(0, 0.2, len(names)), 30).save(tmp_path / "other.json")
+
+    def export(*more: str, of: Path = recording, offsets: str = "o.json") -> dict[str, bytes]:
+        out = tmp_path / "out"
+        shutil.rmtree(out, ignore_errors=True)
+        args = ["export", str(of), "--offsets", str(tmp_path / offsets), "--out", str(out), *more]
+        assert run(args)[0] == 0
+        return {str(p.relative_to(out)): p.read_bytes() for p in out.rglob("*") if p.is_file()}
+
+    base = export("--what", "frames", "timeline")
+    assert set(base) == {"frames.csv", "timeline.otio"}
+    assert base != export("--what", "frames", "timeline", offsets="other.json")
+    assert base != export("--what", "frames", "timeline", "--cameras", *names[:2])
+    assert base != export("--what", "frames", "timeline", "--fps", "10")
+    mosaic = export("--what", "mosaic", "--width", "40")
+    assert set(mosaic) == {"mosaic.mp4"} and mosaic != export("--what", "mosaic", "--width", "60")
+    args = ["export", str(recording), "--offsets", str(tmp_path / "o.json"), "--out", str(tmp_path / "out")]
+    for option, value in (("--width", "50"), ("--fps", "9")):
+        code, _, err = run([*args, "--what", "timeline", option, value])
+        assert code == 2 and f"{option}: expected with" in err
+    assert run([*args, "--what", "mosaic"])[0] == 2 and run([*args, "--what", "mosaic", "--force"])[0] == 0
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    document = json.loads((recording / "scene.json").read_text())
+    for video in document["videos"]:
+        for key in ("frames", "masks", "file"):
+            if key in video:
+                video[key] = f"{recording}/{video[key]}"
+        video.pop("depth", None)
+    (outside / "scene.json").write_text(json.dumps(document))
+    args = ["export", str(outside), "--offsets", str(tmp_path / "o.json"), "--out", str(tmp_path / "out")]
+    code, _, err = run([*args, "--what", "frames"])
+    assert code == 2 and "outside" in err
+    assert export("--what", "frames", "--allow-outside", of=outside)["frames.csv"] == base["frames.csv"]
+
+
 def test_options_of_simulate_and_demo(tmp_path):
     def world(*args: str) -> dict[str, bytes]:
         out = tmp_path / "-".join(args or ("plain",)).replace("/", "_")
@@ -688,6 +728,7 @@ def rows() -> set[str]:
         "options.seed json",
         "init": "folder out reader fps force",
         "check": "scene every_frame allow_outside",
+        "export": "recording offsets out what cameras width fps force allow_outside",
         "bench": "suite scene out gate rebase promises first_seed seeds only sizes limit json cache",
         "plugins": "json",
     }

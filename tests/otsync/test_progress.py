@@ -72,7 +72,7 @@ def test_stages_are_timed_and_notes_are_told_once():
         with kept.stage("reading"):
             kept.note("one frame is damaged")
     assert kept.notes == ["one frame is damaged"] and list(kept.seconds) == ["reading"]
-    assert [line.split(":")[0] for line in told] == ["note", "reading", "reading"]
+    assert [line.split(":")[0] for line in told] == ["reading ...", "note", "reading", "reading ...", "reading"]
     with pytest.raises(KeyError), kept.stage("writing"):
         raise KeyError
     assert list(kept.seconds) == ["reading"]

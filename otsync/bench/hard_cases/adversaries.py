@@ -151,7 +151,6 @@ CASES: tuple[Case, ...] = (
             lambda k=k: frozen(k),
             (FLAGGED,),
             check=wrong_anywhere,
-            open=TRUST,
         )
         for k in (15, 30)
     ),
@@ -162,7 +161,6 @@ CASES: tuple[Case, ...] = (
         lambda: dropped(10),
         (FLAGGED,),
         check=wrong_anywhere,
-        open=TRUST,
     ),
     Case(
         "frame rate wrong by 1 %, 12 s",
@@ -171,6 +169,5 @@ CASES: tuple[Case, ...] = (
         lambda: rated(1.01, 360),
         (FLAGGED,),
         check=wrong_anywhere,
-        open=TRUST,
     ),
 )

@@ -70,7 +70,7 @@ class World:
             if not asked.any():
                 ends[v - 1] = worst[v - 1] = np.inf  # nothing that is claimed to be common is
                 continue
-            error = np.abs(true - own)[asked] * FPS
+            error = np.abs(levelled(true - own, asked, self.tracks[v].times)) * FPS
             ends[v - 1], worst[v - 1] = max(error[0], error[-1]), error.max()
         return ends, worst
 
@@ -80,6 +80,16 @@ def steady(shown: np.ndarray, times: np.ndarray) -> np.ndarray:
     late = shown - times
     low, high = np.searchsorted(times, times - BESIDE), np.searchsorted(times, times + BESIDE, side="right")
     return np.array([np.ptp(late[i:j]) < 1.5 / FPS for i, j in zip(low, high, strict=True)])
+
+
+def levelled(late: np.ndarray, asked: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Of the frames that are asked, the mean over the neighbours that are: a file that repeats frames is a staircase,
+    and a clock that runs through its middle is right.
+    """
+    told = times[asked]
+    low, high = np.searchsorted(told, told - BESIDE), np.searchsorted(told, told + BESIDE, side="right")
+    total = np.concatenate([[0.0], np.cumsum(late[asked])])
+    return np.asarray((total[high] - total[low]) / (high - low))
 
 
 def near(found: np.ndarray, clock: np.ndarray, doubtful: np.ndarray) -> np.ndarray:

@@ -96,6 +96,14 @@ def _array(t: Tensor, dtype: torch.dtype = torch.float32) -> np.ndarray:
     return t.detach().to(dtype).contiguous().numpy()
 
 
+def _gradient(t: Tensor | None, shape: tuple[int, ...]) -> np.ndarray:
+    """The gradient as an array, zeros where the loss does not use this output.
+
+    Autograd could make the zeros (`materialize_grads`), on threads of torch that then spin on the kernels' cores.
+    """
+    return np.zeros(shape, np.float32) if t is None else _array(t)
+
+
 def _tile_parts(n_tiles: int) -> list[tuple[int, int]]:
     return ranges(n_tiles, max(1, n_tiles // PARTS))
 
@@ -103,6 +111,7 @@ def _tile_parts(n_tiles: int) -> list[tuple[int, int]]:
 class _Project(torch.autograd.Function):
     @staticmethod
     def forward(ctx, means, quats, scales, opacities, viewmats, Ks, width, height, settings):
+        ctx.set_materialize_grads(False)
         n, c = len(means), len(viewmats)
         means2d, rows = np.empty((c, n, 2), np.float32), np.empty((c, n, 3), np.float32)
         depths, seen = np.empty((c, n), np.float32), np.empty((c, n), np.float32)
@@ -132,7 +141,8 @@ class _Project(torch.autograd.Function):
         n, c = len(means), len(viewmats)
         gaussians = tuple(_array(t) for t in (means, quats, scales, opacities))
         cameras = (_array(viewmats, torch.float64), _array(Ks), *ctx.size)
-        incoming = tuple(_array(t) for t in (g_means2d, g_rows, g_depths, g_seen))
+        shapes = (c, n, 2), (c, n, 3), (c, n), (c, n)
+        incoming = tuple(map(_gradient, (g_means2d, g_rows, g_depths, g_seen), shapes))
         outgoing = tuple(np.empty(a.shape, np.float32) for a in gaussians)
         parts = [(*part, p) for p, part in enumerate(ranges(n, GAUSSIANS_PER_PART))]
         g_views = np.zeros((len(parts), c, 3, 4))
@@ -147,6 +157,7 @@ class _Project(torch.autograd.Function):
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx, means2d, rows, depths, opacities, radii, residuals, features, width, height, depth_mode):
+        ctx.set_materialize_grads(False)
         n_cameras, n = depths.shape
         splats = (*(_array(t) for t in (means2d, rows, depths, opacities)), radii.numpy(), residuals.numpy())
         tiles = lists.build(splats, width, height)
@@ -171,7 +182,7 @@ class _Rasterize(torch.autograd.Function):
         kept_depth = depth.reshape(-1).copy() if depth_mode == kernels.EXPECTED else np.empty(0, np.float32)
         ctx.saved = (kept_depth, transmittance.reshape(-1), last_drawn)
         ctx.tiles, ctx.channels, ctx.tiling, ctx.depth_mode = tiles, channels, tiling, depth_mode
-        ctx.features_shape, ctx.splats_shape = features.shape, (n_cameras, n)
+        ctx.features_shape, ctx.splats_shape, ctx.dtype = features.shape, (n_cameras, n), means2d.dtype
         return tuple(outputs)
 
     @staticmethod
@@ -180,7 +191,11 @@ class _Rasterize(torch.autograd.Function):
         tiles, (n_cameras, n), with_depth = ctx.tiles, ctx.splats_shape, ctx.depth_mode != kernels.NO_DEPTH
         n_channels = ctx.features_shape[-1] + with_depth
         row = kernels.SHAPE_GRADIENTS + n_channels
-        incoming = tuple(_array(t).reshape(-1) for t in (g_image, g_depth, g_alphas))
+        pixels = n_cameras * ctx.tiling[0] * ctx.tiling[1]
+        sizes = pixels * (n_channels - with_depth), pixels if with_depth else 0, pixels
+        incoming = tuple(
+            _gradient(t, (size,)).reshape(-1) for t, size in zip((g_image, g_depth, g_alphas), sizes, strict=True)
+        )
         gradients = np.empty(len(tiles.ranks) * row + LANES, np.float32)
         for_each(
             kernels.backward,
@@ -199,7 +214,7 @@ class _Rasterize(torch.autograd.Function):
             *((tiles.rank_of_splat, tiles.slot_starts, tiles.records), gradients, row),
             tuple(a.reshape(-1) for a in outgoing),
         )
-        means2d, rows, depths, opacities, features = (torch.from_numpy(a).to(g_image.dtype) for a in outgoing)
+        means2d, rows, depths, opacities, features = (torch.from_numpy(a).to(ctx.dtype) for a in outgoing)
         return means2d, rows, depths, opacities, None, None, features, None, None, None
 
 

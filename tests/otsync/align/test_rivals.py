@@ -12,11 +12,12 @@ from otsync.types import Status
 
 
 def test_a_carousel_suits_at_other_times_and_a_player_does_not():
-    ratio = {}
+    found = {}
     for motion in ("carousel", "tennis"):
         (a, b), _ = simulate(motion, preset="mid", videos=2, offsets=[0.0, 0.1], seed=6)
-        ratio[motion] = rival(a, b, match(a, b, throw=False), 0.1)
-    assert ratio["carousel"] < 1.1 and ratio["tennis"] > 1.5
+        found[motion] = rival(a, b, match(a, b, throw=False), 0.1)
+    assert found["carousel"].as_good and found["carousel"].ratio < 1.1
+    assert not found["tennis"].as_good and found["tennis"].ratio > 1.5
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -31,3 +32,10 @@ def test_a_static_scene_that_drifts_alike_is_static(effect):
     effects = (*PRESETS["mid"].effects, effect)
     tracks, _ = simulate("static", preset="mid", videos=2, offsets=[0.0, 0.4], effects=effects, seed=1)
     assert Status.STATIC in synchronize(tracks).flags[1]
+
+
+@pytest.mark.parametrize(("preset", "seed"), [("hard", 4), ("brutal", 3), ("brutal", 4)])
+def test_noisy_tracks_that_are_near_by_chance_at_another_time_are_no_rival(preset, seed):
+    (a, b), truth = simulate("juggle", preset=preset, videos=2, offsets=[0.0, 0.4], seed=seed)
+    found = rival(a, b, match(a, b, throw=False), float(truth.offsets[1]))
+    assert found.ratio < 1 and not found.as_good

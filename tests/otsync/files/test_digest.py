@@ -9,6 +9,7 @@ import os
 import subprocess
 import sys
 import threading
+import types
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -166,3 +167,10 @@ def test_other_processes_find_the_same():
 def test_what_cannot_be_read_is_named(x):
     with pytest.raises(ValueError, match=r"expected an object whose content can be read.*Make it a dataclass"):
         content_key(Plain(inside=[x]))
+
+
+def test_a_torch_that_another_thread_is_loading_is_no_hindrance(monkeypatch):
+    value = {"a": np.arange(3), "b": [1.5, None]}
+    expected = content_key(value)
+    monkeypatch.setitem(sys.modules, "torch", types.ModuleType("torch"))  # as it is at the beginning of its import
+    assert content_key(value) == expected

@@ -61,7 +61,7 @@ def test_doubt_is_said_with_its_remedy(tmp_path, answer):
     )
     write_report(tmp_path / "r.html", doubtful, tracks)
     page = (tmp_path / "r.html").read_text()
-    assert "1 of 3 videos are to be trusted; 1 answers are doubtful, 1 missing" in page
+    assert "0 of 2 offsets are to be trusted; 1 doubtful, 1 missing" in page  # the reference's own is no answer
     assert "ambiguous, spread" in page and "Look at the hypotheses" in page and "no answer" in page
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from otsync import synchronize
 from otsync.simulate import simulate
-from otsync.simulate.effects import Drop, Freeze, In
+from otsync.simulate.effects import Drop, Freeze, In, SlowMotion
 from otsync.sync.breaks import mended
 from otsync.types import Break, Offsets, Status, TrackSet, mended_frames, mended_times
 
@@ -97,3 +97,10 @@ def test_times_behind_breaks_are_those_of_the_clock_before_them():
     assert index.tolist() == [5, 6, 7, 8, 9, 0, 1, 2, 3, 4] and (np.diff(seconds) > 0).all()
     cut = mended(TrackSet(np.zeros((2, 10, 3)) + np.arange(10)[None, :, None], timestamps=times), [Break(0.5, -1.0)])
     assert cut.xyz is not None and cut.xyz[0, :, 0].tolist() == index.tolist()
+
+
+@pytest.mark.parametrize("seed", [0, 1, 3])
+def test_a_slow_motion_is_no_lost_frames_that_are_mended(seed):
+    """Beside a break that was mended the clock must run on evenly; a slow motion begins and ends in a ramp."""
+    tracks, _ = broken(SlowMotion(2.0), seed=seed)
+    assert Status.BROKEN_CLOCK in synchronize(tracks).flags[1]

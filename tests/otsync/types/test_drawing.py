@@ -67,8 +67,8 @@ def test_lines_say_what_matters():
     weak = replace(PAIR, sigma=float("nan"), rate=1.001, flags=(Status.ALIAS, Status.WEAK))
     assert repr(weak) == "Alignment(12.30 frames = 0.4100 s, rate 1.001000; weak, alias)"
     assert repr(replace(PAIR, offset=float("nan"), flags=(Status.STATIC,))) == "Alignment(no offset; static)"
-    assert repr(offsets("a", "b")) == "Offsets(frames: 'a' +0.00, 'b' +15.00; 1 of 2 to be trusted)"
-    assert "2 more; 4 of 5 to be trusted" in repr(offsets(*"abcde"))
+    assert repr(offsets("a", "b")) == "Offsets(frames: 'a' +0.00, 'b' +15.00; 0 of 1 to be trusted)"
+    assert "2 more; 3 of 4 to be trusted" in repr(offsets(*"abcde"))
     assert repr(Matches([[0, 1], [2, 3]], [0.25, 0.5])) == "Matches(2 pairs, scores 0.25 to 0.5; ok)"
     assert repr(CAMERA) == "Camera(1920 x 1080, focal 1100 px, static)"
 

@@ -419,11 +419,22 @@ def test_simulate_writes_a_recording_that_the_printed_command_fits(tmp_path, cap
     assert "recon fit" in told and "--held-out held0" in told
     scene = open_scene(tmp_path / "w")
     assert scene.names == ("cam0", "cam1", "held0") and len(scene.videos[0].frames) == 4
-    assert scene.videos[2].depth is None and scene.masks[2] is not None
+    assert all(v.depth is not None for v in scene.videos) and scene.masks[2] is not None
     truth, start = Offsets.load(tmp_path / "w" / "truth.json"), Offsets.load(tmp_path / "w" / "start.json")
     assert truth.seconds[0] == 0 != truth.seconds[1] and not start.seconds.any()
     assert main(args) == 2
     assert "found scene.json" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_recording_with_default_options_can_be_synchronised(tmp_path):
+    """The held-out camera too: what the README recommends to try everything on."""
+    assert main(["simulate", str(tmp_path / "w")]) == 0
+    args = ["sync", str(tmp_path / "w"), "--out", str(tmp_path / "s"), "--truth", str(tmp_path / "w" / "truth.json")]
+    assert otsync(args) == 0
+    offsets, truth = (Offsets.load(tmp_path / name) for name in ("s/offsets.json", "w/truth.json"))
+    assert all(status.ok for status in offsets.status)
+    assert np.abs(offsets.frames - truth.frames).max() < 0.5
 
 
 def test_declared_readouts_and_given_exposures_reach_the_fit(tmp_path, monkeypatch, capsys):

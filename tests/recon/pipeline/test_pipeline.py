@@ -72,6 +72,8 @@ def test_a_run_writes_everything_and_reads_it_back(done):
         "run.json",
         "metrics.json",
         "report.html",
+        "scene.html",
+        "strips.npz",
         "fit.npz",
         "stages",
     }

@@ -1,0 +1,19 @@
+"""Synchronised videos for other programs: what ``otsync export`` writes of a recording and its offsets.
+
+slot.py      Aligned: every frame's world second; Export: the slot
+mosaic.py    Mosaic: all videos in one, as filmed beside synchronised
+clips.py     Clips: every video, cut to what all show, on the common clock, with its sound
+frames.py    FrameList: which frames belong together, as CSV
+timeline.py  Timeline: an OpenTimelineIO file for editors
+encode.py, sound.py   writing mp4 with exact timestamps; sound on the common clock
+"""
+
+from .clips import Clips
+from .frames import FrameList
+from .mosaic import Mosaic
+from .slot import Aligned, Clip, Export, aligned
+from .timeline import Timeline
+
+EXPORTS: tuple[Export, ...] = (Mosaic(), Clips(), FrameList(), Timeline())
+
+__all__ = ["EXPORTS", "Aligned", "Clip", "Clips", "Export", "FrameList", "Mosaic", "Timeline", "aligned"]

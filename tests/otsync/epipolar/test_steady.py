@@ -1,0 +1,61 @@
+"""One offset for a whole video, without depth: lost and repeated frames are seen in windows of all pairs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from otsync import Status, TrackSet, synchronize
+from otsync.epipolar.refine import EpipolarRefine
+from otsync.epipolar.scan import EpipolarScan
+from otsync.match.candidates import Candidates
+from tests.recording_world import paths, ring
+
+FPS, LATE = 30.0, (0.0, 6.0, -4.0, 9.0)
+
+
+def filmed(shown: list[np.ndarray], seed: int = 0) -> list[TrackSet]:
+    """A video for each camera of a ring; ``shown``: the world's frame numbers that its frames show."""
+    rng = np.random.default_rng(seed)
+    features = rng.normal(size=(40, 12))
+    sets = []
+    for v, (camera, frames) in enumerate(zip(ring(4, width=640, height=360), shown, strict=False)):
+        uv = camera.project(paths(frames / FPS, 40, seed + 5)) + rng.normal(0, 0.3, (40, len(frames), 2))
+        noisy = features + 0.5 * rng.normal(size=features.shape)
+        sets.append(TrackSet(None, uv=uv, camera=camera, fps=FPS, frame="world", features=noisy, name=f"video{v}"))
+    return sets
+
+
+def solved(tracks: list[TrackSet]):
+    found = synchronize(
+        tracks, matcher=Candidates(8, None), aligner=EpipolarScan(), refiner=EpipolarRefine(), rematch=0
+    )
+    return found
+
+
+@pytest.mark.parametrize("videos", [2, 4])
+@pytest.mark.parametrize("lost", [np.arange(50, 60), None], ids=["ten frames lost", "frozen for ten frames"])
+def test_a_video_that_breaks_is_named_and_the_others_are_trusted(videos, lost):
+    shown = [np.arange(120) + late for late in LATE[:videos]]
+    shown[1] = (
+        np.delete(np.arange(130), lost) + LATE[1]
+        if lost is not None
+        else shown[1] - np.clip(np.arange(120) - 50, 0, 10)
+    )
+    offsets = solved(filmed(shown))
+    assert Status.BROKEN_CLOCK in offsets.flags[1]
+    if videos == 4:
+        assert offsets.status[2].ok and abs(offsets.seconds[2] * FPS - LATE[2]) < 0.3
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_videos_that_run_on_are_left_alone(seed):
+    tracks = filmed([np.arange(120) + late for late in LATE[:3]], seed)
+    # a part in which one of them sees nothing
+    visible = np.ones((40, 120), bool)
+    visible[:, 30:60] = False
+    offsets = solved([*tracks[:2], replace(tracks[2], visible=visible)])
+    assert not any(Status.BROKEN_CLOCK in flags for flags in offsets.flags)
+    assert np.abs(offsets.seconds * FPS - LATE[:3]).max() < 0.3
