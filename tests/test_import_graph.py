@@ -10,14 +10,28 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-HEAVY = {"torch", "ot", "tslearn", "transformers", "dask", "numba", "sklearn", "pandas", "matplotlib", "cv2", "av"}
+HEAVY = {
+    "torch",
+    "ot",
+    "tslearn",
+    "transformers",
+    "dask",
+    "numba",
+    "sklearn",
+    "pandas",
+    "matplotlib",
+    "cv2",
+    "av",
+    "pycolmap",
+    "poselib",
+}
 
 OTSYNC = """
 compute files progress plugins
 types
 geometry clocks costs io priors simulate metrics
 match align refine
-epipolar frames
+epipolar frames calibrate
 sync
 recordings
 report export bench cli
@@ -233,11 +247,24 @@ def test_tests_stand_where_the_code_stands():
             assert (ROOT / folder).is_dir(), f"{path.relative_to(ROOT)}: there is no {folder}"
 
 
-@pytest.mark.parametrize("module", ["otsync.cli", "otsync.cli.sync", "otsync.cli.recordings", "otsync.recordings"])
+@pytest.mark.parametrize(
+    "module", ["otsync.cli", "otsync.cli.sync", "otsync.cli.recordings", "otsync.recordings", "otsync.calibrate"]
+)
 def test_the_command_line_is_light_until_something_runs(module):
     code = f"import sys, {module}; print(' '.join(m.split('.')[0] for m in sys.modules))"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True).stdout
-    assert not {"torch", "ot", "tslearn", "transformers", "matplotlib", "cv2", "av", "recon"} & set(out.split())
+    assert not {
+        "torch",
+        "ot",
+        "tslearn",
+        "transformers",
+        "matplotlib",
+        "cv2",
+        "av",
+        "pycolmap",
+        "poselib",
+        "recon",
+    } & set(out.split())
 
 
 def test_import_loads_nothing_heavy():

@@ -7,6 +7,7 @@ chain.py   matchers x aligners x rematching, to frames of the offset; chain_worl
 hard_cases/  the catalogue of hard cases, and running it
 panoptic.py  the paper's protocol on a truly synchronised recording
 own_frames.py  clock and pose without a common frame, on worlds and on a truly synchronised recording
+calibrate.py  cameras from videos alone, against simulated and given ones
 trust/  whether "ok" is right: classes of worlds, claims and errors
 record.py  tables on disk, machine and versions, the gate against a committed baseline
 """
@@ -30,6 +31,7 @@ OWN = {
     "chain": "chain",
     "own-frames": "own_frames",
     "trust": "trust.run",
+    "calibrate": "calibrate",
 }
 """Our own suites, and where they are."""
 

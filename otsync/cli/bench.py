@@ -47,7 +47,8 @@ class Bench:
     suite: tyro.conf.Positional[suite_names()]
     """Which benchmark; "all": every one that needs no recording."""
     scene: tyro.conf.Positional[Path | None] = None
-    """A truly synchronised recording (its folder or scene.json): of panoptic; if you like, of chain and own-frames."""
+    """A truly synchronised recording (its folder or scene.json): of panoptic; if you like, of chain, own-frames and
+    calibrate."""
     out: Path = Path("bench/out")
     """Folder for CSV, JSON and plots."""
     gate: bool = False
@@ -57,11 +58,11 @@ class Bench:
     promises: bool = False
     """For sync and match: measure what is promised, on fresh seeds, instead of the tables."""
     first_seed: int | None = None
-    """For core, match, sync, panoptic, chain and own-frames: where the seeds begin; default: the suite's own."""
+    """For core, match, sync, panoptic, chain, own-frames and calibrate: where the seeds begin; default: the suite's own."""
     seeds: int | None = None
-    """For core, match, sync, chain and own-frames: how many seeds; default: the suite's own."""
+    """For core, match, sync, chain, own-frames and calibrate: how many seeds; default: the suite's own."""
     only: tuple[str, ...] = ()
-    """For match, hard-cases and chain: names of the solvers to run; default: all."""
+    """For match, hard-cases and chain: names of the solvers to run; for calibrate of the worlds; default: all."""
     sizes: tuple[int, ...] = ()
     """For match: numbers of tracks; default: 200 to 50,000."""
     limit: float | None = None
@@ -69,7 +70,7 @@ class Bench:
     json: bool = False
     """For panoptic and own-frames: one line of JSON on standard output instead of tables."""
     cache: Path | None = None
-    """For panoptic, chain and own-frames: where tracks and depth are kept; default: stages in --out."""
+    """For panoptic, chain, own-frames and calibrate: where tracks and depth are kept; default: stages in --out."""
 
     def run(self) -> int:
         self._check()

@@ -10,6 +10,8 @@ OWN = {
     "simulate": "otsync.cli.simulate:Simulate",
     "match": "otsync.cli.match:Match",
     "init": "otsync.cli.recordings:Init",
+    "film": "otsync.cli.calibrate:Film",
+    "calibrate": "otsync.cli.calibrate:Calibrate",
     "check": "otsync.cli.recordings:Check",
     "sync": "otsync.cli.sync:Sync",
     "export": "otsync.cli.export:Export",

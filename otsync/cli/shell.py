@@ -23,6 +23,8 @@ EXTRAS = {
     "av": "video",
     "cv2": "video",
     "PIL": "video",
+    "pycolmap": "calibrate",
+    "poselib": "calibrate",
     "gsplat": "cuda",
     "ott": "rivals",
     "jax": "rivals",

@@ -28,13 +28,15 @@ class Sync:
 
     The paper's method: otsync sync recording/ --method paper
 
+    Videos that nobody calibrated: otsync sync holiday/ finds their cameras first (otsync calibrate)
+
     Videos without a common frame of reference: otsync sync world/*.npz --frames own
 
     An ablation: otsync sync recording/ matcher:optimal-transport aligner:dtw refiner:unrefined
     """
 
     tracks: tyro.conf.Positional[tuple[Path, ...]]
-    """A scene.json or a folder with one (also in Panoptic layout); or track sets (.npz written by otsync), one per
+    """A scene.json, a folder with one (also in Panoptic layout), or a folder of videos; or track sets (.npz written by otsync), one per
     video, in one world frame."""
     out: Path = Path("sync")
     """Folder for offsets.json and report.html, and the stages of a recording, from which a killed run continues."""
@@ -61,7 +63,12 @@ class Sync:
         method = self.slots.chosen(Graph(complete=COMPLETE) if self.frames == "own" else None)
         if len(self.tracks) == 1 and self.tracks[0].suffix != ".npz":
             refuse_unused(self, ("workers",), f"a recording ({self.tracks[0]}), which has --recording.workers,")
-            return sync_recording(
+            doubts = 0
+            if self.frames == "common":
+                from .calibrate import prepared
+
+                doubts = prepared(self.tracks[0], allow_outside=self.recording.allow_outside)
+            code = sync_recording(
                 self.tracks[0],
                 self.out,
                 self.recording,
@@ -71,6 +78,7 @@ class Sync:
                 truth=self.truth,
                 as_json=self.json,
             )
+            return max(code, doubts)
         refuse_unused(self, ("recording",), "synchronising track sets")
         if len(self.tracks) < 2:
             raise ValueError(f"tracks: expected at least two .npz files; found {len(self.tracks)}.")

@@ -192,7 +192,8 @@ class EpipolarScan(Aligner):
         strength = float(total[best] - level)
         margin = 1.0 if len(peaks) < 2 else float((total[peaks[0]] - total[peaks[1]]) / max(strength, 1e-12))
         flags = []
-        if strength < self.weak * spread:
+        if strength < self.weak * spread or total[best] <= 0:
+            # every right answer on basketball and the mouse had a positive peak: below 0 outliers explain it better
             flags.append(Status.WEAK)
         if margin < self.ambiguous or margin * strength < LEAST_LEAD * spread:
             flags.append(Status.AMBIGUOUS)

@@ -22,6 +22,8 @@ MARKS = {
     "otsync simulate": ("truth.json",),
     "otsync sync": ("sync.json", "offsets.json"),
     "otsync demo": ("offsets.json",),
+    "otsync calibrate": ("calibration.html",),
+    "otsync film": ("cameras.json",),
     "recon export": ("frames.json",),
     "recon render": ("00000.png",),
 }

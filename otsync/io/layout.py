@@ -51,6 +51,27 @@ class VideoFile(Document, frozen=True, kw_only=True):
     labels: Files | None = None
 
 
+class CalibratedFile(Document, frozen=True, kw_only=True):
+    """How sure the camera of one video is, as ``otsync calibrate`` found it."""
+
+    lens: Literal["given", "board", "file", "found", "guessed"]
+    sigma_degrees: float | None = None
+    sigma_position: float | None = None
+    inliers: Count = 0
+    points: Count = 0
+    bridged: float = 0.0
+    doubtful: Text | None = None
+    remedy: Text | None = None
+
+
+class CalibrationFile(Document, frozen=True, kw_only=True):
+    """What ``otsync calibrate`` found out, by video; videos without a camera too."""
+
+    method: Literal["incremental", "global"]
+    unit: Literal["arbitrary", "metres"]
+    cameras: Annotated[dict[Name, CalibratedFile], Meta(max_length=MAX_VIDEOS)]
+
+
 class SceneFile(Document, frozen=True, kw_only=True):
     """A scene document."""
 
@@ -59,4 +80,5 @@ class SceneFile(Document, frozen=True, kw_only=True):
     videos: Annotated[list[VideoFile], Meta(min_length=1, max_length=MAX_VIDEOS)]
     frame: Name = "world"
     missing: list[Text] | None = None
+    calibration: CalibrationFile | None = None
     notes: list[Text] = field(default_factory=list)

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -51,6 +51,7 @@ class Scene:
         root: the folder that paths are relative to.
         notes: what the reader assumed or could not find.
         labels: per video a sequence of (H,W) integer labels that all videos share, 0 none; or None. Empty: none at all.
+        doubtful: why the camera of a video is not to be trusted, by its name: what ``otsync calibrate`` says.
     """
 
     videos: tuple[Video, ...]
@@ -59,6 +60,7 @@ class Scene:
     root: Path = Path()
     notes: tuple[str, ...] = field(default_factory=tuple)
     labels: tuple[Sequence[np.ndarray] | None, ...] = ()
+    doubtful: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -129,8 +131,8 @@ def scene_from_document(
     entries = document["videos"]
     if document.get("missing"):
         raise ValueError(
-            f"{file}: still missing: {shown(document['missing'])}. Write the file with otsync init, fill it in, "
-            "then delete 'missing'."
+            f"{file}: still missing: {shown(document['missing'])}. Find the cameras (otsync calibrate), or fill "
+            "it in, then delete 'missing'."
         )
     names = names_of(entries)
     twice = sorted({n for n in names if names.count(n) > 1})
@@ -147,7 +149,14 @@ def scene_from_document(
         Path(root),
         tuple(str(n) for n in document.get("notes", ())),
         tuple(labels for _, _, labels in built),
+        _doubtful(document),
     )
+
+
+def _doubtful(document: dict[str, Any]) -> dict[str, str]:
+    """Why cameras are not to be trusted, by the names of their videos."""
+    found = (document.get("calibration") or {}).get("cameras") or {}
+    return {name: told["doubtful"] for name, told in found.items() if told.get("doubtful")}
 
 
 def names_of(entries: Sequence[dict[str, Any]]) -> list[str]:
@@ -207,7 +216,9 @@ def video_frames(entry: dict[str, Any], paths: Paths) -> tuple[LazyFrames, np.nd
 def camera_from(value: Any) -> Camera:
     """A camera of the document. ValueError says which field is missing."""
     if not isinstance(value, dict):
-        raise ValueError("camera: expected K, w2c, width and height; found none. Add the calibration.")
+        raise ValueError(
+            "camera: expected K, w2c, width and height; found none. Add the calibration, or let it be found: otsync calibrate."
+        )
     missing = [f for f in ("K", "w2c", "width", "height") if value.get(f) is None]
     if missing:
         own = " Or, with depth for every video, let the poses be found: otsync sync --frames own."

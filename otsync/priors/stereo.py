@@ -20,6 +20,10 @@ from ..types import Camera, Video
 from .working import WorkingFrames
 
 
+class EmptyHull(ValueError):
+    """No place in space is foreground in enough views."""
+
+
 @dataclass(frozen=True, eq=False)
 class Rig:
     """What stereo needs of all videos: pixels and masks at one working size, and which frames belong together.
@@ -263,7 +267,7 @@ class Space:
             occupied.append(np.argwhere(grid))
         corners = np.concatenate(occupied) if occupied else np.zeros((0, 3), int)
         if len(corners) == 0:
-            raise ValueError(
+            raise EmptyHull(
                 "masks: expected foreground that the views agree on; their visual hull is empty. Check masks, camera "
                 "poses and offsets."
             )

@@ -6,6 +6,7 @@ stages.py       the slots of a run, and what stands in them
 routes.py       which way from a scene to offsets, in which stages
 kept_pairs.py   pairs of videos kept on disk
 dense_depth.py  depth maps of synchronised recordings
+placement.py    which cameras may stand elsewhere than the scene says
 check.py        otsync check: what commonly goes wrong in a recording
 """
 

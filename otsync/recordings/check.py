@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -27,6 +28,9 @@ ORTHONORMAL, LAST_ROW = 1e-3, 1e-6
 
 MIDDLE = (0.25, 0.75)
 """Shares of the image between which a principal point lies; K of another resolution leaves them."""
+
+RESIZED = 0.25
+"""Logarithm of the ratio of both coordinates' shares of the middle, below which K is that of a resized image."""
 
 FOCAL = (0.2, 20.0)
 """Focal lengths in widths of the image: from a fisheye to a strong tele."""
@@ -88,9 +92,10 @@ def check_scene(
     if len(entries) < 2:
         findings.append(Finding("error", "", "one video only.", "Add at least a second one."))
     findings += _twice(entries, Paths(root, allow_outside))
+    unmirrored = _unmirrored(entries)
     for entry in entries:
         name = entry["name"]
-        pose = list(_pose(entry, name))
+        pose = list(_pose(entry, name, unmirrored))
         findings += pose
         if pose:
             continue
@@ -167,7 +172,46 @@ def _files_of(entry: dict[str, Any], paths: Paths) -> Sequence[Path]:
         return ()
 
 
-def _pose(entry: dict[str, Any], name: str) -> Iterable[Finding]:
+READINGS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "camera-to-world whose z axis points back: negate column 2, then invert": lambda m: np.linalg.inv(m @ flip(2)),
+    "camera-to-world whose y axis points up: negate column 1, then invert": lambda m: np.linalg.inv(m @ flip(1)),
+    "camera-to-world whose x axis points left: negate column 0, then invert": lambda m: np.linalg.inv(m @ flip(0)),
+    "world-to-camera whose z axis points back: negate row 2": lambda m: flip(2) @ m,
+    "world-to-camera whose y axis points up: negate row 1": lambda m: flip(1) @ m,
+    "world-to-camera whose x axis points left: negate row 0": lambda m: flip(0) @ m,
+}
+"""What matrices with det(R) = -1 may be, and how they become world-to-camera with OpenCV axes."""
+
+
+def flip(axis: int) -> np.ndarray:
+    """(4,4): negates one axis."""
+    return np.diag([-1.0 if n == axis else 1.0 for n in range(4)])
+
+
+def _unmirrored(entries: Sequence[dict[str, Any]]) -> str:
+    """Which readings of mirrored matrices make all cameras look at one place, in words."""
+    cameras: list[tuple[Camera, np.ndarray]] = []
+    for entry in entries:
+        camera = entry.get("camera") or {}
+        with suppress(TypeError, ValueError, KeyError):
+            w2c = np.asarray(camera["w2c"], float).reshape(-1, 4, 4)[0]
+            sound = Camera(np.asarray(camera["K"], float), np.eye(4), camera["width"], camera["height"])
+            cameras.append((sound, w2c))
+    fitting = []
+    for told, read in READINGS.items():
+        with suppress(ValueError, np.linalg.LinAlgError):
+            again = [replace(c, w2c=read(m) if np.linalg.det(m[:3, :3]) < 0 else m) for c, m in cameras]
+            if len(again) > 1 and not _parallel(again) and not _looking_away(again).any():
+                fitting.append(told)
+    if not fitting:
+        return "No reading of it makes the cameras look at one place: check what the matrices are."
+    return (
+        f"Read like this, the cameras look at one place: {'; or '.join(fitting)}. Those that are left differ in what is "
+        "up or left: look at the images."
+    )
+
+
+def _pose(entry: dict[str, Any], name: str, unmirrored: str) -> Iterable[Finding]:
     """det(R) and orthonormality, before the strict constructor refuses them with fewer words."""
     camera = entry.get("camera")
     try:
@@ -184,8 +228,7 @@ def _pose(entry: dict[str, Any], name: str) -> Iterable[Finding]:
             "error",
             name,
             "camera.w2c has det(R) = -1: a mirrored frame.",
-            "It is perhaps camera-to-world with OpenGL axes, or with one axis flipped: negate columns 1 and 2 of c2w "
-            "(OpenGL), or undo the flip, then invert to get w2c.",
+            unmirrored,
         )
     elif not np.allclose(R @ np.swapaxes(R, -1, -2), np.eye(3), atol=ORTHONORMAL):
         yield Finding(
@@ -207,12 +250,25 @@ def _intrinsics(video: Video) -> Iterable[Finding]:
     K, w, h = video.camera.K, video.camera.width, video.camera.height
     low, high = MIDDLE
     if not (low * w < K[0, 2] < high * w and low * h < K[1, 2] < high * h):
-        yield Finding(
-            "error",
-            video.name,
-            f"the principal point ({K[0, 2]:.0f}, {K[1, 2]:.0f}) is far from the middle of {w} x {h} pixels.",
-            "K probably belongs to another resolution: scale its first two rows by the ratio of the widths.",
-        )
+        across, down = 2 * K[0, 2] / w, 2 * K[1, 2] / h
+        scaled = across > 0 and down > 0 and abs(np.log(across / down)) < RESIZED
+        what = f"the principal point ({K[0, 2]:.0f}, {K[1, 2]:.0f}) is far from the middle of {w} x {h} pixels."
+        if scaled:
+            yield Finding(
+                "error",
+                video.name,
+                what,
+                f"K probably belongs to another resolution, of {across:.3g} times the width: divide its first two rows by "
+                "that.",
+            )
+        else:
+            yield Finding(
+                "warning",
+                video.name,
+                what,
+                "Some laboratories calibrate so: if the calibration's own residuals are small, leave it. Else check K, or "
+                "whether the images were cut.",
+            )
     if not FOCAL[0] * w < K[0, 0] < FOCAL[1] * w:
         yield Finding(
             "warning",

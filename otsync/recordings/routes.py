@@ -32,13 +32,14 @@ from ..files.digest import content_key, sequence_key
 from ..geometry import seen_pixels
 from ..io.scene import Scene
 from ..priors.slots import cache_key
-from ..priors.stereo import Rig
+from ..priors.stereo import EmptyHull, Rig
 from ..progress import Deadline, Progress, Tell
 from ..sync.method import Method
 from ..sync.verb import synchronize
 from ..types import Offsets, Status, TrackSet, Video
 from .kept_pairs import KeptPairs
 from .lift import depth_at
+from .placement import misplaced, with_doubts
 from .stages import Stages, with_labels, with_method
 from .tracking import pixel_tracks, track_labels
 
@@ -108,11 +109,13 @@ def synchronize_scene(
         with progress.stage("lift"):
             lifted = lift_given(scene, raw, stages, cache, map)
         with progress.stage("synchronise"):
-            offsets = pairs_in_space(lifted, reference, stages, cache, map)
+            offsets = with_doubts(pairs_in_space(lifted, reference, stages, cache, map), scene.doubtful)
         return Synchronized(without_times(offsets), tuple(lifted), chosen, why, None, progress.seconds)
     with progress.stage("epipolar"):
         flat = [select(video, r, stages, scene.frame) for video, r in zip(scene.videos, raw, strict=True)]
         first = without_times(pairs_in_pixels(flat, reference, stages, cache, map))
+        astray = misplaced(first) | set(scene.doubtful)
+        first = with_doubts(first, astray)
     epipolar = Synchronized(first, tuple(flat), "epipolar", why, None, progress.seconds)
     if chosen == "epipolar":
         return epipolar
@@ -124,7 +127,14 @@ def synchronize_scene(
         tell(doubt)
         return replace(epipolar, why=(*why, doubt))
     with progress.stage("stereo"):
-        depth = stereo_depth(scene, flat, first, stages, cache, map)
+        try:
+            depth = stereo_depth(scene, flat, first, stages, cache, map)
+        except EmptyHull as error:
+            if asked:
+                raise
+            doubt = f"no stereo: {error} The epipolar answer stands"
+            tell(doubt)
+            return replace(epipolar, why=(*why, doubt))
         lifted = [stages.lift(t, z) for t, z in zip(flat, depth, strict=True)]
     bare = [t.name for t in lifted if len(t) == 0]
     if bare:
@@ -133,7 +143,7 @@ def synchronize_scene(
         tell(doubt)
         return replace(epipolar, why=(*why, doubt))
     with progress.stage("synchronise"):
-        offsets = without_times(pairs_in_space(lifted, reference, stages, cache, map))
+        offsets = with_doubts(without_times(pairs_in_space(lifted, reference, stages, cache, map)), astray)
     if _flagged(offsets) > _flagged(first) and not named:
         doubt = "the lifted tracks leave more doubt than the pixels did: the epipolar answer stands"
         tell(doubt)

@@ -60,6 +60,11 @@ class Status(StrEnum):
         "The tracks leave the pose between the videos loose: they lie on a line, close together, or agree badly. Track "
         "more of the scene, or use longer clips."
     )
+    MISPLACED = (
+        "The camera of this video may stand elsewhere than the scene says: its calibration is doubtful, or most of its "
+        "pairs are. Look at calibration in scene.json (otsync calibrate says what to film), run otsync check, or leave "
+        "the video out."
+    )
     STATIC = "Nothing moves enough to tell the time. Choose a part of the clip with motion, or track the moving parts."
     INCONSISTENT = (
         "The pairs of this video contradict the rest of the graph. Look at its residuals in the report; a wrong "

@@ -29,7 +29,8 @@ class Run:
     """
 
     scene: tyro.conf.Positional[Path]
-    """A scene.json, or a folder that holds one, or a folder in Panoptic layout."""
+    """A scene.json, a folder that holds one (also in Panoptic layout), or a folder of videos, whose cameras are then
+    found first (otsync calibrate)."""
     out: Path = Path("run")
     """Folder for offsets_coarse.json, offsets.json, scene.npz, metrics.json, report.html and sync.html."""
     held_out: tuple[str, ...] = ()
@@ -54,6 +55,7 @@ class Run:
             return self._run()
 
     def _run(self) -> int:
+        from otsync.cli.calibrate import prepared
         from otsync.cli.tables import table, true_offsets
         from otsync.files.arrays import write_json
         from otsync.files.cache import Cache
@@ -73,6 +75,7 @@ class Run:
                     f"{getattr(self.recording, name)}. Synchronise with otsync sync, then reconstruct with recon fit."
                 )
         threads, method, deadline = self.recording.threads(), self.slots.chosen(), deadline_of(self.plan)
+        doubts = prepared(self.scene, allow_outside=self.allow_outside or self.recording.allow_outside)
         scene = opened(self.scene, self.allow_outside or self.recording.allow_outside)
         if self.recording.cameras:
             scene = scene.take(
@@ -124,7 +127,7 @@ class Run:
             )
             return 1
         try:
-            return reconstructed(
+            code = reconstructed(
                 scene,
                 coarse.offsets,
                 self.out,
@@ -137,6 +140,7 @@ class Run:
                 progress=progress,
                 deadline=deadline,
             )
+            return max(code, doubts)
         except (Diverged, FloatingPointError) as error:
             print(f"otsync: {error}", file=sys.stderr)
             return 1

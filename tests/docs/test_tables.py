@@ -91,14 +91,15 @@ def test_the_arrays_of_a_track_set(tmp_path):
 
 def test_the_scene_of_the_page_opens_and_its_fields_are_those_that_are_read():
     from otsync.files.strict import fields_of
-    from otsync.io.layout import CameraFile, DepthFile, SceneFile, VideoFile
+    from otsync.io.layout import CalibratedFile, CalibrationFile, CameraFile, DepthFile, SceneFile, VideoFile
     from otsync.io.scene import camera_from
 
     page = (ROOT / "docs/recording.md").read_text()
     document = json.loads(page.partition("```json\n")[2].partition("```")[0])
     for video in document["videos"]:
         camera_from(video["camera"])
-    read = {name for kind in (SceneFile, VideoFile, CameraFile) for name in fields_of(kind)}
+    kinds = (SceneFile, VideoFile, CameraFile, CalibrationFile, CalibratedFile)
+    read = {name for kind in kinds for name in fields_of(kind)}
     assert set(rows("docs/formats.md", "scene.json")) == read
     assert set(fields_of(DepthFile)) == {"frames", "file", "scale"}
 

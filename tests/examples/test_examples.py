@@ -54,3 +54,10 @@ def test_example_runs(script, args, expected, tmp_path, run):
     assert expected in run(script, *args)
     if "--out" in args:
         assert (tmp_path / args[args.index("--out") + 1]).exists()
+
+
+@pytest.mark.slow
+def test_four_phones(run):
+    pytest.importorskip("pycolmap")
+    printed = run("11_four_phones.py", "--frames", "75", "--walk", "200")
+    assert "phone3: to be trusted" in printed and "offsets: off by" in printed

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from otsync import PAPER, TrackSet, synchronize
 from otsync.cli import main
@@ -576,6 +577,89 @@ def test_options_of_simulate_and_demo(tmp_path):
         assert demo(*args) != first, args
 
 
+def test_options_of_film(tmp_path):
+    def filmed(*args: str) -> dict[str, bytes]:
+        out = tmp_path / "-".join(args or ("plain",))
+        tiny = ["--phones", "2", "--frames", "3", "--walk", "3", "--width", "64", "--height", "36"]
+        assert run(["film", str(out), *tiny, *args])[0] == 0
+        return {p.name: p.read_bytes() for p in sorted(out.iterdir())}
+
+    plain = filmed()
+    assert set(plain) >= {"phone0.mp4", "phone1.mp4", "walk.mp4", "truth.json", "cameras.json"}
+    for args in (
+        ["--phones", "3"],
+        ["--gap", "50"],
+        ["--handheld"],
+        ["--walk", "4"],
+        ["--frames", "4"],
+        ["--fps", "25"],
+        ["--width", "80"],
+        ["--height", "40"],
+        ["--max-offset", "2"],
+        ["--contrast", "0.5"],
+        ["--seed", "5"],
+    ):
+        assert filmed(*args) != plain, args
+    code, _, err = run(["film", str(tmp_path / "plain")])
+    assert code == 2 and "holds some" in err
+
+
+@pytest.fixture(scope="module")
+def phones(tmp_path_factory) -> Path:
+    """Three phones and a walk past them, as folders of images: no clock, no cameras."""
+    from otsync.simulate.phones import Tripod, Walk
+    from otsync.simulate.room import RoomCamera, draw_room
+
+    folder, rng, size = tmp_path_factory.mktemp("phones"), np.random.default_rng(2), (400, 226)
+    K = np.array([[340.0, 0, 200], [0, 340, 113], [0, 0, 1]])
+    room = draw_room(2, things=1)
+    still = Tripod()
+    poses = {f"phone{n}": still(float(a), np.zeros(1), rng)[None] for n, a in enumerate((-0.6, 0.0, 0.6))}
+    poses["walk"] = Walk(-0.7, 0.7, sway=0.03)(0.0, np.arange(12) / 0.7, rng)
+    for name, w2c in poses.items():
+        (folder / name).mkdir()
+        eye = RoomCamera(room, K, size, rng)
+        for k, pose in enumerate(w2c):
+            Image.fromarray(eye.film(pose, 0.0)[0]).save(folder / name / f"{k:02d}.png")
+    (folder / "given.json").write_text(json.dumps({"*": {"K": (K * [[1.02], [1.02], [1]]).tolist()}}))
+    return folder
+
+
+@pytest.mark.slow
+def test_options_of_calibrate(phones, tmp_path):
+    pytest.importorskip("pycolmap")
+    out = tmp_path / "out"
+    run(["init", str(phones), "--fps", "30"])
+
+    def calibrated(*args: str) -> tuple[str, str]:
+        code, told, err = run(["calibrate", str(phones), "--out", str(out), *args])
+        assert code in (0, 1), err
+        return (phones / "scene.json").read_text(), told
+
+    document, table = calibrated()
+    assert (out / "calibration.html").is_file() and "phone1" in table
+    for args in (
+        ["--key-frames", "9"],
+        ["--width", "300"],
+        ["--seed", "3"],
+        ["--distance", "phone0", "phone1", "12"],
+    ):
+        assert calibrated(*args)[0] != document, args
+    again, told = calibrated("--json")
+    assert again == document and json.loads(told) == json.loads(document)["calibration"]
+    assert calibrated("--intrinsics", str(phones / "given.json"))[0] != document
+    scene = json.loads(document)
+    scene.pop("calibration")
+    (phones / "scene.json").write_text(json.dumps(scene))  # poses from elsewhere are not thrown away
+    code, _, err = run(["calibrate", str(phones), "--out", str(out)])
+    assert code == 2 and "--force" in err
+    assert "calibration" in json.loads(calibrated("--force")[0])
+    code, _, err = run(["calibrate", str(phones), "--board", "9x6"])  # what it does is in test_boards.py
+    assert code == 2 and "--board" in err and "board.mp4" in err
+    code, _, err = run(["calibrate", str(tmp_path / "nowhere")])
+    assert code == 2 and "nowhere" in err
+
+
 def test_options_of_bench_reach_a_suite_or_are_refused(tmp_path):
     from otsync import plugins
 
@@ -639,6 +723,9 @@ def rows() -> set[str]:
         "recording.allow_outside recording.workers recording.masks recording.points recording.features",
         "demo": "out motion preset videos seed",
         "simulate": "out motion preset videos frames fps max_offset own_frames seed",
+        "film": "out phones gap handheld walk frames fps width height max_offset contrast seed",
+        "calibrate": "folder out force options.intrinsics options.board options.distance options.key_frames options.width "
+        "options.seed json",
         "init": "folder out reader fps force",
         "check": "scene every_frame allow_outside",
         "export": "recording offsets out what cameras width fps force allow_outside",

@@ -320,3 +320,14 @@ def test_detrending_reaches_as_far_back_as_ahead():
     x = np.random.default_rng(2).normal(size=(2, 30))
     known = np.random.default_rng(3).random((2, 30)) < 0.9
     np.testing.assert_allclose(detrended(x[:, ::-1], known[:, ::-1], 4), detrended(x, known, 4)[:, ::-1], atol=1e-12)
+
+
+@pytest.mark.parametrize(("level", "weak"), [(0.0, False), (-100.0, True)])
+def test_a_peak_that_outliers_explain_better_is_weak(level, weak):
+    """The shape of the curve is the same: a sharp lone peak. Below 0 the outlier floor beats every candidate."""
+    lags = np.arange(-60, 61)
+    total = 80 * np.exp(-0.5 * ((lags - 7) / 2) ** 2) + np.sin(lags) + level
+    pairs = np.stack([np.arange(30)] * 2, 1)
+    found = EpipolarScan()._answer(lags, total, np.full(121, 4.0), 0.0, FPS, Matches(pairs, np.ones(30)))
+    assert found.offset * FPS == pytest.approx(7, abs=0.3)
+    assert (Status.WEAK in found.flags) == weak

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from otsync.io.document import FORMAT, VERSION
-from otsync.recordings.check import FROM_OPENGL, check_scene
+from otsync.recordings.check import FROM_OPENGL, READINGS, check_scene, flip
 from tests.recording_world import ring
 
 
@@ -61,6 +61,36 @@ def test_the_mirrored_camera_to_world_trap(sound):
 
     found = findings(sound, change)
     assert any(f.severity == "error" and "det(R) = -1" in f.what and "invert" in f.remedy for f in found)
+
+
+@pytest.mark.parametrize("told", READINGS)
+def test_readings_of_mirrored_matrices_do_what_they_say(sound, told):
+    """The remedy that is printed gives back the poses of the scene, once it is the one that was spoilt."""
+    _, document = sound
+    true = [np.array(video["camera"]["w2c"]) for video in document["videos"]]
+    row = int(told[-1]) if "row" in told else int(told.split(",")[0][-1])
+    spoil = (lambda m: flip(row) @ m) if "row" in told else (lambda m: np.linalg.inv(m) @ flip(row))
+    for m in true:
+        np.testing.assert_allclose(READINGS[told](spoil(m)), m, atol=1e-9)
+    found = findings(sound, lambda videos: each_pose(videos, spoil))
+    assert any("det(R) = -1" in f.what and told in f.remedy for f in found), text(found)
+
+
+def test_mirrored_matrices_that_fit_nothing_are_said_to(sound):
+    def change(videos):
+        for n, v in enumerate(videos):
+            angle = 1.7 * n
+            turn = np.eye(4)
+            turn[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+            v["camera"]["w2c"] = (flip(2) @ turn[[1, 2, 0, 3]] @ np.array(v["camera"]["w2c"])).tolist()
+
+    assert any("No reading" in f.remedy for f in findings(sound, change))
+
+
+def test_a_principal_point_that_no_resizing_explains_is_a_warning(sound):
+    """A public laboratory recording is calibrated so, and synchronises."""
+    found = findings(sound, lambda v: set_camera(v, "K", [[26, 0, 0.5], [0, 26, 25], [0, 0, 1]]))
+    assert [f.severity for f in found if "principal point" in f.what] == ["warning"], text(found)
 
 
 @pytest.mark.parametrize(

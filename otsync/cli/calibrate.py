@@ -1,0 +1,222 @@
+"""``otsync calibrate`` and ``otsync film``."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from ..calibrate.verb import CalibrateOptions
+from ..progress import tell
+
+if TYPE_CHECKING:
+    from ..calibrate import Calibration
+
+
+@dataclass
+class Calibrate:
+    """Find the cameras of a folder of videos, and write them to its scene.json.
+
+    Example: otsync calibrate holiday/
+
+    Beside the videos may lie walk.mp4, a clip for which one phone was carried past all cameras: where cameras stand far
+    apart, nothing else links them. A camera that is not to be trusted is named with the reason and what to film; what
+    was found is written all the same, and the exit code is 1.
+    """
+
+    folder: tyro.conf.Positional[Path]
+    """Video files, folders of images, or a scene.json whose cameras are still missing."""
+    out: Path | None = None
+    """Folder for calibration.html and the stages, from which a killed run continues; default: FOLDER/calibration."""
+    force: bool = False
+    """Replace cameras that scene.json already has."""
+    options: Annotated[CalibrateOptions, tyro.conf.arg(name="")] = field(default_factory=CalibrateOptions)
+
+    json: bool = False
+    """Print what was found as JSON instead of a table."""
+
+    def run(self) -> int:
+        from ..files.claim import claimed
+
+        if not self.folder.is_dir():
+            raise ValueError(f"{self.folder}: expected a folder of videos; found none. Check the path.")
+        with claimed(self.out or self.folder / "calibration", "otsync calibrate") as out:
+            return self._run(out)
+
+    def _run(self, out: Path) -> int:
+        found = calibrate_folder(self.folder, out, self.options, force=self.force)
+        if self.json:
+            from ..calibrate.document import told_of
+            from .tables import print_json
+
+            print_json(told_of(found))
+        else:
+            print(camera_table(found))
+            print(f"wrote {self.folder / 'scene.json'} and {out / 'calibration.html'}")
+        return told_doubts(found)
+
+
+def calibrate_folder(folder: Path, out: Path, options: CalibrateOptions, *, force: bool = False) -> Calibration:
+    """Calibrate a folder and write its scene.json; stages and pages go to ``out``."""
+    from ..calibrate import calibrate
+    from ..calibrate.clips import uncalibrated
+    from ..calibrate.document import calibrated_document
+    from ..files.arrays import write_json
+    from ..files.cache import Cache
+    from ..report.cameras import write_cameras
+
+    document = uncalibrated(folder)
+    if has_poses(document) and not force:
+        raise ValueError(
+            f"{folder / 'scene.json'}: has cameras that otsync calibrate did not find. Use them as they are, or pass "
+            "--force to replace them."
+        )
+    found = calibrate(folder, options, cache=Cache(out / "stages"), tell=tell)
+    if found.found:
+        write_json(folder / "scene.json", calibrated_document(document, found))
+    write_cameras(out / "calibration.html", found)
+    return found
+
+
+def prepared(path: Path, *, allow_outside: bool = False) -> int:
+    """Make a folder of videos that nobody calibrated ready to be synchronised: init, calibrate, check; 1 for doubts.
+
+    A folder with a scene.json, or whose reader knows the cameras, stays as it is: 0. What is done is printed on stderr.
+    ValueError where fewer than two cameras can be found.
+    """
+    if not path.is_dir() or (path / "scene.json").exists():
+        return 0
+    from ..files.claim import claimed
+    from ..io.scene import read_document
+    from ..recordings.check import check_scene
+
+    document, _ = read_document(path)
+    if all((video.get("camera") or {}).get("w2c") is not None for video in document["videos"]):
+        return 0
+    clockless = [item for item in document.get("missing") or () if "fps" in item]
+    if clockless:
+        raise ValueError(f"{path}: still missing: {'; '.join(clockless)}. Give it first: otsync init {path} --fps 30.")
+    tell(f"{path}: no scene.json and no cameras: looking for them (otsync calibrate {path})")
+    with claimed(path / "calibration", "otsync calibrate") as out:
+        found = calibrate_folder(path, out, CalibrateOptions())
+    tell(camera_table(found))
+    doubts = told_doubts(found)
+    if len(found.found) < 2:
+        raise ValueError(
+            f"{path}: expected cameras of two videos and more; found {len(found.found)}. {found.cameras[0].remedy}"
+        )
+    for finding in check_scene(path, every_frame=False, allow_outside=allow_outside):
+        print(f"{finding.severity}: {finding.video or 'scene'}: {finding.what} {finding.remedy}", file=sys.stderr)
+    tell(f"wrote {path / 'scene.json'}; synchronising (otsync sync {path})")
+    return doubts
+
+
+def has_poses(document: dict[str, Any]) -> bool:
+    """Whether a scene document has the pose of a camera."""
+    return any((video.get("camera") or {}).get("w2c") is not None for video in document["videos"])
+
+
+def camera_table(found: Calibration) -> str:
+    """The cameras as text."""
+    width = max(5, *(len(c.name) for c in found.cameras))
+    unit = {"metres": "m", "arbitrary": "units"}[found.unit]
+    lines = [
+        f"{'video':{width}}  {'focal':>7} {'lens':>7} {'turn':>8} {'place':>10} {'matches':>7} {'points':>6}  status"
+    ]
+    for c in found.cameras:
+        turn = f"±{c.sigma_degrees:.2f}°" if c.sigma_degrees == c.sigma_degrees else "–"
+        place = f"±{c.sigma_position:.3f} {unit}" if c.sigma_position == c.sigma_position else "–"
+        status = "ok" if c.ok else "doubtful" if c.w2c is not None else "not found"
+        moves = ", moves" if c.w2c is not None and c.w2c.ndim == 3 else ""
+        lines.append(
+            f"{c.name:{width}}  {c.K[0, 0]:7.1f} {c.lens:>7} {turn:>8} {place:>10} {c.inliers:7d} {c.points:6d}  "
+            f"{status}{moves}"
+        )
+    return "\n".join(lines)
+
+
+def told_doubts(found: Calibration) -> int:
+    """Say which cameras are not to be trusted, why, and what to film, on stderr; 1 where there are any, else 0."""
+    remedies = []
+    for camera in found.cameras:
+        if not camera.ok:
+            print(f"{camera.name}: {camera.doubt}", file=sys.stderr)
+            remedies.append(camera.remedy)
+    for remedy in dict.fromkeys(remedies):
+        print(f"what to do: {remedy}", file=sys.stderr)
+    return 0 if found.ok else 1
+
+
+@dataclass
+class Film:
+    """Film a simulated room with phones that nobody calibrated: video files, and the truth beside them.
+
+    Example: otsync film room/ --seed 3
+
+    Then: otsync calibrate room/ and otsync sync room/ --truth room/truth.json
+    """
+
+    out: tyro.conf.Positional[Path]
+    """Folder for phone0.mp4, phone1.mp4, ..., walk.mp4, truth.json (their offsets) and cameras.json (their cameras)."""
+    phones: int = 4
+    gap: float = 80.0
+    """Degrees between neighbours."""
+    handheld: bool = False
+    """Phones sway in hands; off: they stand on tripods."""
+    walk: int = 600
+    """Frames of the clip that is carried past all phones; 0: none is filmed."""
+    frames: int = 150
+    fps: float = 30.0
+    width: int = 640
+    height: int = 360
+    max_offset: float = 20.0
+    """Largest offset, in frames."""
+    contrast: float = 1.0
+    """Of what the walls carry, from 0 to 1."""
+    seed: int = 0
+
+    def run(self) -> int:
+        from ..files.claim import claimed
+
+        with claimed(self.out, "otsync film"):
+            return self._run()
+
+    def _run(self) -> int:
+        from ..io.document import write_document
+        from ..simulate.phones import Hand, Tripod, film
+        from ..simulate.room import draw_room
+        from ..types import Offsets
+
+        if any(self.out.glob("*.mp4")):
+            raise ValueError(f"{self.out}: expected a folder without videos; it holds some. Choose another.")
+        truth = film(
+            self.out,
+            self.seed,
+            phones=self.phones,
+            gap=self.gap,
+            held=Hand() if self.handheld else Tripod(),
+            walk=self.walk,
+            frames=self.frames,
+            fps=self.fps,
+            size=(self.width, self.height),
+            max_offset=self.max_offset,
+            room=draw_room(self.seed, contrast=self.contrast),
+        )
+        cameras = [(name, camera) for name, camera in zip(truth.names, truth.cameras, strict=True)]
+        if truth.walk is not None:
+            cameras.append(("walk", truth.walk))
+        videos: list[dict[str, Any]] = [
+            {
+                "name": name,
+                "file": f"{name}.mp4",
+                "camera": {"K": c.K.tolist(), "w2c": c.w2c.tolist(), "width": c.width, "height": c.height},
+            }
+            for name, c in cameras
+        ]
+        write_document(self.out / "cameras.json", videos)
+        Offsets.known(truth.names, truth.offsets, truth.fps).save(self.out / "truth.json")
+        print(f"{self.out}: {', '.join(video['file'] for video in videos)}; truth.json, cameras.json")
+        return 0

@@ -1,0 +1,79 @@
+"""Cameras in a wrong place: by how their pairs fare, and by what their calibration says."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from otsync.io import open_scene
+from otsync.priors.stereo import EmptyHull
+from otsync.recordings import routes
+from otsync.recordings.placement import misplaced, with_doubts
+from otsync.types import Alignment, Offsets, Status
+from tests.recording_world import write_recording
+
+
+def offsets(bad: set[tuple[int, int]], videos: int = 5, residual: float = 0.0) -> Offsets:
+    """Offsets whose pairs are sound, but for ``bad`` ones."""
+    pairs = {
+        (a, b): Alignment(
+            0.0,
+            fps=30.0,
+            flags=(Status.WEAK,) if (a, b) in bad and not residual else (),
+            stats={"residual": residual / 30 if (a, b) in bad else 0.0},
+        )
+        for a in range(videos)
+        for b in range(a + 1, videos)
+    }
+    known = Offsets.known([f"v{n}" for n in range(videos)], np.zeros(videos), 30.0)
+    return replace(known, alignments=pairs)
+
+
+@pytest.mark.parametrize("residual", [0.0, 4.0])
+def test_the_camera_whose_pairs_fail_is_named_and_no_other(residual):
+    bad = {(min(a, 2), max(a, 2)) for a in (0, 1, 3, 4)}
+    assert misplaced(offsets(bad, residual=residual)) == {"v2"}
+    assert misplaced(offsets(set())) == set()
+    assert misplaced(offsets({(0, 1), (1, 2)})) == set()  # half of its pairs: far cameras have such
+
+
+def test_two_pairs_tell_nothing_of_a_camera():
+    assert misplaced(offsets({(0, 1), (1, 2)}, videos=3)) == set()
+
+
+def test_doubts_become_flags_beside_others():
+    found = with_doubts(offsets(set()), {"v1", "nobody"})
+    assert [status.code for status in found.status] == ["ok", "misplaced", "ok", "ok", "ok"]
+    assert with_doubts(found, {"nobody"}) is found
+
+
+def test_what_calibrate_doubts_sync_flags(tmp_path):
+    write_recording(tmp_path, [0.0, 2.0], frames=3)
+    document = json.loads((tmp_path / "scene.json").read_text())
+    cameras = {"cam0": {"lens": "found"}, "cam1": {"lens": "guessed", "doubtful": "its focal length is a guess."}}
+    document["calibration"] = {"method": "global", "unit": "arbitrary", "cameras": cameras}
+    (tmp_path / "scene.json").write_text(json.dumps(document))
+    scene = open_scene(tmp_path)
+    assert scene.doubtful == {"cam1": "its focal length is a guess."}
+    assert scene.take(["cam1"]).doubtful == scene.doubtful
+
+
+def test_an_empty_hull_leaves_the_epipolar_answer(tmp_path, monkeypatch):
+    write_recording(tmp_path, [0.0] * 5, frames=2)
+    scene, first = open_scene(tmp_path), offsets(set())
+
+    def empty(*args, **more):
+        raise EmptyHull("masks: their visual hull is empty.")
+
+    monkeypatch.setattr(routes, "track_all", lambda *args: [None] * 5)
+    monkeypatch.setattr(routes, "select", lambda *args: None)
+    monkeypatch.setattr(routes, "pairs_in_pixels", lambda *args: first)
+    monkeypatch.setattr(routes, "stereo_depth", empty)
+    found = routes.synchronize_scene(scene)
+    assert found.route == "epipolar" and any("visual hull is empty" in line for line in found.why)
+    np.testing.assert_array_equal(found.offsets.seconds, first.seconds)
+    with pytest.raises(EmptyHull):
+        routes.synchronize_scene(scene, route="stereo")
