@@ -24,7 +24,8 @@ def main(
     out: Path = Path("out/phones"), handheld: bool = False, frames: int = 120, walk: int = 400, seed: int = 3
 ) -> None:
     """Args:
-    handheld: six phones in hands instead of four on tripods. frames: of each video. walk: of the walk, which hands need not.
+    handheld: six phones in hands instead of four on tripods. frames: of each video. walk: of the walk, which hands
+    need not.
     """
     if handheld:
         truth = film(out / "videos", seed, held=Hand(), phones=6, gap=40, frames=frames, walk=0)

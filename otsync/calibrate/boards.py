@@ -1,7 +1,7 @@
 """Lenses from clips of a board: a checkerboard, or a ChArUco board (a checkerboard with markers), by OpenCV.
 
-A clip ``board left.mp4`` is of the lens that filmed ``left``; ``board.mp4`` is of all videos without a clip of their own
-and of the same size. A board fixes a phone's lens once; it must be filmed in the mode that films the scene.
+A clip ``board left.mp4`` is of the lens that filmed ``left``; ``board.mp4`` is of all videos without a clip of their
+own and of the same size. A board fixes a phone's lens once; it must be filmed in the mode that films the scene.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Board:
 
     @classmethod
     def parse(cls, text: str) -> Board:
-        """``9x6`` (inner corners of a checkerboard), or ``5x7:DICT_4X4_50`` (squares and markers of a ChArUco board)."""
+        """``9x6`` (inner corners of a checkerboard), or ``5x7:DICT_4X4_50`` (squares, markers of a ChArUco board)."""
         match = re.fullmatch(r"(\d{1,3})x(\d{1,3})(?::(DICT_\w+))?", text.strip())
         if not match or min(int(match[1]), int(match[2])) < 3:
             raise ValueError(
@@ -111,8 +111,8 @@ def lens_of(clip: Clip, board: Board) -> Lens:
     )
     if error > WORST * max(w, h) / 1000:
         raise ValueError(
-            f"{clip.name}: expected a flat board; found corners that are {error:.1f} pixels off. Check --board, and that "
-            "the board is flat."
+            f"{clip.name}: expected a flat board; found corners that are {error:.1f} pixels off. Check --board, and "
+            "that the board is flat."
         )
     normals = np.array([cv2.Rodrigues(turn)[0][:, 2] for turn in turns])
     if np.degrees(np.arccos(np.clip(normals @ normals.T, -1, 1))).max() < TILT:

@@ -47,9 +47,9 @@ class Thresholds:
     """What a mapper asks for before it believes. Strict: on the dome looser ones added wrong cameras, no right ones.
 
     Args:
-        matches: verified matches of a pair of pictures; of several numbers each is tried. pose: matches that agree on a new picture's pose, and
-        share: which part of all of them that must be. first: matches of the first pair, and angle: degrees between its
-        rays.
+        matches: verified matches of a pair of pictures; of several numbers each is tried. pose: matches that agree on a
+        new picture's pose, and share: which part of all of them that must be. first: matches of the first
+        pair, and angle: degrees between its rays.
     """
 
     matches: tuple[int, ...] = (30, 45, 60, 80)

@@ -16,7 +16,7 @@ from .mapping import Model, lenses_found
 from .world import centres, degrees, laid_over
 
 FEW_INLIERS = 50
-"""Verified matches with the nearest picture: of pairs with 30 to 50 half are right, of those with 50 to 80 92 % (dome)."""
+"""Verified matches with the nearest picture: of pairs with 30 to 50 half are right, of those with 50 to 80 92 %."""
 
 MAPPERS_TURN, MAPPERS_MOVE = 2.0, 0.05
 """How far two mappers may disagree: degrees, and shares of the distance to the middle of the cameras."""
@@ -41,8 +41,8 @@ class Agreement:
     Args:
         turn, move: (V,) degrees, and shares of the distance to the middle of the cameras: the median over each video's
             pictures; nan for a video that either model lacks.
-        whole: whether most pictures agree. If not, no camera is confirmed: two worlds can always be laid over each other
-            so that some few do.
+        whole: whether most pictures agree. If not, no camera is confirmed: two worlds can always be laid over each
+            other so that some few do.
     """
 
     turn: Float[np.ndarray, " V"]
@@ -73,9 +73,9 @@ def agreement(one: Model, other: Model | None, of: np.ndarray, videos: int) -> A
 def spread(model: Model, of: np.ndarray, videos: int) -> tuple[Float[np.ndarray, " V"], Float[np.ndarray, " V"]]:
     """Standard deviations of every video's pose: degrees, and units of the model; nan where they are not known.
 
-    Poses from either half of the points differ by twice the standard deviation of those from all of them. Each video's is
-    the root of the mean square over its pictures, and no less than a third of that over all: two halves of one picture
-    may agree by chance.
+    Poses from either half of the points differ by twice the standard deviation of those from all of them. Each video's
+    is the root of the mean square over its pictures, and no less than a third of that over all: two halves of one
+    picture may agree by chance.
     """
     turn, move = np.full(videos, np.nan), np.full(videos, np.nan)
     if len(model.halves) != 2 or len(model.pictures) < 3:

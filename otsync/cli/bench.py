@@ -58,7 +58,7 @@ class Bench:
     promises: bool = False
     """For sync and match: measure what is promised, on fresh seeds, instead of the tables."""
     first_seed: int | None = None
-    """For core, match, sync, panoptic, chain, own-frames and calibrate: where the seeds begin; default: the suite's own."""
+    """For core, match, sync, panoptic, chain, own-frames and calibrate: where they begin; default: the suite's own."""
     seeds: int | None = None
     """For core, match, sync, chain, own-frames and calibrate: how many seeds; default: the suite's own."""
     only: tuple[str, ...] = ()

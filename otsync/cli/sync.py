@@ -36,8 +36,8 @@ class Sync:
     """
 
     tracks: tyro.conf.Positional[tuple[Path, ...]]
-    """A scene.json, a folder with one (also in Panoptic layout), or a folder of videos; or track sets (.npz written by otsync), one per
-    video, in one world frame."""
+    """A scene.json, a folder with one (also in Panoptic layout), or a folder of videos; or track sets (.npz
+    written by otsync), one per video, in one world frame."""
     out: Path = Path("sync")
     """Folder for offsets.json and report.html, and the stages of a recording, from which a killed run continues."""
     reference: str | None = None

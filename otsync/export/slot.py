@@ -177,7 +177,7 @@ def file_names(names: Sequence[str], suffix: str) -> list[str]:
 
 
 def reopened(frames: Sequence) -> Sequence:
-    """The same frames with a decoder of their own, so that two readers of one file do not send each other to and fro."""
+    """The same frames with a decoder of their own, so that two readers of one file do not disturb each other."""
     if isinstance(frames, FrameRange):
         base = reopened(frames.base)
         return FrameRange(base, frames.picks) if isinstance(base, LazyFrames) else frames

@@ -217,7 +217,8 @@ def camera_from(value: Any) -> Camera:
     """A camera of the document. ValueError says which field is missing."""
     if not isinstance(value, dict):
         raise ValueError(
-            "camera: expected K, w2c, width and height; found none. Add the calibration, or let it be found: otsync calibrate."
+            "camera: expected K, w2c, width and height; found none. Add the calibration, or let otsync calibrate "
+            "find it."
         )
     missing = [f for f in ("K", "w2c", "width", "height") if value.get(f) is None]
     if missing:

@@ -66,8 +66,8 @@ class FlowResidual:
     Args:
         threshold: pixels of distance at 640 of width, over ``step`` frames (a longer step sees slower motion).
         back: look at the frame before as well as at the one after: what moves along its own line in the one pair of
-            frames seldom does in the other. Of fast balls before a phone in a hand 101 tracks lived long enough with it,
-            13 without.
+            frames seldom does in the other. Of fast balls before a phone in a hand 101 tracks lived long enough with
+            it, 13 without.
     """
 
     threshold: float = 1.0

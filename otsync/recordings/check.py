@@ -206,8 +206,8 @@ def _unmirrored(entries: Sequence[dict[str, Any]]) -> str:
     if not fitting:
         return "No reading of it makes the cameras look at one place: check what the matrices are."
     return (
-        f"Read like this, the cameras look at one place: {'; or '.join(fitting)}. Those that are left differ in what is "
-        "up or left: look at the images."
+        f"Read like this, the cameras look at one place: {'; or '.join(fitting)}. Those that are left differ in what "
+        "is up or left: look at the images."
     )
 
 
@@ -258,16 +258,16 @@ def _intrinsics(video: Video) -> Iterable[Finding]:
                 "error",
                 video.name,
                 what,
-                f"K probably belongs to another resolution, of {across:.3g} times the width: divide its first two rows by "
-                "that.",
+                f"K probably belongs to another resolution, of {across:.3g} times the width: divide its first two rows "
+                "by that.",
             )
         else:
             yield Finding(
                 "warning",
                 video.name,
                 what,
-                "Some laboratories calibrate so: if the calibration's own residuals are small, leave it. Else check K, or "
-                "whether the images were cut.",
+                "Some laboratories calibrate so: if the calibration's own residuals are small, leave it. Else check K, "
+                "or whether the images were cut.",
             )
     if not FOCAL[0] * w < K[0, 0] < FOCAL[1] * w:
         yield Finding(

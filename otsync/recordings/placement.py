@@ -10,8 +10,8 @@ import numpy as np
 from ..types import Offsets, Status
 
 SOUND = 0.3
-"""Share of a camera's pairs that must be trusted and agree with the answer. On the dome: cameras in the right place .5 to
-1, far ones included; cameras 72 degrees off 0."""
+"""Share of a camera's pairs that must be trusted and agree with the answer. On the dome: cameras in the right place .5
+to 1, far ones included; cameras 72 degrees off 0."""
 
 LEAST_PAIRS = 3
 """Pairs of a camera below which their share says nothing."""
@@ -29,7 +29,8 @@ def with_doubts(offsets: Offsets, doubtful: Collection[str]) -> Offsets:
 
 
 def misplaced(offsets: Offsets) -> set[str]:
-    """Names of the videos most of whose pairs are flagged or contradict the answer, the worst first: its pairs then count no more.
+    """Names of the videos most of whose pairs are flagged or contradict the answer, the worst first: its pairs then count
+    no more.
 
     A camera in a wrong place spoils the pairs of the others too; without it theirs are sound.
     """

@@ -28,8 +28,8 @@ COMMON_ERRORS = 4.0
 the square of the noise, and neither residuals nor other windows show them."""
 
 LONG = 180 / 30
-"""Seconds of overlap from which a rate is looked for: over less, one of 1 % moves the ends by less than a frame, and what
-whole videos have in common (drifting depth, limbs) looks like one: real cameras, 3.3 s, "1.010 ± .0015"."""
+"""Seconds of overlap from which a rate is looked for: over less, one of 1 % moves the ends by less than a frame, and
+what whole videos have in common (drifting depth, limbs) looks like one: real cameras, 3.3 s, "1.010 ± .0015"."""
 
 AT_ENDS = 0.1
 """Share of ``blur`` by which errors that a whole video shares move either end of the overlap by itself."""

@@ -49,7 +49,8 @@ def _pictures(cameras: Sequence[FoundCamera], points: Float[np.ndarray, "M 3"]) 
     for title, axes in VIEWS.items():
         drawn.append(f"<figure style='display:inline-block;margin:0'>{_picture(cameras, points, axes)}")
         drawn.append(f"<figcaption>{title}</figcaption></figure>")
-    return f"<div>{''.join(drawn)}</div><p class=s>A line is the way of a camera that moves; dots are what stands still.</p>"
+    what = "A line is the way of a camera that moves; dots are what stands still."
+    return f"<div>{''.join(drawn)}</div><p class=s>{what}</p>"
 
 
 def _picture(cameras: Sequence[FoundCamera], points: Float[np.ndarray, "M 3"], axes: Float[np.ndarray, "2 3"]) -> str:

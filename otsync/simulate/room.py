@@ -215,8 +215,8 @@ def _eye(w2c: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, " 3"]:
 def look_at(
     eye: Float[np.ndarray, " 3"], target: Float[np.ndarray, " 3"], turn: Float[np.ndarray, " 3"] | None = None
 ) -> Float[np.ndarray, "4 4"]:
-    """World to camera of an upright camera (y down) at ``eye`` that looks at ``target``, then turned by ``turn`` (rotation
-    vector in camera axes, rad)."""
+    """World to camera of an upright camera (y down) at ``eye`` that looks at ``target``, then turned by ``turn``
+    (rotation vector in camera axes, rad)."""
     import cv2
 
     forward = (target - eye) / np.linalg.norm(target - eye)

@@ -56,8 +56,8 @@ class Camera:
             )
         if (np.linalg.det(R) < 0).any():
             raise ValueError(
-                "Camera.w2c: expected det(R) = +1; found -1, a mirrored frame: one axis points the wrong way. Negate that "
-                "axis; otsync check tries which readings of the matrices fit."
+                "Camera.w2c: expected det(R) = +1; found -1, a mirrored frame: one axis points the wrong way. Negate "
+                "that axis; otsync check tries which readings of the matrices fit."
             )
         if int(self.width) < 1 or int(self.height) < 1:
             raise ValueError(f"Camera.width, height: expected positive pixels; found {self.width} x {self.height}.")

@@ -249,7 +249,7 @@ def _strip_header(strip: Strip) -> dict[str, Any]:
 
 
 def _gaussians(packing: Packing, part: str, gaussians: Gaussians | None, centre: np.ndarray, finest: float) -> int:
-    """Packs how Gaussians look, and where they rest; how many they are. Those too faint to be drawn keep their place."""
+    """Packs how Gaussians look, and where they rest; how many they are. Those too faint keep their place."""
     if gaussians is None or not len(gaussians):
         return 0
     flat = gaussians.detach().finite()

@@ -724,8 +724,8 @@ def rows() -> set[str]:
         "demo": "out motion preset videos seed",
         "simulate": "out motion preset videos frames fps max_offset own_frames seed",
         "film": "out phones gap handheld walk frames fps width height max_offset contrast seed",
-        "calibrate": "folder out force options.intrinsics options.board options.distance options.key_frames options.width "
-        "options.seed json",
+        "calibrate": "folder out force options.intrinsics options.board options.distance options.key_frames "
+        "options.width options.seed json",
         "init": "folder out reader fps force",
         "check": "scene every_frame allow_outside",
         "export": "recording offsets out what cameras width fps force allow_outside",

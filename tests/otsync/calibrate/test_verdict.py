@@ -65,7 +65,7 @@ def test_mappers_agree_up_to_a_similarity():
 
 
 def test_half_of_a_symmetric_room_turned_confirms_nothing():
-    """A dome of 72 degrees: one mapper turns three of six cameras by a step. None of them is confirmed by the others."""
+    """A dome of 72 degrees: one mapper turns three of six cameras by a step. None of them is confirmed."""
     w2c = np.stack([c.w2c for c in ring(6)])
     angle = np.radians(72)
     turn = np.eye(4)

@@ -315,7 +315,10 @@ def test_clocks_as_filmed_and_synchronised(opened, scene_page):
     opened.page.click("#clocks label:has([value=synchronised])")
     np.testing.assert_array_equal(opened.rested().picture(tile), before)
     np.testing.assert_array_equal(opened.picture("#videos li:nth-child(1) canvas"), reference)
-    own = "([v, t]) => { const c = new Clocks(JSON.parse(textOf('about'))); return [c.own(c.cameras[v], t), c.at(c.cameras[v], c.own(c.cameras[v], t)), c.shown(c.cameras[v], t)]; }"
+    own = """([v, t]) => {
+        const c = new Clocks(JSON.parse(textOf('about'))), own = c.own(c.cameras[v], t);
+        return [own, c.at(c.cameras[v], own), c.shown(c.cameras[v], t)];
+    }"""
     shown = opened.page.evaluate(own, [2, 0.5])
     assert shown == pytest.approx([(0.5 - 0.16) / 1.02, 0.5, 0.5])
 
@@ -353,7 +356,10 @@ def test_a_phone_shows_everything_and_is_steered_by_touch(browser, scene_page):
     shown.open(scene_page)
     assert shown.page.evaluate("document.documentElement.scrollWidth <= innerWidth")
     before = shown.picture("#view")
-    touch = "(kind, id, x, y) => part('view').dispatchEvent(new PointerEvent(kind, { pointerId: id, clientX: x, clientY: y, bubbles: true, buttons: kind === 'pointermove' ? 1 : 0 }))"
+    touch = """(kind, id, x, y) => {
+        const more = { bubbles: true, buttons: kind === 'pointermove' ? 1 : 0 };
+        part('view').dispatchEvent(new PointerEvent(kind, { pointerId: id, clientX: x, clientY: y, ...more }));
+    }"""
     shown.page.evaluate("part('view').setPointerCapture = () => {}")
     for kind, id_, x, y in [
         *(("pointerdown", 1, 150, 200), ("pointerdown", 2, 200, 200)),
