@@ -29,8 +29,9 @@ def with_doubts(offsets: Offsets, doubtful: Collection[str]) -> Offsets:
 
 
 def misplaced(offsets: Offsets) -> set[str]:
-    """Names of the videos most of whose pairs are flagged or contradict the answer, the worst first: its pairs then count
-    no more.
+    """Names of the videos most of whose pairs are flagged or contradict the answer.
+
+    The worst comes first, and its pairs then count no more.
 
     A camera in a wrong place spoils the pairs of the others too; without it theirs are sound.
     """
