@@ -148,7 +148,7 @@ def mend_clocks(
     ``tracks`` is changed in place. A mend is kept where it adds to the evidence of the video's pairs.
     """
     broken: dict[int, tuple[Break, ...]] = {}
-    unsteady: set[int] = set()
+    doubtful_mends: set[int] = set()
     fps = [nominal_fps(t) for t in tracks]
     for _ in range(MOST):
         doubtful = [a for a in verdict.answers if len(a.scanned.parts) and not NOTHING_COMMON & set(a.scanned.flags)]
@@ -165,9 +165,12 @@ def mend_clocks(
         broken[v] = (*earlier, _on_own_clock(exact, earlier))
         verdict = judged([fresh.get(a.pair, a) for a in verdict.answers])
         if not steady_beside(fresh, tracks, v, exact):
-            unsteady.add(v)
-    if unsteady:
-        verdict = judged([_doubted(a) if unsteady & set(a.pair) else a for a in verdict.answers])
+            doubtful_mends.add(v)
+    # a clock that is whole again is so against every video: one pair that still breaks speaks against the mend
+    still = {v for a in verdict.answers if Status.BROKEN_CLOCK in a.refined.flags for v in a.pair}
+    doubtful_mends |= still & set(broken)
+    if doubtful_mends:
+        verdict = judged([_doubted(a) if doubtful_mends & set(a.pair) else a for a in verdict.answers])
     return jobs, verdict, broken
 
 
