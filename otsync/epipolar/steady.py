@@ -38,16 +38,23 @@ MATCHES = 1500
 
 
 def local_evidence(
-    scan: EpipolarScan, a: TrackSet, b: TrackSet, matches: Matches, offset: float, start: float, count: int
+    scan: EpipolarScan,
+    a: TrackSet,
+    b: TrackSet,
+    matches: Matches,
+    offset: float,
+    start: float,
+    count: int,
+    fps: float,
 ) -> Float[np.ndarray, "W D"]:
     """Evidence (nats) of windows of a's time for offsets that differ by -REACH ... REACH from ``offset``, a column a
     frame; 0 where too little is common.
 
     Args:
-        start: of the first window on a's clock, s. count: of windows, :data:`STEP` apart.
+        start: of the first window on a's clock, s. count: of windows, :data:`STEP` apart. fps: of the clock that both
+            videos are brought on, so that curves of several pairs can be added.
     """
     assert a.camera is not None and b.camera is not None
-    fps = min(nominal_fps(a), nominal_fps(b))
     xa, xb = (on_clock(tracks, seen_pixels(tracks), fps) for tracks in (a, b))
     F, unit = fundamentals(a.camera, b.camera), unit_of(a, b)
     middle = round((offset - float(a.times[0] - b.times[0])) * fps)
@@ -87,7 +94,7 @@ def unsteady(
     count = int((stop - start) / STEP)
     told = {
         (i, j): local_evidence(
-            scan, tracks[i], tracks[j], _some(m), float(seconds[j] - seconds[i]), start - float(seconds[i]), count
+            scan, tracks[i], tracks[j], _some(m), float(seconds[j] - seconds[i]), start - float(seconds[i]), count, fps
         )
         for (i, j), m in matches.items()
         if len(m) and np.isfinite(seconds[[i, j]]).all()

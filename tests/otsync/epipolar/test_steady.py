@@ -59,3 +59,11 @@ def test_videos_that_run_on_are_left_alone(seed):
     offsets = solved([*tracks[:2], replace(tracks[2], visible=visible)])
     assert not any(Status.BROKEN_CLOCK in flags for flags in offsets.flags)
     assert np.abs(offsets.seconds * FPS - LATE[:3]).max() < 0.3
+
+
+def test_cameras_of_other_rates_are_compared_on_one_clock():
+    tracks = filmed([np.arange(120) + late for late in LATE[:3]])
+    slow = filmed([np.arange(120.0)] * 2 + [np.arange(0, 120, 30 / 25) + LATE[2]])[2]
+    offsets = solved([*tracks[:2], replace(slow, fps=25.0)])
+    assert np.abs(offsets.seconds * FPS - LATE[:3]).max() < 0.5
+    assert not any(Status.BROKEN_CLOCK in flags for flags in offsets.flags)
