@@ -62,9 +62,10 @@ class SplineRefine(Refiner):
     its two curves minus its mean over ±``windows[0]`` seconds, read at the frames of both videos, so that constant and
     slowly drifting errors drop out and exchanging a and b flips the sign to rounding. Samples and whole matches that
     fit badly lose weight; matches with a ``weight`` of their own begin with it. Sigma adds the scatter over
-    neighbourhoods of matches or blocks of one second, the ``spread`` of the answers with the other windows (the largest
-    difference, so its square counts half), and what blur predicts: errors of the model that no residual shows. It holds
-    at both ends of the overlap: the uncertainty of the rate grows with the distance from the middle.
+    neighbourhoods of matches or blocks of one second (wider where these are few), the ``spread`` of the answers with
+    the other windows (the largest difference, so its square counts half), and what blur predicts: errors of the model
+    that no residual shows. It holds at both ends of the overlap: the uncertainty of the rate grows with the distance
+    from the middle.
 
     Args:
         windows: half windows of detrending in seconds: the answer's, and those that it is compared with.

@@ -9,8 +9,8 @@ import pytest
 
 from otsync import Alignment, Matches, Refused, SplineRefine, Status, TrackSet, Unrefined, align, refine
 from otsync.clocks.splines import TrackSplines
-from otsync.refine.gauss_newton import Side, _linearise, fit_clock, neighbours
-from otsync.refine.splines import COMMON_ERRORS
+from otsync.refine.gauss_newton import Side, _linearise, fit_clock, neighbours, wider
+from otsync.refine.splines import COMMON_ERRORS, LEAST_SIGMA
 from otsync.simulate import simulate
 from otsync.types import Clock
 
@@ -285,4 +285,21 @@ def test_sigma_never_falls_below_what_blur_predicts():
     a, b, m = films(n=300, noise=0.8)
     found = refine(a, b, m, near(0.3), SplineRefine(windows=(14 / 30,)), throw=False)
     shared = found.stats["blur"] ** 2 / COMMON_ERRORS
-    assert found.sigma > shared > np.sqrt(found.sigma**2 - shared**2)  # the rest alone would be less
+    rest = max(fit_clock(*curves_of(a, b), Clock(found.offset), 14 / 30).covariance[0, 0], 0)
+    assert found.sigma == pytest.approx(np.sqrt(shared**2 + rest + LEAST_SIGMA**2), rel=0.1)
+    assert shared > 0.3 * found.sigma
+
+
+def test_one_sigma_of_few_clusters_holds_68_percent():
+    """The score of a common error of whole clusters: the jackknife over C of them, made wider, covers what it says."""
+    rng = np.random.default_rng(0)
+    for count in (2, 3, 4, 10):
+        scores = rng.standard_normal((20_000, count))
+        error = scores.mean(1)
+        sigma = np.sqrt(((scores - error[:, None]) ** 2).sum(1) / (count - 1) / count)
+        within = (np.abs(error) < sigma * wider(np.ones(count))).mean()
+        assert within == pytest.approx(0.683, abs=0.012)
+        assert (np.abs(error) < sigma).mean() < within
+    assert wider(np.ones(400)) == pytest.approx(1, abs=0.005)
+    # one cluster that holds nearly everything: as little is known as of two
+    assert wider(np.array([1.0, 1e-3, 1e-3])) == pytest.approx(wider(np.ones(2)))
