@@ -115,6 +115,11 @@ class RecordingOptions:
     """The tracker of points."""
     features: prior("features") = None
     """What describes a track."""
+    selection: Annotated[str | None, tyro.conf.arg(metavar="FIELD=VALUE,...")] = None
+    """Which tracks are kept: count, min_life (frames at 30 fps), extent and apart (pixels at 640 of width), enough
+    (tracks, below which the limits are lowered)."""
+    width: int | None = None
+    """Pixels of width that videos are tracked at; default: 640. More of it sees smaller things, and takes longer."""
     workers: int = 0
     """Threads; 0: one per core."""
 
@@ -122,7 +127,9 @@ class RecordingOptions:
         """The objects of every stage. ValueError names a prior that there is not."""
         from ..recordings.stages import stages_from
 
-        return stages_from(masks=self.masks, points=self.points, features=self.features)
+        return stages_from(
+            masks=self.masks, points=self.points, features=self.features, selection=self.selection, width=self.width
+        )
 
     def threads(self) -> int:
         """How many threads. ValueError for fewer than none."""

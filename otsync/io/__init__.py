@@ -9,6 +9,7 @@ panoptic.py     the Panoptic layout
 footage.py      video files and folders of images
 frames.py       frames of a video without holding the video
 images.py       single images, masks, labels and depth maps from files
+keypoints/      detections and keypoints of other programs
 mend.py         a scene without some of its frames
 """
 

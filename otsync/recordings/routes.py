@@ -33,10 +33,12 @@ from ..geometry import seen_pixels
 from ..io.scene import Scene
 from ..priors.slots import cache_key
 from ..priors.stereo import EmptyHull, Rig
+from ..priors.working import WIDTH
 from ..progress import Deadline, Progress, Tell
 from ..sync.method import Method
 from ..sync.verb import synchronize
 from ..types import Offsets, Status, TrackSet, Video
+from .given import names_of, tracks_of
 from .kept_pairs import KeptPairs
 from .lift import depth_at
 from .placement import misplaced, with_doubts
@@ -191,15 +193,27 @@ def lacks_stereo(scene: Scene, stages: Stages) -> str:
 def track_all(
     scene: Scene, stages: Stages, cache: Cache, map: MapLike, tell: Tell = lambda text: None
 ) -> list[dict[str, np.ndarray]]:
-    """Masks, point tracks, descriptors and, where given, labels of every video.
+    """Masks, point tracks, descriptors and, where given, labels of every video; points that were given instead.
 
     ValueError names the first frame that does not read.
     """
     started, done = time.perf_counter(), []
 
-    def one(item: tuple[Video, Any, Any]) -> dict[str, np.ndarray]:
-        video, masks, labels = item
-        tracked = stages.tracking(video, masks, cache)
+    points = scene.points or (None,) * len(scene.videos)
+    parts = names_of(points)
+    if any(points) and not all(points):
+        lacking = [v.name for v, p in zip(scene.videos, points, strict=True) if p is None]
+        raise ValueError(
+            f"points: expected them of every video, since tracks of our own have other features; {', '.join(lacking)} "
+            "have none. Add them, leave these videos out, or take all points out of scene.json."
+        )
+
+    def one(item: tuple[Video, Any, Any, Any]) -> dict[str, np.ndarray]:
+        video, masks, labels, found = item
+        if found is None:
+            tracked = stages.tracking(video, masks, cache)
+        else:
+            tracked = tracks_of(found, len(video.frames), video.fps or 30.0, video.camera.width / WIDTH, parts)
         if labels is not None:
             size, uv = (video.camera.width, video.camera.height), tracked["uv"]
             key = (sequence_key(labels), size, content_key(uv))
@@ -210,7 +224,7 @@ def track_all(
         return tracked
 
     labels = scene.labels or (None,) * len(scene.videos)
-    return list(map(one, list(zip(scene.videos, scene.masks, labels, strict=True))))
+    return list(map(one, list(zip(scene.videos, scene.masks, labels, points, strict=True))))
 
 
 def select(video: Video, raw: dict[str, np.ndarray], stages: Stages, frame: str) -> TrackSet:
@@ -218,8 +232,10 @@ def select(video: Video, raw: dict[str, np.ndarray], stages: Stages, frame: str)
     chosen = stages.selection(raw["uv"], video.camera.width, video.fps or 30.0)
     if len(chosen) == 0:
         raise ValueError(
-            f"video {video.name}: expected moving foreground to track; found no track that lives and moves enough. "
-            "Check the masks, choose a part of the clip with motion, or leave this video out."
+            f"video {video.name}: expected moving foreground to track; found no track that lives and moves enough: "
+            f"{stages.selection.told(raw['uv'], video.camera.width, video.fps or 30.0)}. Check the masks, choose a "
+            "part of the clip with motion, lower the limit (--recording.selection, --recording.masks), raise "
+            "--recording.width where things are small, or leave this video out."
         )
     tracks = pixel_tracks(
         raw["uv"][chosen],

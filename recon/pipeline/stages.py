@@ -29,7 +29,7 @@ from recon.pipeline.starts import Given, Start
 from recon.scene.gaussians import Gaussians
 from recon.scene.gaussians4d import Gaussians4D, scene_arrays, scene_from_arrays
 
-MANY: dict[str, Any] = {"count": 700, "min_life": 10, "apart": 4.0}
+MANY: dict[str, Any] = {"count": 700, "min_life": 10, "apart": 4.0, "enough": 0}
 """Tracks for a scaffold: more and shorter ones than synchronisation asks for, since every limb must have some."""
 
 
