@@ -33,7 +33,7 @@ class Blobs:
     size: float | None = None
     gate: float = 0.6
     fastest: float = 3.0
-    largest: float = 2.5
+    largest: float = 4.0
     max_gap: int = 3
     min_life: int = 8
     most: int = 4000
@@ -44,14 +44,15 @@ class Blobs:
         size = np.sqrt(area) if self.size is None else self.size * frames.unit
         if size == 0:
             return np.zeros((0, len(frames), 2), np.float32)
-        found = []
+        found, areas = [], []
         for k in range(len(frames)):
             parts = components(masks[k])
             parts = parts[parts[:, 2] <= self.largest * size**2]
             found.append(middles(frames.gray(k), parts, size))
+            areas.append(parts[:, 2])
         slow = max(1.0, 30 / fps)
         pace = Linker(self.gate * size * slow, self.fastest * size * slow, round(self.max_gap * fps / 30))
-        uv = pace(found)
+        uv = pace(found, areas)
         life = np.isfinite(uv[..., 0]).sum(1)
         chosen = np.flatnonzero(life >= min(lives(self.min_life, fps), len(frames)))
         return uv[np.sort(chosen[np.argsort(-life[chosen], kind="stable")[: self.most]])]
