@@ -54,6 +54,13 @@ class Init:
             print(f"note: paths in {out} are relative to {self.folder}; keep it there to use it", file=sys.stderr)
         name, _ = find_reader(self.folder, self.reader)
         document = describe_folder(self.folder, reader=name, fps=self.fps)
+        if any("file" in video and (video.get("camera") or {}).get("K") is None for video in document["videos"]):
+            from ..calibrate.clips import fill_lenses
+            from ..io.document import missing_fields
+
+            document = fill_lenses(document, self.folder)
+            if document.get("missing"):
+                document["missing"] = missing_fields(document["videos"])
         write_json(out, document)
         print(f"wrote {out}: {len(document['videos'])} videos (reader: {name})")
         for note in document.get("notes", ()):

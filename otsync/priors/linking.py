@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-
 USUAL = 9
 """Detections of a track that its area is taken from, the last ones."""
 
