@@ -146,8 +146,7 @@ def synchronize_scene(
         return replace(epipolar, why=(*why, doubt))
     with progress.stage("synchronise"):
         offsets = with_doubts(without_times(pairs_in_space(lifted, reference, stages, cache, map)), astray)
-    if _flagged(offsets) > _flagged(first) and not named:
-        doubt = "the lifted tracks leave more doubt than the pixels did: the epipolar answer stands"
+    if not named and (doubt := _less_sure(offsets, first)):
         tell(doubt)
         return replace(epipolar, why=(*why, doubt))
     return Synchronized(offsets, tuple(lifted), chosen, why, first, progress.seconds)
@@ -333,6 +332,23 @@ def without_times(offsets: Offsets) -> Offsets:
 
 def _flagged(offsets: Offsets) -> int:
     return sum(not s.ok for s in offsets.status)
+
+
+LESS_SURE = 2.0
+"""Times the sigma of the pixels' answer from which on lifted tracks are no gain. Of a mouse in a glass cylinder, 5
+cameras at 120 frames a second: the pixels' answer was off by .8 frame on average at a sigma of .6, that of lifted tracks
+by 2.7 at 1.9."""
+
+
+def _less_sure(offsets: Offsets, first: Offsets) -> str:
+    """Why the answer from lifted tracks is less sure than the pixels'; empty when it is not."""
+    if _flagged(offsets) > _flagged(first):
+        return "the lifted tracks leave more doubt than the pixels did: the epipolar answer stands"
+    both = np.isfinite(offsets.sigma) & np.isfinite(first.sigma) & (first.sigma > 0)
+    ratio = float(np.median(offsets.sigma[both] / first.sigma[both])) if both.any() else 0.0
+    if ratio > LESS_SURE:
+        return f"the lifted tracks are less sure than the pixels, by {ratio:.1f} times: the epipolar answer stands"
+    return ""
 
 
 def _refuse_unused(method: Method | None, why: str) -> None:
