@@ -336,8 +336,7 @@ def _flagged(offsets: Offsets) -> int:
 
 LESS_SURE = 2.0
 """Times the sigma of the pixels' answer from which on lifted tracks are no gain. Of a mouse in a glass cylinder, 5
-cameras at 120 frames a second: the pixels' answer was off by .8 frame on average at a sigma of .6, that of lifted tracks
-by 2.7 at 1.9."""
+cameras at 120 frames a second, the pixels' answer was off by .8 frame on average, that of lifted tracks by 2.7."""
 
 
 def _less_sure(offsets: Offsets, first: Offsets) -> str:

@@ -34,10 +34,10 @@ def test_a_swarm_of_ten_pixels_a_thing_is_synchronised():
     [
         {},
         {"width": 320},
-        {"fps": [60.0, 50.0, 30.0], "frames": 240},
-        {"fps": 240.0, "frames": 600},
-        {"fps": 6.0, "frames": 40, "pace": 0.5},
-        {"count": 5},
+        {"fps": [60.0, 50.0, 30.0], "frames": 180, "width": 320},
+        {"fps": 240.0, "frames": 480, "width": 320},
+        {"fps": 6.0, "frames": 40, "pace": 0.5, "width": 320},
+        {"count": 5, "width": 320},
     ],
     ids=["640", "320", "60, 50, 30 fps", "240 fps", "6 fps", "five things"],
 )
