@@ -52,7 +52,7 @@ class Pose2Sim:
         notes, videos = [f"cameras from {path.relative_to(folder)}"], []
         for file in _videos(folder):
             video = VideoFrames(file)
-            entry = {"name": file.stem, "file": file.relative_to(folder).as_posix()}
+            entry: dict[str, Any] = {"name": file.stem, "file": file.relative_to(folder).as_posix()}
             camera = by_name.get(_plain(file.stem))
             if camera is None:
                 videos.append(entry | {"camera": unknown_camera(video.width, video.height)})
@@ -61,7 +61,7 @@ class Pose2Sim:
             if note:
                 notes.append(f"{file.stem}: {note}")
             videos.append(entry | {"camera": camera})
-        left = sorted(set(by_name) - {_plain(v["name"]) for v in videos})
+        left = sorted(set(by_name) - {_plain(str(v["name"])) for v in videos})
         if left:
             notes.append(f"cameras without a video: {', '.join(left)}")
         missing = missing_fields(videos)

@@ -119,6 +119,7 @@ class Linker:
         chosen = []
         for _, i, j, k in sorted(triples):
             if i not in used[0] and j not in used[1] and k not in used[2]:
-                used[0].add(i), used[1].add(j), used[2].add(k)
+                for taken, at in zip(used, (i, j, k), strict=True):
+                    taken.add(at)
                 chosen.append((int(index[0][i]), int(index[1][j]), int(index[2][k])))
         return chosen

@@ -131,7 +131,7 @@ def tidied(changed: Bool[np.ndarray, "T h w"], unit: float, min_area: int | None
     return changed
 
 
-def typical_area(changed: Sequence[np.ndarray], unit: float, closing: bool = False) -> float:
+def typical_area(changed: Sequence[np.ndarray] | np.ndarray, unit: float, closing: bool = False) -> float:
     """Area (pixels) of the component that a changed pixel lies in, the median; 0 where nothing changes.
 
     ``changed``: (h,w) a frame. Specks are removed first; ``closing``: holes are closed, too.

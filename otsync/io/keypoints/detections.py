@@ -60,8 +60,9 @@ class Detections:
 
     def take(self, index: np.ndarray) -> Detections:
         """The points at ``index`` (a mask or integers)."""
-        chosen = (getattr(self, name)[index] for name in ("frame", "xy", "part", "who", "score"))
-        return Detections(*chosen, self.names)
+        return Detections(
+            self.frame[index], self.xy[index], self.part[index], self.who[index], self.score[index], self.names
+        )
 
     def surer(self, least: float) -> Detections:
         """The points with a score of ``least`` and more."""
