@@ -78,7 +78,7 @@ MATCHER_OPTIONS = (
     | slot("matcher", "EntropicFGW", reg=0.09, alpha=3.0, max_iter=2, tol=1.0)
     | slot("matcher", "GromovWasserstein", max_iter=2, tol=0.5)
     | slot("matcher", "OptimalTransport", reg=0.3)
-    | slot("matcher", "UnbalancedOT", reg=0.3, marginal=1.0, partners=1, top=10, every=10000)
+    | slot("matcher", "UnbalancedOT", reg=0.3, marginal=1.0, partners=1, top=10, every=10**6)
     | {"matcher:UnbalancedOT.weighted": ["--matcher.weighted"]}
     | slot("matcher", "UnbalancedFGW", marginal=1.0, reg=0.05, alpha=0.5, partners=2, top=10, max_iter=1)
     | slot("matcher", "SemirelaxedFGW", alpha=3.0, partners=2, top=10, max_iter=1, tol=0.5)
