@@ -16,15 +16,15 @@ from tests.swarm_world import paths, swarm
 
 
 def errors(scene, shifts, fps):
-    """(V,) frames of the reference, and which videos are trusted."""
+    """(V,) frames of the reference, their sigma, and which videos are trusted."""
     found = synchronize_scene(scene, route="epipolar").offsets
-    return (found.seconds - shifts) * fps, np.array([s.ok for s in found.status])
+    return np.abs(found.seconds - shifts) * fps, found.sigma * fps, np.array([s.ok for s in found.status])
 
 
 def test_a_swarm_of_ten_pixels_a_thing_is_synchronised():
     shifts = np.array([0.0, 0.31])
-    error, sure = errors(swarm(shifts, count=24, frames=75, width=320, seed=3), shifts, 30)
-    assert sure.all() and np.abs(error).max() < 0.2
+    error, _, sure = errors(swarm(shifts, count=24, frames=75, width=320, seed=3), shifts, 30)
+    assert sure.all() and error.max() < 0.2
 
 
 @pytest.mark.slow
@@ -45,8 +45,10 @@ def test_a_swarm_is_right_or_flagged(world, seed):
     shifts = np.array([0.0, *np.random.default_rng(900 + seed).uniform(-0.7, 0.7, 2)])
     rate = world.get("fps", 30.0)
     fps = rate if isinstance(rate, float) else rate[0]
-    error, sure = errors(swarm(shifts, seed=seed, **world), shifts, fps)
-    assert (np.abs(error[sure]) < 0.2).all()
+    error, sigma, sure = errors(swarm(shifts, seed=seed, **world), shifts, fps)
+    # a frame of 240 a second is 4 ms; six frames a second leave little to tell the time by, and sigma says so
+    assert (error[sure] < (0.2 if rate == 30 else 0.5)).all()
+    assert (error[sure] <= 3 * sigma[sure] + 0.05).all()
 
 
 def test_points_without_features_are_synchronised_by_geometry(tmp_path):
