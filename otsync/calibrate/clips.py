@@ -155,16 +155,37 @@ def _clip(name: str, entry: Mapping[str, Any], paths: Paths, given: Mapping[str,
 def _lens(camera: Mapping[str, Any], size: tuple[int, int], told: Mapping[str, float], given: Lens | None) -> Lens:
     if given is not None:
         return given
+    own = (
+        pinhole(float(told["mm35"]) / DIAGONAL_35MM * float(np.hypot(*size)), size, "file") if "mm35" in told else None
+    )
     if camera.get("K") is not None:
-        distortion = camera.get("distortion")
-        return Lens(
-            matrix_of(camera["K"], "camera.K", "(3,3)"),
-            None if distortion is None else np.asarray(distortion, float),
-            "given",
-        )
-    if told.get("mm35"):
-        return pinhole(float(told["mm35"]) / DIAGONAL_35MM * float(np.hypot(*size)), size, "file")
+        distortion, K = camera.get("distortion"), matrix_of(camera["K"], "camera.K", "(3,3)")
+        if own is not None and distortion is None and np.allclose(K, own.K, rtol=1e-6):
+            return own  # otsync init filled it in: a phone's word is less than a calibration
+        return Lens(K, None if distortion is None else np.asarray(distortion, float), "given")
+    if own is not None:
+        return own
     return pinhole(USUAL_FOCAL * max(size), size, "guessed")
+
+
+def fill_lenses(document: dict[str, Any], folder: str | os.PathLike[str]) -> dict[str, Any]:
+    """The document with K of the video files that tell their focal length themselves, each with a note.
+
+    A 35 mm equivalent is right to some per cent: calibration begins with it and does not hold it fixed.
+    """
+    videos, notes = [], list(document.get("notes") or ())
+    for name, entry in zip(names_of(document["videos"]), document["videos"], strict=True):
+        camera = dict(entry.get("camera") or {})
+        if "file" in entry and camera.get("K") is None and camera.get("width") and camera.get("height"):
+            size = (int(camera["width"]), int(camera["height"]))
+            lens = _lens({}, size, _metadata(Paths(Path(folder)).one(entry["file"])), None)
+            if lens.source == "file":
+                camera["K"] = lens.K.tolist()
+                notes.append(f"{name}: K from the focal length that the file tells: {lens.K[0, 0]:.0f} pixels, about")
+                entry = {**entry, "camera": camera}
+        videos.append(entry)
+    more = {"notes": notes} if notes else {}
+    return {**document, "videos": videos, **more}
 
 
 def pinhole(focal: float, size: tuple[int, int], source: str) -> Lens:

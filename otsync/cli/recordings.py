@@ -54,6 +54,13 @@ class Init:
             print(f"note: paths in {out} are relative to {self.folder}; keep it there to use it", file=sys.stderr)
         name, _ = find_reader(self.folder, self.reader)
         document = describe_folder(self.folder, reader=name, fps=self.fps)
+        if any("file" in video and (video.get("camera") or {}).get("K") is None for video in document["videos"]):
+            from ..calibrate.clips import fill_lenses
+            from ..io.document import missing_fields
+
+            document = fill_lenses(document, self.folder)
+            if document.get("missing"):
+                document["missing"] = missing_fields(document["videos"])
         write_json(out, document)
         print(f"wrote {out}: {len(document['videos'])} videos (reader: {name})")
         for note in document.get("notes", ()):
@@ -115,6 +122,11 @@ class RecordingOptions:
     """The tracker of points."""
     features: prior("features") = None
     """What describes a track."""
+    selection: Annotated[str | None, tyro.conf.arg(metavar="FIELD=VALUE,...")] = None
+    """Which tracks are kept: count, min_life (frames at 30 fps), extent and apart (pixels at 640 of width), enough
+    (tracks, below which the limits are lowered)."""
+    width: int | None = None
+    """Pixels of width that videos are tracked at; default: 640. More of it sees smaller things, and takes longer."""
     workers: int = 0
     """Threads; 0: one per core."""
 
@@ -122,7 +134,9 @@ class RecordingOptions:
         """The objects of every stage. ValueError names a prior that there is not."""
         from ..recordings.stages import stages_from
 
-        return stages_from(masks=self.masks, points=self.points, features=self.features)
+        return stages_from(
+            masks=self.masks, points=self.points, features=self.features, selection=self.selection, width=self.width
+        )
 
     def threads(self) -> int:
         """How many threads. ValueError for fewer than none."""

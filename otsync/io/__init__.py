@@ -6,9 +6,11 @@ document.py     scene.json: format, version, writing
 scene.py        from a document to a scene, checked
 readers.py      what a reader is; READERS, in the order in which they are asked
 panoptic.py     the Panoptic layout
+pose2sim.py     Pose2Sim's and Caliscope's .toml, Qualisys' .qca.txt
 footage.py      video files and folders of images
 frames.py       frames of a video without holding the video
 images.py       single images, masks, labels and depth maps from files
+keypoints/      detections and keypoints of other programs
 mend.py         a scene without some of its frames
 """
 

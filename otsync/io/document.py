@@ -30,8 +30,10 @@ def missing_fields(videos: Sequence[dict[str, Any]]) -> list[str]:
     """In words, what entries of videos lack before they can be read."""
     missing = []
     for video in videos:
-        if video["camera"]["K"] is None or video["camera"]["w2c"] is None:
-            missing.append(f"{video['name']}: camera.K and camera.w2c (world to camera, OpenCV axes)")
+        unknown = {"K": "camera.K", "w2c": "camera.w2c (world to camera, OpenCV axes)"}
+        lacking = [words for field, words in unknown.items() if video["camera"][field] is None]
+        if lacking:
+            missing.append(f"{video['name']}: {' and '.join(lacking)}")
         if "file" not in video and video.get("fps") is None and video.get("timestamps") is None:
             missing.append(f"{video['name']}: fps or timestamps")
     return missing

@@ -10,6 +10,9 @@ from ..files.strict import Count, Document, Name, Text
 
 MAX_VIDEOS, MAX_FILES = 1000, 200_000
 
+LEAST_SCORE = 0.3
+"""Of points that other programs found: below it they are guesses."""
+
 Files = Text | Annotated[list[Text], Meta(min_length=1, max_length=MAX_FILES)]
 """A pattern with ``*`` in the file name, or a list of files."""
 
@@ -36,6 +39,14 @@ class DepthFile(Document, frozen=True, kw_only=True):
     scale: float = 1.0
 
 
+class PointsFile(Document, frozen=True, kw_only=True):
+    """Points of a video that another program found: a file, or one a frame."""
+
+    files: Files
+    kind: Name | UnsetType = UNSET
+    least: float = LEAST_SCORE
+
+
 class VideoFile(Document, frozen=True, kw_only=True):
     """One video of a scene."""
 
@@ -49,6 +60,7 @@ class VideoFile(Document, frozen=True, kw_only=True):
     depth: DepthFile | None = None
     masks: Files | None = None
     labels: Files | None = None
+    points: PointsFile | None = None
 
 
 class CalibratedFile(Document, frozen=True, kw_only=True):

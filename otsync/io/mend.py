@@ -28,13 +28,16 @@ def cut(scene: Scene, first: int, stop: int) -> Scene:
 
 
 def keep_frames(scene: Scene, index: Sequence[Sequence[int]]) -> Scene:
-    """The frames at ``index`` of every video, with their masks, labels, depth, poses and times."""
-    videos, masks, labels = [], [], []
+    """The frames at ``index`` of every video, with their masks, labels, points, depth, poses and times."""
+    videos, masks, labels, points = [], [], [], []
     labels_of = scene.labels or (None,) * len(scene.videos)
-    for video, mask, label, picks in zip(scene.videos, scene.masks, labels_of, index, strict=True):
+    points_of = scene.points or (None,) * len(scene.videos)
+    given = zip(scene.videos, scene.masks, labels_of, points_of, index, strict=True)
+    for video, mask, label, found, picks in given:
         whole = np.array_equal(picks, np.arange(len(video.frames)))
         masks.append(mask if whole or mask is None else _some(mask, picks))
         labels.append(label if whole or label is None else _some(label, picks))
+        points.append(found if whole or found is None else found.within(picks))
         if whole:
             videos.append(video)
             continue
@@ -49,7 +52,13 @@ def keep_frames(scene: Scene, index: Sequence[Sequence[int]]) -> Scene:
         frames, fps = _some(video.frames, picks), None if thinned else video.fps
         told = times if rising else np.sort(times)  # of frames in another order the caller tells the times
         videos.append(replace(video, frames=frames, camera=camera, fps=fps, timestamps=told, depth=depth))
-    return replace(scene, videos=tuple(videos), masks=tuple(masks), labels=tuple(labels) if scene.labels else ())
+    return replace(
+        scene,
+        videos=tuple(videos),
+        masks=tuple(masks),
+        labels=tuple(labels) if scene.labels else (),
+        points=tuple(points) if scene.points else (),
+    )
 
 
 def on_mended_clocks(scene: Scene, offsets: Offsets) -> Scene:

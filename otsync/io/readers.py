@@ -11,6 +11,7 @@ from typing import Any, Protocol
 from ..plugins import available
 from .footage import ImageFolders, VideoFiles, VideosAndImages
 from .panoptic import Panoptic
+from .pose2sim import Pose2Sim
 
 
 class Reader(Protocol):
@@ -35,7 +36,7 @@ class Reader(Protocol):
         ...
 
 
-READERS: tuple[Reader, ...] = (Panoptic(), VideosAndImages(), VideoFiles(), ImageFolders())
+READERS: tuple[Reader, ...] = (Panoptic(), Pose2Sim(), VideosAndImages(), VideoFiles(), ImageFolders())
 """otsync's own readers, in the order in which they are asked; plugins are asked before them."""
 
 

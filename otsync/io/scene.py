@@ -7,11 +7,14 @@ A document::
                  "camera": {"K": [[f,0,cx],[0,f,cy],[0,0,1]], "w2c": [[...4x4...]], "width": 1920, "height": 1080}},
                 {"name": "right", "frames": "right/*.png", "fps": 30, "range": [10, 160],
                  "camera": {...}, "masks": "seg/right/*.png", "labels": "who/right/*.png",
-                 "depth": {"frames": "depth/right/*.png", "scale": 0.001}}]}
+                 "depth": {"frames": "depth/right/*.png", "scale": 0.001},
+                 "points": {"files": "right_dlc.csv"}}]}
 
 Paths are relative to the file's folder and may not leave it. ``w2c`` is world-to-camera, OpenCV axes, 4x4 or one per
 frame. ``range`` [first, stop) keeps some frames; a video file's clock comes from its container unless fps or
-timestamps are given. ``labels``: images of whole numbers that mean the same thing or class in every video, 0 none.
+timestamps are given. ``points``: what another program found in the video, in place of our own tracks: a file of
+DeepLabCut, SLEAP, COCO or a table, or OpenPose's files (:mod:`otsync.io.keypoints`); ``least`` is the lowest score that
+counts. ``labels``: images of whole numbers that mean the same thing or class in every video, 0 none.
 
 A camera may have ``distortion`` (OpenCV's coefficients) and ``readout``: the seconds that a rolling shutter takes from
 the image's first to its last row (phones: 0.005 to 0.03; measure it, or leave it out, as for images that were turned
@@ -36,7 +39,8 @@ from ..types.camera import matrix_of
 from .document import FORMAT, VERSION
 from .frames import ArrayFrames, FrameRange, ImageFrames, LazyFrames, VideoFrames
 from .images import read_depth, read_image, read_labels, read_mask
-from .layout import MAX_FILES, SceneFile
+from .keypoints import KEYPOINTS, Detections, read_detections
+from .layout import LEAST_SCORE, MAX_FILES, SceneFile
 from .readers import describe_folder
 
 
@@ -52,6 +56,7 @@ class Scene:
         notes: what the reader assumed or could not find.
         labels: per video a sequence of (H,W) integer labels that all videos share, 0 none; or None. Empty: none at all.
         doubtful: why the camera of a video is not to be trusted, by its name: what ``otsync calibrate`` says.
+        points: per video what another program found in it, used in place of our own tracks; or None. Empty: none.
     """
 
     videos: tuple[Video, ...]
@@ -61,6 +66,7 @@ class Scene:
     notes: tuple[str, ...] = field(default_factory=tuple)
     labels: tuple[Sequence[np.ndarray] | None, ...] = ()
     doubtful: Mapping[str, str] = field(default_factory=dict)
+    points: tuple[Detections | None, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -74,9 +80,12 @@ class Scene:
                 f"cameras: expected some of {', '.join(self.names)}; found {', '.join(missing)}. Check the names."
             )
         index = [self.names.index(n) for n in names]
-        labels = tuple(self.labels[i] for i in index) if self.labels else ()
         return replace(
-            self, videos=tuple(self.videos[i] for i in index), masks=tuple(self.masks[i] for i in index), labels=labels
+            self,
+            videos=tuple(self.videos[i] for i in index),
+            masks=tuple(self.masks[i] for i in index),
+            labels=tuple(self.labels[i] for i in index) if self.labels else (),
+            points=tuple(self.points[i] for i in index) if self.points else (),
         )
 
 
@@ -143,13 +152,14 @@ def scene_from_document(
     builder = Paths(root, allow_outside)
     built = [_video(entry, n, builder, file) for n, entry in enumerate(entries)]
     return Scene(
-        tuple(video for video, _, _ in built),
-        tuple(masks for _, masks, _ in built),
+        tuple(video for video, _, _, _ in built),
+        tuple(masks for _, masks, _, _ in built),
         str(document.get("frame", "world")),
         Path(root),
         tuple(str(n) for n in document.get("notes", ())),
-        tuple(labels for _, _, labels in built),
+        tuple(labels for _, _, labels, _ in built),
         _doubtful(document),
+        tuple(points for _, _, _, points in built),
     )
 
 
@@ -166,7 +176,7 @@ def names_of(entries: Sequence[dict[str, Any]]) -> list[str]:
 
 def _video(
     entry: dict[str, Any], n: int, paths: Paths, file: Path
-) -> tuple[Video, Sequence[np.ndarray] | None, Sequence[np.ndarray] | None]:
+) -> tuple[Video, Sequence[np.ndarray] | None, Sequence[np.ndarray] | None, Detections | None]:
     name = entry.get("name", f"video{n}")
     where = f"{file}: videos[{n}] ({shown(name)[1:-1]})"
     try:
@@ -189,7 +199,7 @@ def _video(
         masks = cut(_images(entry.get("masks"), paths, read_mask, "mask"), "masks")
         labels = cut(_images(entry.get("labels"), paths, read_labels, "labels"), "labels")
         video = Video(cut(frames, "frames") or frames, camera, fps, timestamps, name, depth)
-        return video, masks, labels
+        return video, masks, labels, _points(entry.get("points"), paths, len(frames), used)
     except FileNotFoundError as error:
         raise FileNotFoundError(f"{where}: {error}") from None
     except OSError as error:
@@ -248,6 +258,32 @@ def _depth(value: Any, paths: Paths) -> LazyFrames | None:
     if "file" in value:
         return ArrayFrames(paths.one(value["file"]), scale)
     return ImageFrames(paths.many(value["frames"]), lambda path: read_depth(path, scale), f"depth*{scale:g}")
+
+
+def _points(value: Any, paths: Paths, frames: int, used: range) -> Detections | None:
+    """What another program found in a video of so many frames, in those that are used; its sure points."""
+    if value is None:
+        return None
+    files = value["files"]
+    listed = paths.many(files) if isinstance(files, list) or "*" in files else [paths.one(files)]
+    kind = value.get("kind")
+    known = {reader.name: reader for reader in KEYPOINTS}
+    if kind is not None and kind not in known:
+        raise ValueError(f"points.kind: expected one of {', '.join(known)}; found {shown(kind)}.")
+    found = read_detections(listed, KEYPOINTS if kind is None else (known[kind],))
+    if found.last >= frames:
+        raise ValueError(
+            f"points: {listed[0].name}: expected points of the {frames} frames of the video; found one of frame "
+            f"{found.last}. Is it the file of another video?"
+        )
+    least = float(value.get("least", LEAST_SCORE))
+    sure = found.surer(least)
+    if len(sure) == 0:
+        raise ValueError(
+            f"points: {listed[0].name}: expected points with a score of {least:g} and more; the best of {len(found)} "
+            f"has {found.score.max():g}. Lower points.least."
+        )
+    return sure.within(used)
 
 
 def _images(value: Any, paths: Paths, read: Callable[[Path], np.ndarray], kind: str) -> LazyFrames | None:

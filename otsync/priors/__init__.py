@@ -4,13 +4,16 @@ slots.py        what goes into the slots of tracking
 working.py      frames at the resolution that priors work at
 masks.py        which pixels move
 flow.py         optical flow between neighbouring frames
-points.py       point tracks
+points.py       point tracks by optical flow
+blobs.py        tracks of things too small for flow, and the choice by their size
+linking.py      detections of single frames joined to tracks
 features.py     descriptors of tracks
 stereo.py       depth of tracked points of a rig by visual hull and correlation
 dense.py        the same at every pixel of a mask
 """
 
 from ..files.cache import Cache
+from .blobs import Blobs, BySize
 from .features import Daisy, LabHistogram
 from .flow import DISFlow
 from .masks import FlowResidual, GivenMasks, MedianBackground
@@ -22,6 +25,8 @@ __all__ = [
     "DESCRIBERS",
     "MASKERS",
     "TRACKERS",
+    "Blobs",
+    "BySize",
     "Cache",
     "ChainedFlow",
     "DISFlow",
@@ -39,7 +44,7 @@ __all__ = [
 MASKERS = (MedianBackground, FlowResidual)
 """Maskers that the shell offers; plugins come on top."""
 
-TRACKERS = (ChainedFlow,)
+TRACKERS = (BySize, ChainedFlow, Blobs)
 """Trackers of points that the shell offers; plugins come on top."""
 
 DESCRIBERS = (LabHistogram, Daisy)

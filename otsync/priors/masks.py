@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from ..compute.indices import evenly
 from ..files.digest import sequence_key
@@ -21,12 +21,13 @@ class MedianBackground:
     """Static camera: what differs from the temporal median. IoU .72-.79 with given masks on basketball.
 
     Args:
-        threshold: grey levels (of 255) in any channel. min_area: pixels of a component at 640 of width.
+        threshold: grey levels (of 255) in any channel.
+        min_area: pixels of a component at 640 of width; None: 300, or less where what moves is small (:func:`tidied`).
         samples: frames that the median is taken of; bounds the memory (50 frames of 640 x 360 are 35 MB).
     """
 
     threshold: int = 12
-    min_area: int = 300
+    min_area: int | None = None
     samples: int = 50
 
     def __call__(self, frames: WorkingFrames, camera: Camera) -> Bool[np.ndarray, "T h w"]:
@@ -36,9 +37,8 @@ class MedianBackground:
         background = np.median(np.stack([frames[int(k)] for k in picks]), 0).astype(np.uint8)
         out = np.zeros((len(frames), frames.size[1], frames.size[0]), bool)
         for k in range(len(frames)):
-            changed = cv2.absdiff(frames[k], background).max(2) > self.threshold
-            out[k] = tidy(changed, frames.unit, self.min_area)
-        return out
+            out[k] = cv2.absdiff(frames[k], background).max(2) > self.threshold
+        return tidied(out, frames.unit, self.min_area)
 
 
 @dataclass(frozen=True)
@@ -65,13 +65,14 @@ class FlowResidual:
 
     Args:
         threshold: pixels of distance at 640 of width, over ``step`` frames (a longer step sees slower motion).
+        min_area: as of :class:`MedianBackground`.
         back: look at the frame before as well as at the one after: what moves along its own line in the one pair of
             frames seldom does in the other. Of fast balls before a phone in a hand 101 tracks lived long enough with
             it, 13 without.
     """
 
     threshold: float = 1.0
-    min_area: int = 300
+    min_area: int | None = None
     step: int = 1
     back: bool = True
     flow: DISFlow = field(default_factory=DISFlow)
@@ -89,27 +90,80 @@ class FlowResidual:
             return (residual > self.threshold * frames.unit).reshape(h, w)
 
         for k in range(T):
-            ahead, behind = k + self.step, k - self.step
+            ahead = k + self.step
             if ahead < T:
                 forward, backward = self.flow.pair(frames.gray(k), frames.gray(ahead))
                 out[k] |= leaves(k, ahead, forward)
                 if self.back or ahead + self.step >= T:  # the last frames have none after them
                     out[ahead] |= leaves(ahead, k, backward)
-            elif behind < 0:
-                continue
-            out[k] = tidy(out[k], frames.unit, self.min_area)
-        return out
+        return tidied(out, frames.unit, self.min_area)
 
 
-def tidy(changed: Bool[np.ndarray, "h w"], unit: float, min_area: int) -> Bool[np.ndarray, "h w"]:
-    """Specks removed (3 px opening), holes closed (9 px), components below ``min_area`` dropped."""
+LEAST_AREA, CLOSING = 300, 9
+"""Pixels (at 640 of width) of the smallest component, and side of the square that closes holes, where things are as
+large as people at 640 columns."""
+
+PART = 10
+"""A component is at least such a part of the area of what typically moves; smaller ones are specks."""
+
+LOOKS = 40
+"""Frames that the size of what moves is measured in."""
+
+
+def tidied(changed: Bool[np.ndarray, "T h w"], unit: float, min_area: int | None = None) -> Bool[np.ndarray, "T h w"]:
+    """:func:`tidy` of every frame, in place, with an area and a closing that suit the size of what moves.
+
+    Args:
+        unit: working pixels per pixel at 640 of width. min_area: pixels at 640 of width; None: 300, or the tenth part
+            of a typical component where those are smaller than 3000 (people have 9000): things of ten pixels stay, and
+            neighbours among them are not closed to one.
+    """
+    typical = typical_area(changed, unit, closing=True)
+    small = typical < PART * LEAST_AREA * unit**2
+    if small:  # what was closed may be several things
+        typical = typical_area(changed, unit, closing=False)
+    least: float = LEAST_AREA if min_area is None else min_area
+    if min_area is None and small:
+        least = min(LEAST_AREA, typical / unit**2 / PART)
+    closing = min(CLOSING, 0.3 * np.sqrt(typical) / unit) if small else CLOSING
+    for k in range(len(changed)):
+        changed[k] = tidy(changed[k], unit, least, closing)
+    return changed
+
+
+def typical_area(changed: Sequence[np.ndarray] | np.ndarray, unit: float, closing: bool = False) -> float:
+    """Area (pixels) of the component that a changed pixel lies in, the median; 0 where nothing changes.
+
+    ``changed``: (h,w) a frame. Specks are removed first; ``closing``: holes are closed, too.
+    """
+    areas = [
+        np.sort(components(tidy(changed[int(k)], unit, 0, CLOSING if closing else 0))[:, 2])
+        for k in evenly(len(changed), LOOKS)
+    ]
+    area = np.sort(np.concatenate([*areas, np.zeros(0)]))
+    return float(area[np.searchsorted(np.cumsum(area), 0.5 * area.sum())]) if len(area) else 0.0
+
+
+def components(mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "n 3"]:
+    """Middle (pixel indices) and area of every component."""
     import cv2
 
-    def square(pixels: int) -> np.ndarray:
+    _, _, stats, middle = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
+    return np.column_stack([middle[1:], stats[1:, cv2.CC_STAT_AREA]])
+
+
+def tidy(changed: Bool[np.ndarray, "h w"], unit: float, min_area: float, closing: float = CLOSING) -> np.ndarray:
+    """Specks removed (3 px opening), holes closed (``closing`` px), components of at most ``min_area`` dropped.
+
+    Pixels are at 640 of width; (h,w) bool.
+    """
+    import cv2
+
+    def square(pixels: float) -> np.ndarray:
         return np.ones((max(1, round(pixels * unit)),) * 2, np.uint8)
 
     mask = cv2.morphologyEx(changed.astype(np.uint8), cv2.MORPH_OPEN, square(3))
-    mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, square(9))
+    mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, square(closing))
     _, component, stats, _ = cv2.connectedComponentsWithStats(mask)
     large = stats[:, cv2.CC_STAT_AREA] > min_area * unit**2
     large[0] = False

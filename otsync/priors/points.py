@@ -51,7 +51,7 @@ class ChainedFlow:
             steps, seeds = self._forwards(frames, masks, flows, fps)
             steps += self._backwards(seeds, masks, flows, frames)
             del flows
-        uv = self._dense(steps, T)
+        uv = self._dense(steps, T, max(3, round(self.min_life * fps / 30)))
         return join_gaps(uv, self.max_gap, self.join * frames.unit) if self.max_gap else uv
 
     def _forwards(self, frames, masks, flows, fps):
@@ -103,10 +103,10 @@ class ChainedFlow:
             steps.append((t - 1, ids, x))
         return steps
 
-    def _dense(self, steps, T):
+    def _dense(self, steps, T, least):
         """(N,T,2) of the tracks that live long enough, at most the ``most`` longest-lived, in order of their seeds."""
         life = np.bincount(np.concatenate([ids for _, ids, _ in steps]))
-        chosen = np.flatnonzero(life >= min(self.min_life, T))
+        chosen = np.flatnonzero(life >= min(least, T))
         chosen = np.sort(chosen[np.argsort(-life[chosen], kind="stable")[: self.most]])
         row = np.full(len(life), -1)
         row[chosen] = np.arange(len(chosen))

@@ -16,8 +16,9 @@ to 1, far ones included; cameras 72 degrees off 0."""
 LEAST_PAIRS = 3
 """Pairs of a camera below which their share says nothing."""
 
-AGREES = 1.0
-"""Frames by which a pair may miss the answer."""
+AGREES = 1 / 30
+"""Seconds by which a pair may miss the answer, or a frame where that is longer: with 120 frames a second all is sound
+that misses it by four."""
 
 
 def with_doubts(offsets: Offsets, doubtful: Collection[str]) -> Offsets:
@@ -35,9 +36,9 @@ def misplaced(offsets: Offsets) -> set[str]:
 
     A camera in a wrong place spoils the pairs of the others too; without it theirs are sound.
     """
+    least = max(AGREES, 1 / offsets.fps[offsets.reference])
     sound = {
-        pair: a.status.ok and abs(a.stats.get("residual", np.nan)) * offsets.fps[offsets.reference] < AGREES
-        for pair, a in offsets.alignments.items()
+        pair: a.status.ok and abs(a.stats.get("residual", np.nan)) < least for pair, a in offsets.alignments.items()
     }
     found: set[int] = set()
     while True:

@@ -33,10 +33,12 @@ from ..geometry import seen_pixels
 from ..io.scene import Scene
 from ..priors.slots import cache_key
 from ..priors.stereo import EmptyHull, Rig
+from ..priors.working import WIDTH
 from ..progress import Deadline, Progress, Tell
 from ..sync.method import Method
 from ..sync.verb import synchronize
 from ..types import Offsets, Status, TrackSet, Video
+from .given import names_of, tracks_of
 from .kept_pairs import KeptPairs
 from .lift import depth_at
 from .placement import misplaced, with_doubts
@@ -144,8 +146,7 @@ def synchronize_scene(
         return replace(epipolar, why=(*why, doubt))
     with progress.stage("synchronise"):
         offsets = with_doubts(without_times(pairs_in_space(lifted, reference, stages, cache, map)), astray)
-    if _flagged(offsets) > _flagged(first) and not named:
-        doubt = "the lifted tracks leave more doubt than the pixels did: the epipolar answer stands"
+    if not named and (doubt := _less_sure(offsets, first)):
         tell(doubt)
         return replace(epipolar, why=(*why, doubt))
     return Synchronized(offsets, tuple(lifted), chosen, why, first, progress.seconds)
@@ -191,15 +192,27 @@ def lacks_stereo(scene: Scene, stages: Stages) -> str:
 def track_all(
     scene: Scene, stages: Stages, cache: Cache, map: MapLike, tell: Tell = lambda text: None
 ) -> list[dict[str, np.ndarray]]:
-    """Masks, point tracks, descriptors and, where given, labels of every video.
+    """Masks, point tracks, descriptors and, where given, labels of every video; points that were given instead.
 
     ValueError names the first frame that does not read.
     """
     started, done = time.perf_counter(), []
 
-    def one(item: tuple[Video, Any, Any]) -> dict[str, np.ndarray]:
-        video, masks, labels = item
-        tracked = stages.tracking(video, masks, cache)
+    points = scene.points or (None,) * len(scene.videos)
+    parts = names_of(points)
+    if any(points) and not all(points):
+        lacking = [v.name for v, p in zip(scene.videos, points, strict=True) if p is None]
+        raise ValueError(
+            f"points: expected them of every video, since tracks of our own have other features; {', '.join(lacking)} "
+            "have none. Add them, leave these videos out, or take all points out of scene.json."
+        )
+
+    def one(item: tuple[Video, Any, Any, Any]) -> dict[str, np.ndarray]:
+        video, masks, labels, found = item
+        if found is None:
+            tracked = stages.tracking(video, masks, cache)
+        else:
+            tracked = tracks_of(found, len(video.frames), video.fps or 30.0, video.camera.width / WIDTH, parts)
         if labels is not None:
             size, uv = (video.camera.width, video.camera.height), tracked["uv"]
             key = (sequence_key(labels), size, content_key(uv))
@@ -210,7 +223,7 @@ def track_all(
         return tracked
 
     labels = scene.labels or (None,) * len(scene.videos)
-    return list(map(one, list(zip(scene.videos, scene.masks, labels, strict=True))))
+    return list(map(one, list(zip(scene.videos, scene.masks, labels, points, strict=True))))
 
 
 def select(video: Video, raw: dict[str, np.ndarray], stages: Stages, frame: str) -> TrackSet:
@@ -218,8 +231,10 @@ def select(video: Video, raw: dict[str, np.ndarray], stages: Stages, frame: str)
     chosen = stages.selection(raw["uv"], video.camera.width, video.fps or 30.0)
     if len(chosen) == 0:
         raise ValueError(
-            f"video {video.name}: expected moving foreground to track; found no track that lives and moves enough. "
-            "Check the masks, choose a part of the clip with motion, or leave this video out."
+            f"video {video.name}: expected moving foreground to track; found no track that lives and moves enough: "
+            f"{stages.selection.told(raw['uv'], video.camera.width, video.fps or 30.0)}. Check the masks, choose a "
+            "part of the clip with motion, lower the limit (--recording.selection, --recording.masks), raise "
+            "--recording.width where things are small, or leave this video out."
         )
     tracks = pixel_tracks(
         raw["uv"][chosen],
@@ -317,6 +332,22 @@ def without_times(offsets: Offsets) -> Offsets:
 
 def _flagged(offsets: Offsets) -> int:
     return sum(not s.ok for s in offsets.status)
+
+
+LESS_SURE = 2.0
+"""Times the sigma of the pixels' answer from which on lifted tracks are no gain. Of a mouse in a glass cylinder, 5
+cameras at 120 frames a second, the pixels' answer was off by .8 frame on average, that of lifted tracks by 2.7."""
+
+
+def _less_sure(offsets: Offsets, first: Offsets) -> str:
+    """Why the answer from lifted tracks is less sure than the pixels'; empty when it is not."""
+    if _flagged(offsets) > _flagged(first):
+        return "the lifted tracks leave more doubt than the pixels did: the epipolar answer stands"
+    both = np.isfinite(offsets.sigma) & np.isfinite(first.sigma) & (first.sigma > 0)
+    ratio = float(np.median(offsets.sigma[both] / first.sigma[both])) if both.any() else 0.0
+    if ratio > LESS_SURE:
+        return f"the lifted tracks are less sure than the pixels, by {ratio:.1f} times: the epipolar answer stands"
+    return ""
 
 
 def _refuse_unused(method: Method | None, why: str) -> None:

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..files.cache import Cache
 from ..files.digest import content_key, sequence_key
+from ..priors.blobs import BySize
 from ..priors.features import LabHistogram
 from ..priors.masks import FlowResidual, GivenMasks, MedianBackground
-from ..priors.points import ChainedFlow
 from ..priors.slots import Describer, Masker, Tracker, cache_key
 from ..priors.working import WIDTH, WorkingFrames
 from ..types import Camera, TrackSet, Video
+from ..types.checks import positive
 
 TOGETHER = 5 / 30
 """Seconds that two tracks must share to be told apart, or not."""
@@ -29,33 +30,74 @@ SHORT_CLIP = 3
 class Selection:
     """Which 2-D tracks to keep: the longest-lived, unless they move too little or follow a kept one.
 
+    Where that keeps fewer than ``enough``, what moves is small or fast: then tracks may be nearer together (down to a
+    quarter of ``apart``), live half as long and move half as much.
+
     Args:
         count: tracks (100 measured worse, 400 no better). min_life: frames at 30 fps.
         extent: pixels at 640 of width that a track must move in x or in y; a static false foreground does not.
         apart: pixels; a track that stays within it of a kept one tells nothing new. 10 let a person close to the
             camera take all places: 12 % of such depth-free pairs failed by more than 2 frames, 4 % with 16.
+        enough: tracks; 0: the limits are never lowered.
     """
 
     count: int = 200
-    min_life: int = 24
+    min_life: float = 24
     extent: float = 6.0
     apart: float = 16.0
+    enough: int = 60
+
+    def __post_init__(self) -> None:
+        positive("Selection.count", self.count)
+        for name in ("min_life", "extent", "apart", "enough"):
+            positive(f"Selection.{name}", getattr(self, name), zero=True)
 
     def __call__(self, uv: Float[np.ndarray, "N T 2"], width: int, fps: float) -> Int[np.ndarray, " K"]:
         """Indices into ``uv`` (pixels, nan unseen), by life."""
+        kept = self._kept(uv, width, fps)
+        for apart, least in LOWERED:
+            if len(kept) >= self.enough:
+                break
+            lower = replace(self, apart=apart * self.apart, min_life=least * self.min_life, extent=least * self.extent)
+            kept = lower._kept(uv, width, fps)
+        return kept
+
+    def _kept(self, uv: Float[np.ndarray, "N T 2"], width: int, fps: float) -> Int[np.ndarray, " K"]:
         from .kernels import apart_from_others
 
-        seen = np.isfinite(uv[..., 0])
-        life = seen.sum(1)
-        unit = width / WIDTH
-        least = min(self.min_life * fps / 30, uv.shape[1] / SHORT_CLIP)
-        low = np.where(seen[..., None], uv, np.inf).min(1)
-        high = np.where(seen[..., None], uv, -np.inf).max(1)
-        good = (life >= least) & ((high - low).max(1) > self.extent * unit)
+        life, least, moves = self._judged(uv, width, fps)
+        good = (life >= least) & moves
         order = np.flatnonzero(good)[np.argsort(-life[good], kind="stable")]
         together = max(1, round(TOGETHER * fps))
         rows = np.ascontiguousarray(uv[order], np.float64)
-        return order[apart_from_others(rows, self.apart * unit, together, self.count)]
+        return order[apart_from_others(rows, self.apart * width / WIDTH, together, self.count)]
+
+    def _judged(
+        self, uv: Float[np.ndarray, "N T 2"], width: int, fps: float
+    ) -> tuple[Int[np.ndarray, " N"], float, Bool[np.ndarray, " N"]]:
+        """Life (frames) of every track, the least one, and which tracks move enough."""
+        seen = np.isfinite(uv[..., 0])
+        least = min(self.min_life * fps / 30, uv.shape[1] / SHORT_CLIP)
+        low = np.where(seen[..., None], uv, np.inf).min(1, initial=np.inf)
+        high = np.where(seen[..., None], uv, -np.inf).max(1, initial=-np.inf)
+        return seen.sum(1), least, (high - low).max(1) > self.extent * width / WIDTH
+
+    def told(self, uv: Float[np.ndarray, "N T 2"], width: int, fps: float) -> str:
+        """How many tracks there were, and how many of them each limit drops where it is lowest, in words."""
+        if len(uv) == 0:
+            return "no track at all"
+        apart, least = LOWERED[-1] if self.enough else (1.0, 1.0)
+        lowest = replace(self, apart=apart * self.apart, min_life=least * self.min_life, extent=least * self.extent)
+        life, needed, moves = lowest._judged(uv, width, fps)
+        return (
+            f"{len(uv)} tracks, of which {int((life < needed).sum())} live for less than {needed / fps:.2f} s "
+            f"(min_life) and {int((~moves).sum())} move by less than {lowest.extent * width / WIDTH:.3g} px (extent)"
+        )
+
+
+LOWERED = ((0.5, 1.0), (0.25, 1.0), (0.25, 0.5))
+"""Shares of ``apart``, and of life and extent, that are tried in turn where too few tracks are kept. Half of the life
+is what the epipolar scan asks of a pair of tracks."""
 
 
 def pixel_tracks(
@@ -124,13 +166,13 @@ class Tracking:
     Args:
         masker: default: given masks where there are any, else the median background of a static camera, else the
             flow residual of a moving one. One that is named is used even where masks are given.
-        points: optical flow that is chained. features: colours, or :class:`otsync.priors.Daisy`. Any object with the
-            call of its slot (:mod:`otsync.priors.slots`) will do.
+        points: by the size of what moves optical flow that is chained, or blobs. features: colours, or
+            :class:`otsync.priors.Daisy`. Any object with the call of its slot (:mod:`otsync.priors.slots`) will do.
         width: working resolution; larger frames are reduced to it.
     """
 
     masker: Masker | None = None
-    points: Tracker = field(default_factory=ChainedFlow)
+    points: Tracker = field(default_factory=BySize)
     features: Describer = field(default_factory=LabHistogram)
     width: int = WIDTH
 

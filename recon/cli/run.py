@@ -60,6 +60,7 @@ class Run:
         from otsync.files.arrays import write_json
         from otsync.files.cache import Cache
         from otsync.io.mend import cut
+        from otsync.priors.stereo import EmptyHull
         from otsync.progress import Progress, tell
         from otsync.recordings.routes import synchronize_scene
         from otsync.report.frames import write_recording_report
@@ -68,7 +69,7 @@ class Run:
         from recon.pipeline.intake import given_clocks, readable
         from recon.pipeline.verb import check_effects_of
 
-        for name in ("masks", "points", "features"):
+        for name in ("masks", "points", "features", "selection", "width"):
             if getattr(self.recording, name) is not None:
                 raise ValueError(
                     f"--recording.{name}: expected without it, since the reconstruction tracks by its own; found "
@@ -141,6 +142,12 @@ class Run:
                 deadline=deadline,
             )
             return max(code, doubts)
+        except EmptyHull as error:
+            print(
+                f"otsync: nothing is reconstructed: {error} The offsets stand: {self.out / 'offsets_coarse.json'}.",
+                file=sys.stderr,
+            )
+            return 1
         except (Diverged, FloatingPointError) as error:
             print(f"otsync: {error}", file=sys.stderr)
             return 1

@@ -21,8 +21,8 @@ from recon.observe.recorded import check_effects
 from recon.pipeline.intake import readable, split
 from recon.pipeline.plan import Plan
 from recon.pipeline.readings import read_by, with_readings
-from recon.pipeline.stages import backdrop_of_scene, initial_scene, lifted_tracks, read_footage
-from recon.pipeline.starts import Given, OnScaffold, Start
+from recon.pipeline.stages import NoDepth, backdrop_of_scene, initial_scene, lifted_tracks, read_footage
+from recon.pipeline.starts import FromImages, Given, OnScaffold, Start
 from recon.pipeline.track_sets import tracks_of
 from recon.scene.gaussians4d import Gaussians4D
 
@@ -77,7 +77,8 @@ def prepare(
             tracked and lifted here.
         held_out: names of videos that nothing here sees but their own footage.
         backdrop: the static part, its gains those of the training videos in their order; default: fitted here.
-        start: how the moving part begins; default: on a scaffold. One that reads neither tracks nor depth is not given
+        start: how the moving part begins; default: on a scaffold, and on visual hulls of the masks where no track can
+            be lifted. One that reads neither tracks nor depth is not given
             any, nor is the static part.
         cache: an :class:`otsync.files.cache.Cache`. map: any map-like callable; two threads use two cores.
         deadline: of the whole job; the static part takes at most a share of what is left.
@@ -106,7 +107,15 @@ def prepare(
         train, tracks = replace(train, videos=tuple(replace(v, depth=None) for v in train.videos)), ()
     elif tracks is None:
         with progress.stage("tracks"):
-            tracks = lifted_tracks(train, offsets, cache, map, progress)
+            try:
+                tracks = lifted_tracks(train, offsets, cache, map, progress)
+            except NoDepth as error:
+                # images and calibration alone still tell where masks meet, also for few cameras and for moving ones
+                progress.note(
+                    f"{error} The scene begins on visual hulls of the masks: options of a scaffold are unused"
+                )
+                start, tracks = FromImages(), ()
+                train = replace(train, videos=tuple(replace(v, depth=None) for v in train.videos))
     else:
         own = [at_frame_times(t) for t in tracks_of(train, tracks, held_out, progress.note)]
         tracks = tuple(mended(t, offsets.breaks[offsets.names.index(t.name)]) for t in own)

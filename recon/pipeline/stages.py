@@ -18,6 +18,7 @@ import torch
 from otsync.compute.threads import MapLike
 from otsync.files.digest import content_key
 from otsync.io import Scene
+from otsync.priors.stereo import EmptyHull
 from otsync.progress import Deadline, Progress
 from otsync.types import Offsets, TrackSet, Video
 from recon.backdrop.fit import StaticFit, fit_backdrop
@@ -29,12 +30,19 @@ from recon.pipeline.starts import Given, Start
 from recon.scene.gaussians import Gaussians
 from recon.scene.gaussians4d import Gaussians4D, scene_arrays, scene_from_arrays
 
-MANY: dict[str, Any] = {"count": 700, "min_life": 10, "apart": 4.0}
+MANY: dict[str, Any] = {"count": 700, "min_life": 10, "apart": 4.0, "enough": 0}
 """Tracks for a scaffold: more and shorter ones than synchronisation asks for, since every limb must have some."""
 
 
+class NoDepth(ValueError):
+    """No track can be lifted into space: no depth is given, and none can be measured."""
+
+
 def lifted_tracks(scene: Scene, offsets: Offsets, cache: Any, map: MapLike, progress: Progress) -> tuple[TrackSet, ...]:
-    """Tracks in space of every video that has some: by given depth, else by hull and stereo at the offsets."""
+    """Tracks in space of every video that has some: by given depth, else by hull and stereo at the offsets.
+
+    :class:`NoDepth` where no video has some.
+    """
     from otsync.recordings import routes as recordings
     from otsync.recordings.tracking import Selection
 
@@ -64,7 +72,7 @@ def lifted_tracks(scene: Scene, offsets: Offsets, cache: Any, map: MapLike, prog
     if bare:
         lacking = recordings.lacks_stereo(scene, stages)
         if lacking and not out:
-            raise ValueError(
+            raise NoDepth(
                 f"depth: none was given for {', '.join(scene.videos[v].name for v in bare)}, and none can be measured: "
                 f"{lacking}. Add depth maps to the scene, or more static cameras."
             )
@@ -73,11 +81,17 @@ def lifted_tracks(scene: Scene, offsets: Offsets, cache: Any, map: MapLike, prog
         else:
             kept = [v for v, t in enumerate(flat) if t is not None]
             part, sets = scene.take([scene.names[v] for v in kept]), [t for t in flat if t is not None]
-            depth = recordings.stereo_depth(part, sets, only(offsets, part.names), stages, cache, map)
-            lifted = [stages.lift(t, z) for t, z in zip(sets, depth, strict=True)]
-            out += [t for v, t in zip(kept, lifted, strict=True) if v in bare and len(t)]
+            try:
+                depth = recordings.stereo_depth(part, sets, only(offsets, part.names), stages, cache, map)
+            except EmptyHull as error:
+                if not out:
+                    raise NoDepth(str(error)) from None
+                progress.note(f"no tracks in space from {', '.join(part.names)}: {error}")
+            else:
+                lifted = [stages.lift(t, z) for t, z in zip(sets, depth, strict=True)]
+                out += [t for v, t in zip(kept, lifted, strict=True) if v in bare and len(t)]
     if not out:
-        raise ValueError("depth: expected depth where things move; no track could be lifted. Check the depth or masks.")
+        raise NoDepth("depth: expected depth where things move; no track could be lifted. Check the depth or masks.")
     return tuple(out)
 
 

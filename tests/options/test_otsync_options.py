@@ -78,7 +78,7 @@ MATCHER_OPTIONS = (
     | slot("matcher", "EntropicFGW", reg=0.09, alpha=3.0, max_iter=2, tol=1.0)
     | slot("matcher", "GromovWasserstein", max_iter=2, tol=0.5)
     | slot("matcher", "OptimalTransport", reg=0.3)
-    | slot("matcher", "UnbalancedOT", reg=0.3, marginal=1.0, partners=1, top=10)
+    | slot("matcher", "UnbalancedOT", reg=0.3, marginal=1.0, partners=1, top=10, every=10**6)
     | {"matcher:UnbalancedOT.weighted": ["--matcher.weighted"]}
     | slot("matcher", "UnbalancedFGW", marginal=1.0, reg=0.05, alpha=0.5, partners=2, top=10, max_iter=1)
     | slot("matcher", "SemirelaxedFGW", alpha=3.0, partners=2, top=10, max_iter=1, tol=0.5)
@@ -469,6 +469,10 @@ def test_options_of_recordings(recording, tmp_path):
         assert first != answer([*base, f"--recording.{priors[0]}", priors[1]]), priors
         code, _, err = run([*base, f"--recording.{priors[0]}", "nothing"])
         assert code == 2 and f"--{priors[0]}" in err
+    for option, other, wrong in (("selection", "count=20", "pace=3"), ("width", "200", "8")):
+        assert first != answer([*base, f"--recording.{option}", other]), option
+        code, _, err = run([*base, f"--recording.{option}", wrong])
+        assert code == 2 and f"--recording.{option}" in err
     assert first == answer([*base, "--recording.workers", "1"])
     assert run([*base, "--recording.workers", "-1"])[0] == 2
     answer([*base, "--recording.cache", str(tmp_path / "kept")])
@@ -720,7 +724,8 @@ def rows() -> set[str]:
         "sync": "tracks out reference truth method rate rematch costs frames workers json refiner:Unrefined "
         "graph.extra graph.complete "
         "graph.curves graph.starts graph.seed recording.route recording.cameras recording.cache "
-        "recording.allow_outside recording.workers recording.masks recording.points recording.features",
+        "recording.allow_outside recording.workers recording.masks recording.points recording.features "
+        "recording.selection recording.width",
         "demo": "out motion preset videos seed",
         "simulate": "out motion preset videos frames fps max_offset own_frames seed",
         "film": "out phones gap handheld walk frames fps width height max_offset contrast seed",

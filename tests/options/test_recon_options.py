@@ -526,8 +526,14 @@ def test_the_other_options_of_a_run(arriving, world, outside, home):
         assert asked(option, scene=outside)["fit"]["names"] == base["fit"]["names"]
     refused(otsync.cli.main, running(outside, home / "r"), "outside")
     refused(otsync.cli.main, running(world, home / "r", "--recording.workers", "-1"), "--recording.workers")
-    for name in ("masks", "points", "features"):
-        refused(otsync.cli.main, running(world, home / "r", f"--recording.{name}", "daisy"), f"--recording.{name}")
+    for name, value in (
+        ("masks", "a"),
+        ("points", "a"),
+        ("features", "daisy"),
+        ("selection", "count=9"),
+        ("width", "99"),
+    ):
+        refused(otsync.cli.main, running(world, home / "r", f"--recording.{name}", value), f"--recording.{name}")
 
 
 def test_a_run_tells_json_only_where_it_is_asked_to(world, home, monkeypatch):
@@ -859,7 +865,8 @@ def rows() -> set[str]:
     others = {
         "fit": "scene offsets out held_out tracks truth cache json allow_outside",
         "run": "scene out held_out reference truth json allow_outside recording.route recording.cameras "
-        "recording.cache recording.allow_outside recording.masks recording.points recording.features",
+        "recording.cache recording.allow_outside recording.masks recording.points recording.features "
+        "recording.selection recording.width",
         "bench": "scene truth rows out cache name lpips_weights json allow_outside gate rebase protocol.held_out "
         "protocol.cameras protocol.amplitudes protocol.seeds protocol.lengths protocol.held_out_tracks",
         "lifting": "scene out cache json allow_outside lifting.cameras lifting.steps lifting.seed lifting.width "

@@ -13,6 +13,7 @@ import pytest
 from otsync.calibrate.clips import Lens, kind_of, read_clips, read_intrinsics, uncalibrated
 from otsync.calibrate.mapping import colmap_camera
 from otsync.calibrate.stills import background, key_frames, pictures_of, stands_still
+from otsync.cli.recordings import Init
 from otsync.io.document import document
 from otsync.simulate.phones import write_video
 
@@ -72,6 +73,15 @@ def test_metadata_tell_focal_length_and_turn(tmp_path):
     a, b = read_clips(tmp_path)[0]
     assert a.lens.source == "file" and a.lens.K[0, 0] == pytest.approx(26 / 43.27 * 80, rel=1e-3)
     assert b.lens.source == "guessed"
+    # otsync init writes what the file tells, and calibration takes that for no more than it is
+    assert Init(tmp_path).run() == 1
+    told = json.loads((tmp_path / "scene.json").read_text())
+    assert told["videos"][0]["camera"]["K"] == a.lens.K.tolist() and told["videos"][1]["camera"]["K"] is None
+    assert told["missing"][0].startswith("a: camera.w2c") and told["missing"][1].startswith("b: camera.K and")
+    assert [clip.lens.source for clip in read_clips(tmp_path)[0]] == ["file", "guessed"]
+    told["videos"][0]["camera"]["K"][0][0] += 1.0
+    (tmp_path / "scene.json").write_text(json.dumps(told))
+    assert read_clips(tmp_path)[0][0].lens.source == "given"
 
 
 K = [[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]

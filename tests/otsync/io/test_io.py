@@ -421,7 +421,9 @@ def test_a_registered_reader_is_asked_first_and_opens_its_folders(folder, thing)
 
 def test_the_readers_of_otsync_are_asked_from_the_most_special_to_the_most_general():
     assert list(readers()) == [reader.name for reader in READERS]
-    assert [reader.name for reader in READERS] == ["panoptic", "videos-and-images", "video-files", "image-folders"]
+    assert [reader.name for reader in READERS] == [
+        *("panoptic", "pose2sim", "videos-and-images", "video-files", "image-folders")
+    ]
 
 
 def test_init_says_which_reader_took_the_folder(folder, capsys):

@@ -228,7 +228,7 @@ def test_selection_keeps_the_long_the_moving_and_the_separate():
         [move + at([10, 10]), move + at([12, 11]), move + at([10, 100]), 0 * move + at([200, 50]), move + at([10, 150])]
     )
     uv[2, 50:] = np.nan
-    uv[4, 15:] = np.nan
+    uv[4, 10:] = np.nan
     assert Selection()(uv, 640, 30.0).tolist() == [0, 2]
     assert Selection(count=1)(uv, 640, 30.0).tolist() == [0]
 

@@ -40,6 +40,14 @@ def test_the_camera_whose_pairs_fail_is_named_and_no_other(residual):
     assert misplaced(offsets({(0, 1), (1, 2)})) == set()  # half of its pairs: far cameras have such
 
 
+def test_fast_cameras_may_miss_by_some_of_their_frames_and_slow_ones_by_one():
+    bad = {(min(a, 2), max(a, 2)) for a in (0, 1, 3, 4)}
+    for fps, frames, named in ((120.0, 3.0, False), (120.0, 5.0, True), (6.0, 0.8, False), (6.0, 1.2, True)):
+        found = offsets(bad, residual=frames * 30 / fps)
+        found = replace(found, fps=np.full(5, fps))
+        assert misplaced(found) == ({"v2"} if named else set())
+
+
 def test_two_pairs_tell_nothing_of_a_camera():
     assert misplaced(offsets({(0, 1), (1, 2)}, videos=3)) == set()
 

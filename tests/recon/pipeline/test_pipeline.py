@@ -19,6 +19,7 @@ from otsync.files.claim import clear_parts
 from otsync.io import open_scene
 from otsync.io.mend import cut, keep_frames, unreadable
 from otsync.priors.points import ChainedFlow
+from otsync.priors.stereo import EmptyHull
 from otsync.progress import Deadline, Progress
 from otsync.recordings.routes import synchronize_scene
 from otsync.types import Offsets, Status, TrackSet
@@ -308,11 +309,35 @@ def test_nothing_that_moves_is_said(world, start, tmp_path):
         prepare(open_scene(still), start, capture().tracks, plan=QUICK, held_out=("held0",))
 
 
-def test_too_few_cameras_without_depth_say_what_is_lacking(world, start):
-    scene = open_scene(world)
+def test_too_few_cameras_without_depth_begin_on_hulls_and_say_so(world, start):
+    scene, progress = open_scene(world), Progress()
     flat = replace(scene, videos=tuple(replace(v, depth=None) for v in scene.videos))
-    with pytest.raises(ValueError, match=r"depth: none was given for cam0, cam1, cam2.*3 videos are fewer than the 5"):
-        prepare(flat, start, plan=QUICK, held_out=("held0",))
+    ready = prepare(flat, start, plan=QUICK, held_out=("held0",), progress=progress)
+    told = " ".join(progress.notes)
+    assert "depth: none was given for cam0, cam1, cam2" in told and "3 videos are fewer than the 5" in told
+    assert "begins on visual hulls" in told
+    assert ready.tracks == () and len(ready.initial) > 100
+    masks = {f.name: f.masks for f in ready.footage}
+    focus = ready.initial.dynamic.means.mean(0).numpy()
+    for f in ready.footage:
+        x = f.K @ (f.pose(0)[:3] @ np.append(focus, 1))
+        assert 0 < x[0] / x[2] < f.size[0] and 0 < x[1] / x[2] < f.size[1] and masks[f.name] is not None
+
+
+def test_an_empty_hull_is_no_end(world, start, monkeypatch):
+    scene, progress = open_scene(world), Progress()
+
+    def empty(*args, **kwargs):
+        raise EmptyHull("masks: their visual hull is empty.")
+
+    monkeypatch.setattr("otsync.recordings.routes.stereo_depth", empty)
+    monkeypatch.setattr("otsync.recordings.routes.lacks_stereo", lambda *args: "")
+    flat = replace(scene, videos=tuple(replace(v, depth=None) for v in scene.videos))
+    ready = prepare(flat, start, plan=QUICK, held_out=("held0",), progress=progress)
+    assert ready.tracks == () and "visual hull is empty" in " ".join(progress.notes)
+    one = tuple(v if v.name == "cam0" else replace(v, depth=None) for v in scene.videos)
+    ready = prepare(replace(scene, videos=one), start, plan=QUICK, held_out=("held0",), progress=progress)
+    assert [t.name for t in ready.tracks] == ["cam0"]
 
 
 def test_a_video_without_depth_only_adds_its_images(world, start, tmp_path):
