@@ -18,8 +18,12 @@ $(VENV)/.test: $(VENV)/.core
 	$(PIP) -e '.[recon,test]'
 	touch $@
 
-demo: $(VENV)/.core  ## simulate, match and synchronise a small world; writes demo/
-	$(BIN)/otsync demo --out demo
+$(VENV)/.demo: $(VENV)/.core
+	$(PIP) -e '.[recon,video]'
+	touch $@
+
+demo: $(VENV)/.demo  ## films a small moving world, and does the whole job on the videos; writes demo/
+	$(BIN)/otsync --quiet demo --out demo
 
 test: $(VENV)/.test lint  ## under ten minutes on two cores
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m "not slow"

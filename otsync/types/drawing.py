@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-CHOSEN, PEAK, TRUTH, CURVE, GREY = "#0a7d33", "#c22f2f", "#6b3fa0", "#31507d", "#8a8f98"
+CHOSEN, PEAK, TRUTH, CURVE, GREY = "#2a83c6", "#d9690f", "#a06cc4", "#74849b", "#8a8f98"
+"""Colours that all eyes tell apart, and that show on white and on black."""
 
 SHOWN = 3
 """Videos that an ``Offsets`` names in its line."""
@@ -136,11 +137,11 @@ def draw_score(ax: Any, pair: Any) -> None:
 def draw_choice(ax: Any, pair: Any, truth: float | None = None) -> None:
     """Lines at the chosen and, where known, at the true offset (seconds), and what all colours mean."""
     if np.isfinite(pair.offset):
-        ax.axvline(pair.frames, color=CHOSEN, lw=1, label="chosen")
+        ax.axvline(pair.frames, color=CHOSEN, lw=1.4, label="chosen")
     if truth is not None:
         ax.axvline(truth * pair.fps, color=TRUTH, lw=1, ls=":", label="true")
-    if ax.get_legend_handles_labels()[0]:
-        ax.legend(fontsize=6)
+    if ax.get_legend_handles_labels()[0]:  # above, where it covers nothing
+        ax.legend(fontsize=6.5, loc="lower left", bbox_to_anchor=(0, 1), ncols=3, frameon=False, borderaxespad=0)
 
 
 def draw_clock_bars(ax: Any, offsets: Any, clips: Sequence[tuple[float, float]]) -> None:
@@ -169,3 +170,27 @@ def clips_of(sources: Sequence[Any] | None, count: int) -> list[tuple[float, flo
     if sources is None:
         return [(0.0, 1.0)] * count
     return [(float(s.times[0]), float(s.times[-1] - s.times[0] + 1 / (s.fps or 1))) for s in sources]
+
+
+def draw_matches_in_space(ax: Any, a: Any, b: Any, first: str, second: str) -> None:
+    """Matched points of two videos, (M,3) each, on three-dimensional axes, a line between the two of each match."""
+    for p, q in zip(a, b, strict=True):
+        ax.plot(*np.stack([p, q]).T, color=GREY, lw=0.7)
+    ax.scatter(*a.T, s=7, color=CHOSEN, label=short(first)[1:-1], depthshade=False)
+    ax.scatter(*b.T, s=7, color=PEAK, marker="x", lw=0.9, label=short(second)[1:-1], depthshade=False)
+    look_in_space(ax, np.concatenate([a, b]))
+
+
+def look_in_space(ax: Any, points: Any) -> None:
+    """Three-dimensional axes about points (M,3), nan left out: one unit in all directions, thin walls, a legend."""
+    points = points[np.isfinite(points).all(-1)]
+    low, high = (np.percentile(points, q, axis=0) for q in (1, 99)) if len(points) else (-np.ones(3), np.ones(3))
+    size = np.maximum(high - low, 1e-3 * max(float((high - low).max()), 1e-9))
+    for name, middle, half in zip("xyz", (low + high) / 2, 0.6 * size, strict=True):
+        getattr(ax, f"set_{name}lim")(middle - half, middle + half)
+        axis = getattr(ax, f"{name}axis")
+        axis.set_pane_color((0.5, 0.5, 0.5, 0.06))
+        axis.set_tick_params(labelsize=6, pad=0)
+    ax.set_box_aspect(size)
+    if ax.get_legend_handles_labels()[0]:
+        ax.legend(fontsize=6.5, loc="upper left", frameon=False, ncols=2)

@@ -20,7 +20,7 @@ from otsync.io import Scene
 from otsync.io.mend import cut, on_mended_clocks
 from otsync.metrics import offset_error
 from otsync.progress import Deadline, Progress
-from otsync.types import Clock, Offsets, TrackSet
+from otsync.types import Clock, Offsets, TrackSet, Video
 from recon.evaluate.lpips import Lpips
 from recon.evaluate.views import ViewScore, view
 from recon.fit.verb import Reconstruction, fit
@@ -219,8 +219,14 @@ def _write(
         truth=outcome.truth,
         lpips_reason=outcome.lpips_reason,
         scene_page=SCENE_PAGE,
+        sync_page=SYNC_PAGE if (out / SYNC_PAGE).is_file() else None,
+        filmed=[Video(list(f.images), f.camera, timestamps=f.times, name=f.name) for f in ready.footage],
     )
     write_page(out / SCENE_PAGE, load_result(out), strips, report="report.html")
+
+
+SYNC_PAGE = "sync.html"
+"""Of the clocks, where ``otsync run`` found them."""
 
 
 def _strips(ready: Prepared, progress: Progress) -> tuple[Strip, ...]:

@@ -83,7 +83,7 @@ def test_the_page_is_one_small_file_without_a_script(coarse, tmp_path):
         "300 steps",
     ):
         assert text in page, text
-    assert page.count("<img") == 2 and page.count("<svg") == 2
+    assert page.count("<img") == 2 and page.count("<svg") == 3
 
 
 def test_a_page_needs_no_opencv_and_goes_without_pictures_where_pillow_lacks(coarse, tmp_path, monkeypatch):
