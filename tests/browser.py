@@ -70,7 +70,7 @@ class Opened:
 
     def too_wide(self) -> list[str]:
         """What sticks out of the window to the right."""
-        code = """() => [...document.querySelectorAll('body *')].filter((e) => {
+        code = """() => [...document.querySelectorAll('body *:not(svg *):not(.bar *):not(.mosaic *)')].filter((e) => {
             const box = e.getBoundingClientRect();
             return box.width && box.right > document.documentElement.clientWidth + 0.5;
         }).map((e) => e.outerHTML.slice(0, 80))"""

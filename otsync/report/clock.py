@@ -19,9 +19,6 @@ THUMB, THUMBS = 96, 8
 STILL, SHOWN = 208, 9
 """Width of a picture of the stills, and videos that they show."""
 
-GAP = 4
-"""Pixels between the pictures of a still."""
-
 TICKS = 6
 """About how many ticks the axis has."""
 
@@ -65,7 +62,7 @@ def timeline(offsets: Offsets, own: Sequence[Float[np.ndarray, " T"]], videos: S
         span = ends[v]
         if span is None:
             why = "on a clock of its own group" if np.isfinite(offsets.seconds[v]) else "no answer"
-            rows.append(_row(name, "<span class=no>⚠</span>", f"<div class=none>{escape(name)}: {why}</div>"))
+            rows.append(_row(name, "<span class=no>⚠</span>", f"<div class=none>{why}</div>"))
             continue
         left, share = 100 * (span[0] - low) / width, 100 * (span[1] - span[0]) / width
         sure = v == offsets.reference or offsets.status[v].ok
@@ -144,30 +141,26 @@ def stills(offsets: Offsets, videos: Sequence[Video]) -> str:
         ("Before", filmed, "if all videos are started together"),
         ("After", worlds, "on the common clock"),
     ):
-        sheet = _sheet([(videos[v], clocks[v]) for v in shown], moment)
+        cells = "".join(_cell(videos[v], clocks[v], moment) for v in shown)
+        columns = f"grid-template-columns:repeat({math.ceil(math.sqrt(len(shown)))},minmax(0,1fr))"
         what = f"<b>{title}</b>: {moment - zero:.2f} s in, {words}"
-        parts.append(f"<figure>{inline_image(sheet, f'{title}, {words}')}<figcaption>{what}</figcaption></figure>")
-    more = f" The first {SHOWN} of {len(videos)} videos." if len(videos) > len(shown) else ""
-    order = ", ".join(escape(offsets.names[v]) for v in shown)
-    return f"<div class=stills>{''.join(parts)}</div><p class=s>Row by row: {order}.{more}</p>"
+        parts.append(
+            f'<figure><div class=mosaic style="{columns}">{cells}</div><figcaption>{what}</figcaption></figure>'
+        )
+    more = f"<p class=s>The first {SHOWN} of {len(videos)} videos.</p>" if len(videos) > SHOWN else ""
+    return f"<div class=stills>{''.join(parts)}</div>{more}"
 
 
-def _sheet(cells: Sequence[tuple[Video, np.ndarray]], moment: float) -> UInt8[np.ndarray, "H W 3"]:
-    """The frame of every video that is nearest to a moment on its clock, in rows; grey where it has none then."""
-    columns = math.ceil(math.sqrt(len(cells)))
-    height = max(max(1, round(STILL * v.camera.height / v.camera.width)) for v, _ in cells)
-    rows = -(-len(cells) // columns)
-    sheet = np.full((rows * (height + GAP) - GAP, columns * (STILL + GAP) - GAP, 3), 128, np.uint8)
-    for n, (video, clock) in enumerate(cells):
-        away = np.abs(clock - moment)
-        k = int(np.nanargmin(away))
-        step = float(np.nanmedian(np.diff(clock))) if len(clock) > 1 else 1.0
-        if away[k] > step:
-            continue
-        own = max(1, round(STILL * video.camera.height / video.camera.width))
-        y, x = n // columns * (height + GAP), n % columns * (STILL + GAP)
-        sheet[y : y + own, x : x + STILL] = thumbnail(video.frames[k], (STILL, own))
-    return sheet
+def _cell(video: Video, clock: Float[np.ndarray, " T"], moment: float) -> str:
+    """The frame of a video that is nearest to a moment on a clock, under its name; empty where it has none then."""
+    away = np.abs(clock - moment)
+    k = int(np.nanargmin(away))
+    step = float(np.nanmedian(np.diff(clock))) if len(clock) > 1 else 1.0
+    picture = ""
+    if away[k] <= step:
+        height = max(1, round(STILL * video.camera.height / video.camera.width))
+        picture = inline_image(thumbnail(video.frames[k], (STILL, height)), f"{video.name} at {moment:.2f} s")
+    return f"<div>{picture}<span>{escape(video.name)}</span></div>"
 
 
 def thumbnail(frame: np.ndarray, size: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:

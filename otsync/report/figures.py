@@ -24,7 +24,7 @@ from ..types.drawing import (
 )
 
 MAP_PIXELS = 100
-"""Longest side of an embedded cost map: eight of them keep the page below 400 KB."""
+"""Longest side of an embedded cost map: six of them keep the page below 400 KB."""
 
 WIDE, HIGH = 4.2, 2.4
 """Inches of a figure: at the width of a phone its letters can still be read, and two fit side by side elsewhere."""
@@ -56,6 +56,9 @@ def svg(figure, label: str) -> str:
     text = text[text.index("<svg") :]
     # a hundredth of a point is finer than any screen; six decimals make up half of the page
     text = re.sub(r'\bd="[^"]*"', lambda path: re.sub(r"(\.\d\d)\d+", r"\1", path.group()), text)
+    # nor does anybody read its comments, its names of groups, and the space between its tags
+    text = re.sub(r"<!--.*?-->|<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    text = re.sub(r">\s+<", "><", re.sub(r'<g id="[^"]*"', "<g", text))
     # black is the ink of the page, which is bright in the dark; words that black was not asked for have none
     text = re.sub(r'style="[^"]*"', lambda style: style.group().replace("#000000", "currentColor"), text)
     text = text.replace("<svg ", f'<svg role="img" aria-label="{escape(label, quote=True)}" fill="currentColor" ', 1)
@@ -87,17 +90,15 @@ def cost_figure(pair: Alignment, cost: np.ndarray, path: np.ndarray | None, orig
     top = float(np.quantile(known, 0.95)) if known.size else 1.0
     ax.imshow(cost[::step, ::step], extent=extent, cmap="cividis", vmax=top, aspect="auto", interpolation="none")
     if path is not None:
-        ax.plot(path[:, 1], path[:, 0], color="#ffffff", lw=1.2, label="DTW path")
+        ax.plot(path[:, 1], path[:, 0], color="#3fb9f0", lw=1.2, label="DTW path")
     j = np.array([0, cost.shape[1] - 1])
-    for offset, color, name in ((pair.offset, "#ff8c2b", "chosen"), (truth, "#ffffff", "true")):
+    for offset, color, name in ((pair.offset, "#ff8c2b", "chosen"), (truth, "#e07be0", "true")):
         if offset is not None and np.isfinite(offset):
             i = j + (offset - origin) * pair.fps
             ax.plot(j, i, color=color, lw=1.4, ls="-" if name == "chosen" else ":", label=name)
     ax.set(xlim=(-0.5, cost.shape[1] - 0.5), ylim=(cost.shape[0] - 0.5, -0.5), xlabel="frame of b", ylabel="frame of a")
     if ax.get_legend_handles_labels()[0]:
-        ax.legend(
-            fontsize=6.5, loc="lower left", bbox_to_anchor=(0, 1), ncols=3, facecolor="#31363f", labelcolor="white"
-        )
+        ax.legend(fontsize=6.5, loc="lower left", bbox_to_anchor=(0, 1), ncols=3, frameon=False, borderaxespad=0)
     return svg(figure, "cost of frames against each other")
 
 
@@ -124,6 +125,7 @@ def residual_bars(labels: Sequence[str], frames: np.ndarray, trusted: Sequence[b
     ax.invert_yaxis()
     if np.abs(frames).max(initial=0.0) > 3:
         ax.set_xscale("symlog", linthresh=0.5)
+        ax.xaxis.set_major_formatter("{x:g}")
     ax.set_xlabel("pair minus graph, frames (grey: flagged pair)")
     return svg(figure, "graph residuals")
 
@@ -173,6 +175,8 @@ def effort(
             ax.axvline(end, color=GREY, lw=0.5, zorder=0)
     ax.set(xlabel="wall seconds since the start", ylabel="frames", yscale="log", xlim=(-0.02 * total, 1.05 * total))
     ax.margins(y=0.3)
+    ax.yaxis.set_major_formatter("{x:g}")
+    ax.yaxis.set_minor_formatter("")
     ax.legend(fontsize=7, loc="lower left", bbox_to_anchor=(0, 1), ncols=2, frameon=False, borderaxespad=0)
     return svg(figure, "estimated error of the offsets against seconds")
 

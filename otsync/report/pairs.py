@@ -12,7 +12,7 @@ from ..types import Alignment, Matches, Offsets, TrackSet, Video
 from . import figures
 from .clock import inline_image, measured, thumbnail
 
-DETAILED_PAIRS = 8
+DETAILED_PAIRS = 6
 """Pairs shown with their figures; the others stand in the table. Keeps the page below 400 KB."""
 
 WIDTH = 300

@@ -25,15 +25,22 @@ box-shadow:inset 0 0 0 1.5px var(--good)}
 table{border-collapse:collapse;font-size:.9rem;margin:.4rem 0;width:100%}
 td,th{padding:.42rem .7rem;text-align:right;border-bottom:1px solid var(--line);vertical-align:top}
 th{color:var(--soft);font-weight:500;font-size:.82rem;vertical-align:bottom}
-td:first-child,th:first-child,td.t,th.t{text-align:left}td:first-child,th:first-child{padding-left:0}
+td:first-child,th:first-child,td.t,th.t{text-align:left}
+td:first-child,th:first-child{padding-left:0;overflow-wrap:anywhere}
 table.numbers{width:auto;display:inline-table;margin-right:2.5rem;vertical-align:top}
-svg,img{max-width:100%;height:auto}figure{margin:.6rem 0}figure img{display:block;width:100%;border-radius:.45rem}
+svg,img{max-width:100%;height:auto}.figs>*{min-width:0}
+figure{margin:.6rem 0}figure img{display:block;width:100%;border-radius:.45rem}
 figcaption{margin-top:.35rem}svg{display:block}
 .figs{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(100%,19rem),1fr));gap:.4rem 1.6rem;
 align-items:start}
 .stills{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(100%,20rem),1fr));gap:1rem;margin:1.2rem 0}
-.stills figure{margin:0}.stills b{color:var(--ink)}
-.clock{margin:1.2rem 0 .3rem}.row{display:grid;grid-template-columns:13.5rem 1fr;gap:.9rem;align-items:center;
+.stills>figure{margin:0}.stills b{color:var(--ink)}
+.mosaic{display:grid;gap:3px;border-radius:.45rem;overflow:hidden}.mosaic div{position:relative;background:var(--card)}
+.mosaic img{display:block;width:100%;border-radius:0}.mosaic span{position:absolute;left:0;top:0;max-width:100%;
+padding:.05rem .4rem;font-size:.72rem;background:#0e1116cc;color:#fff;border-radius:0 0 .3rem 0;overflow:hidden;
+text-overflow:ellipsis;white-space:nowrap}
+
+.clock{margin:1.2rem 0 .3rem}.row{display:grid;grid-template-columns:13.5rem minmax(0,1fr);gap:.9rem;align-items:center;
 margin:.42rem 0}.who{font-size:.875rem;line-height:1.35;min-width:0}.who b{display:block;overflow-wrap:anywhere}
 .who .s{display:block}.lane{position:relative;min-height:1.4rem;border-radius:.3rem;background:var(--card)}
 .bar{position:relative;min-height:1.4rem;border-radius:.3rem;overflow:hidden;background:var(--bar);
@@ -48,23 +55,24 @@ box-shadow:inset 0 0 0 2px var(--doubt)}.bar.unsure::after{box-shadow:inset 0 0 
 .axis span{position:absolute;transform:translateX(-50%);white-space:nowrap}
 .axis span::before{content:"";position:absolute;left:50%;top:-.3rem;height:.25rem;border-left:1px solid var(--soft)}
 .steps{list-style:none;padding:0;margin:.5rem 0;font-size:.9rem;max-width:34rem}
-.steps li{display:grid;grid-template-columns:9.5rem 1fr 4.2rem;gap:.7rem;align-items:center;margin:.2rem 0}
+.steps li{display:grid;grid-template-columns:12rem 1fr 4.2rem;gap:.7rem;align-items:center;margin:.2rem 0}
 .steps i{height:.55rem;border-radius:.2rem;background:var(--good);opacity:.75;min-width:2px}
 .steps span:last-child{text-align:right;color:var(--soft)}
 details{border:1px solid var(--line);border-radius:.55rem;margin:.55rem 0;background:var(--card)}
 summary{cursor:pointer;padding:.6rem .9rem;display:flex;flex-wrap:wrap;gap:.2rem 1rem;align-items:baseline}
 summary::before{content:"▸";color:var(--soft)}details[open]>summary::before{content:"▾"}
-summary b{overflow-wrap:anywhere}summary::-webkit-details-marker{display:none}summary:focus-visible{outline:2px solid
-var(--good);outline-offset:2px;border-radius:.5rem}.inside{padding:.1rem .9rem .9rem}
+summary b,figcaption,h1,.lead,.none{overflow-wrap:anywhere}
+summary::-webkit-details-marker{display:none}
+summary:focus-visible{outline:2px solid var(--good);outline-offset:2px;border-radius:.5rem}.inside{padding:.1rem .9rem .9rem}
 dl{margin:.8rem 0;max-width:46rem}dt{font-weight:600;margin-top:.6rem}dd{margin:0 0 .3rem}
 ul{padding-left:1.2rem;max-width:46rem}
 footer{margin-top:3rem;padding-top:.9rem;border-top:1px solid var(--line);color:var(--soft);font-size:.82rem}
 .scroll{overflow-x:auto}
 @media(max-width:44rem){body{padding:1.3rem 1rem 2rem}h2{margin-top:2.1rem}
-.row{grid-template-columns:1fr;gap:.25rem;margin:.85rem 0}.who b{display:inline}
+.row{grid-template-columns:minmax(0,1fr);gap:.25rem;margin:.85rem 0}.who b{display:inline}
 .who .s{display:inline;margin-left:.5rem}
 table.cards,table.cards tbody{display:block}table.cards tr:first-child{display:none}
-table.cards tr{display:grid;grid-template-columns:1fr 1fr;gap:.1rem 1rem;padding:.7rem 0;
+table.cards tr{display:grid;grid-template-columns:repeat(2,minmax(0,1fr));gap:.1rem 1rem;padding:.7rem 0;
 border-bottom:1px solid var(--line)}
 table.cards td{display:block;border:0;padding:0;text-align:left}
 table.cards td:first-child{grid-column:1/-1;font-weight:600;font-size:.98rem}

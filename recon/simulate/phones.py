@@ -1,4 +1,4 @@
-"""Phones that film the small world: video files as phones write them, their cameras, and the truth.
+"""Phones that film the small world: video files as phones write them, depth maps, cameras, and the truth.
 
 No two phones agree: each has a rate of its own, one drops and delays frames, one begins late in its file, some hear the
 footfalls. All of it stands in :data:`PHONES`.
@@ -22,6 +22,8 @@ from otsync.simulate.observation import stream
 from otsync.types import Camera, Offsets
 from recon.rotations import look_at
 from recon.simulate.camera import FilmingCamera
+from recon.simulate.estimates import noisy_depth
+from recon.simulate.recording import write_depth
 from recon.simulate.world import DISTANCE, MIDDLE, World, draw_world
 
 SOUND_SPEED = 343.0
@@ -89,9 +91,11 @@ def film_phones(
     seconds: float = 2.0,
     size: tuple[int, int] = (320, 192),
     late: float = 0.35,
-    gap: float = 40.0,
+    gap: float = 72.0,
 ) -> PhoneFilms:
     """Film the world that ``seed`` draws: ``phone0.mp4``, ..., ``scene.json`` with their cameras, and ``truth.json``.
+
+    The phones have a depth sensor, as erroneous as those are (:mod:`.estimates`); its maps stand in ``depth/``.
 
     Args:
         seconds: of every clip. late: the largest shift between the beginning of a phone and of the first, s.
@@ -116,7 +120,9 @@ def film_phones(
         images = zip(own.tolist(), film.images, strict=True)
         write_video(folder / f"phone{v}.mp4", images, phone.fps, sound, RATE, x264=REPEATABLE)
         lens = {"K": camera.K.tolist(), "w2c": camera.w2c.tolist(), "width": camera.width, "height": camera.height}
-        entries.append({"name": f"phone{v}", "file": f"phone{v}.mp4", "camera": lens})
+        maps = noisy_depth(film, stream(seed, v, "depth"))
+        depth = write_depth(folder / "depth" / f"phone{v}", maps, folder)
+        entries.append({"name": f"phone{v}", "file": f"phone{v}.mp4", "camera": lens, "depth": depth})
         cameras.append(camera)
         starts.append(start)
     truth = Offsets.known([e["name"] for e in entries], np.array(starts) - starts[0], phones[0].fps)
