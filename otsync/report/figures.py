@@ -154,6 +154,8 @@ def effort(
     points = [p for p in points if p[2] > 0 and np.isfinite(p[2])]
     if not points:
         return ""
+    from matplotlib.ticker import LogLocator, NullLocator
+
     names, at, sigma, error = zip(*points, strict=True)
     figure, ax = axes_of()
     ax.plot(at, sigma, "o-", color=CHOSEN, ms=4, lw=1, label="estimated: mean sigma")
@@ -175,8 +177,9 @@ def effort(
             ax.axvline(end, color=GREY, lw=0.5, zorder=0)
     ax.set(xlabel="wall seconds since the start", ylabel="frames", yscale="log", xlim=(-0.02 * total, 1.05 * total))
     ax.margins(y=0.3)
+    ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     ax.yaxis.set_major_formatter("{x:g}")
-    ax.yaxis.set_minor_formatter("")
+    ax.yaxis.set_minor_locator(NullLocator())
     ax.legend(fontsize=7, loc="lower left", bbox_to_anchor=(0, 1), ncols=2, frameon=False, borderaxespad=0)
     return svg(figure, "estimated error of the offsets against seconds")
 

@@ -21,6 +21,7 @@ p{margin:.5rem 0;max-width:46rem}.lead{font-size:1.08rem}.kind,p.s,figcaption,.s
 .go{display:inline-block;margin:.5rem .6rem .5rem 0;padding:.5rem 1.05rem;border-radius:.5rem;background:var(--good);
 color:var(--ground);font-weight:600;text-decoration:none}.go.second{background:none;color:var(--good);
 box-shadow:inset 0 0 0 1.5px var(--good)}
+.note{color:var(--soft);font-size:.9rem}.note i{color:var(--doubt);font-style:normal}
 .ok{color:var(--good);font-weight:600}.no{color:var(--doubt);font-weight:600}
 table{border-collapse:collapse;font-size:.9rem;margin:.4rem 0;width:100%}
 td,th{padding:.42rem .7rem;text-align:right;border-bottom:1px solid var(--line);vertical-align:top}
@@ -59,11 +60,12 @@ box-shadow:inset 0 0 0 2px var(--doubt)}.bar.unsure::after{box-shadow:inset 0 0 
 .steps i{height:.55rem;border-radius:.2rem;background:var(--good);opacity:.75;min-width:2px}
 .steps span:last-child{text-align:right;color:var(--soft)}
 details{border:1px solid var(--line);border-radius:.55rem;margin:.55rem 0;background:var(--card)}
-summary{cursor:pointer;padding:.6rem .9rem;display:flex;flex-wrap:wrap;gap:.2rem 1rem;align-items:baseline}
-summary::before{content:"▸";color:var(--soft)}details[open]>summary::before{content:"▾"}
+summary{cursor:pointer;padding:.6rem .9rem;display:block}summary>*{margin-right:.8rem}
+summary::before{content:"▸";color:var(--soft);margin-right:.6rem}details[open]>summary::before{content:"▾"}
 summary b,figcaption,h1,.lead,.none{overflow-wrap:anywhere}
 summary::-webkit-details-marker{display:none}
-summary:focus-visible{outline:2px solid var(--good);outline-offset:2px;border-radius:.5rem}.inside{padding:.1rem .9rem .9rem}
+summary:focus-visible{outline:2px solid var(--good);outline-offset:2px;border-radius:.5rem}
+.inside{padding:.1rem .9rem .9rem}
 dl{margin:.8rem 0;max-width:46rem}dt{font-weight:600;margin-top:.6rem}dd{margin:0 0 .3rem}
 ul{padding-left:1.2rem;max-width:46rem}
 footer{margin-top:3rem;padding-top:.9rem;border-top:1px solid var(--line);color:var(--soft);font-size:.82rem}

@@ -183,6 +183,8 @@ def draw_matches_in_space(ax: Any, a: Any, b: Any, first: str, second: str) -> N
 
 def look_in_space(ax: Any, points: Any) -> None:
     """Three-dimensional axes about points (M,3), nan left out: one unit in all directions, thin walls, a legend."""
+    from matplotlib.ticker import MaxNLocator
+
     points = points[np.isfinite(points).all(-1)]
     low, high = (np.percentile(points, q, axis=0) for q in (1, 99)) if len(points) else (-np.ones(3), np.ones(3))
     size = np.maximum(high - low, 1e-3 * max(float((high - low).max()), 1e-9))
@@ -191,6 +193,7 @@ def look_in_space(ax: Any, points: Any) -> None:
         axis = getattr(ax, f"{name}axis")
         axis.set_pane_color((0.5, 0.5, 0.5, 0.06))
         axis.set_tick_params(labelsize=6, pad=0)
+        axis.set_major_locator(MaxNLocator(4))
     ax.set_box_aspect(size)
     if ax.get_legend_handles_labels()[0]:
         ax.legend(fontsize=6.5, loc="upper left", frameon=False, ncols=2)

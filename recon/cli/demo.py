@@ -48,7 +48,7 @@ class Demo:
         recording, result = self.out / "recording", self.out / "result"
         tell("filming a small world with five phones ...")
         films = film_phones(recording, self.seed)
-        plan = Plan(width=160, backdrop_steps=200, views=8, fit=FitOptions(steps=self.steps))
+        plan = Plan(width=200, backdrop_steps=400, views=8, fit=FitOptions(steps=self.steps))
         with redirect_stdout(io.StringIO()):  # its tables stand in the report
             code = Run(recording, result, plan=plan, truth=recording / "truth.json").run()
         if not (result / "run.json").is_file():
@@ -67,22 +67,20 @@ def held_against_the_truth(films: PhoneFilms, folder: Path) -> dict[str, Any]:
     from otsync.types import Offsets
     from recon.result.folder import load_result
     from recon.result.images import seen_by
-    from recon.simulate.camera import FilmingCamera
 
     result, truth = load_result(folder), films.offsets
     offsets, coarse = result.offsets, Offsets.load(folder / "offsets_coarse.json")
     others = [v for v in range(len(offsets)) if v != offsets.reference]
-    true = truth.seconds[[truth.names.index(name) for name in offsets.names]]
-    errors = np.abs(offsets.seconds - true)[others]
+    began = truth.seconds[[truth.names.index(name) for name in offsets.names]]
+    errors = np.abs(offsets.seconds - began)[others]
     first, second = (result.video(offsets.names[v]).camera for v in (len(offsets) // 2, len(offsets) // 2 + 1))
     between = _between(first, second)
     low, high = (float(x) for x in result.video(offsets.names[offsets.reference]).times[[0, -1]])
     step = result.scene.frame_step
     times = low + step * (np.round(np.linspace(0.15, 0.85, MOMENTS) * (high - low) / step) + 0.5)
-    eye = FilmingCamera(films.world, between, (), np.ones(3), ())
-    filmed = eye.film(times + films.start)
+    true, moving = films.seen(between, times)
     seen = np.stack([seen_by(result, between, float(t)).numpy().clip(0, 1) for t in times])
-    apart = (255 * seen - filmed.images) ** 2
+    apart = (255 * seen - true) ** 2
     return {
         "phones": len(films.cameras),
         "apart_seconds": float(np.ptp([video.clock.world(video.times[0]) for video in result.videos])),
@@ -92,24 +90,17 @@ def held_against_the_truth(films: PhoneFilms, folder: Path) -> dict[str, Any]:
         "error_frames": {"mean": float(errors.mean() / step), "max": float(errors.max() / step)},
         "moving_gaussians": len(result.scene),
         "psnr": float(10 * np.log10(255**2 / apart.mean())),
-        "psnr_moving": float(10 * np.log10(255**2 / apart[filmed.masks].mean())),
+        "psnr_moving": float(10 * np.log10(255**2 / apart[moving].mean())),
     }
 
 
 def _between(a: Camera, b: Camera) -> Camera:
-    """A camera half-way between two that stand around the scene, as far from it as they."""
+    """A camera half-way between two that look at the middle of the room."""
     from dataclasses import replace
 
-    import numpy as np
+    from otsync.simulate.room import MIDDLE, look_at
 
-    from recon.rotations import look_at
-    from recon.simulate.world import MIDDLE
-
-    focus = np.array(MIDDLE)
-    sides = np.stack([a.center - focus, b.center - focus])
-    middle = sides.mean(0)
-    middle *= np.linalg.norm(sides, axis=1).mean() / np.linalg.norm(middle)
-    return replace(a, w2c=look_at(focus + middle, focus, np.array([0.0, 0, 1])))
+    return replace(a, w2c=look_at((a.center + b.center) / 2, MIDDLE))
 
 
 def told(figures: dict[str, Any], out: Path) -> tuple[str, str, str]:

@@ -5,7 +5,7 @@ A run that was killed continues from its stages and its checkpoint, and ends wit
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -34,6 +34,7 @@ from recon.result.folder import FilmedBy, SavedReconstruction, load_result, metr
 from recon.result.page import SCENE_PAGE, write_page
 from recon.result.report import write_reconstruction_report
 from recon.result.strips import Strip, strips_of, write_strips
+from recon.scene.gaussians4d import Gaussians4D
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +72,7 @@ def reconstruct(
     map: MapLike = map,
     progress: Progress | None = None,
     deadline: Deadline | None = None,
+    watch: Callable[[Gaussians4D, str], None] | None = None,
 ) -> Outcome:
     """Prepare, fit, evaluate and write the result folder (see :mod:`recon.result.folder`).
 
@@ -85,6 +87,7 @@ def reconstruct(
         cache: an :class:`otsync.files.cache.Cache`; default: ``stages`` in ``out``. map: any map-like callable.
         deadline: of the whole job, whose seconds ``plan.fit.budget`` then are. The static part gets a share of what is
             left, the fit the rest. What that leaves out is noted.
+        watch: is shown the fit as it goes on; see :func:`recon.fit.verb.fit`.
     """
     from otsync.files.cache import Cache
 
@@ -116,7 +119,10 @@ def reconstruct(
             progress.note("what comes before the fit took nearly all of the budget: a longer one gives a better scene")
     with progress.stage("fit"):
         initial = ready.initial.to(plan.device)
-        fitted = fit(initial, ready.footage, ready.offsets, options, checkpoint=out / "fit.npz", deadline=deadline)
+        if watch is not None:
+            watch(ready.initial, "before the first step")
+        kept_in = out / "fit.npz"
+        fitted = fit(initial, ready.footage, ready.offsets, options, checkpoint=kept_in, deadline=deadline, watch=watch)
     _write_fit(out, fitted)
     with progress.stage("views"):
         videos, scores = compared(fitted, effects, ready, plan, progress)

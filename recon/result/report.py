@@ -65,7 +65,7 @@ def write_reconstruction_report(
         f"<h1>{_verdict(reconstruction)}</h1>",
         f"<p class=lead>{extent(offsets, own) if filmed else ''} {_worth(views)}</p>",
         _links(scene_page, sync_page),
-        "".join(f"<p class=no>⚠ {escape(note)}</p>" for note in notes),
+        "".join(f"<p class=note><i>⚠</i> {escape(note)}</p>" for note in notes),
         *([stills(offsets, filmed), "<h2>On the common clock</h2>", timeline(offsets, own, filmed)] if filmed else []),
         "<h2>How sure</h2>",
         _offset_rows(reconstruction, coarse, truth),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -39,7 +38,10 @@ def write_capture(capture: Capture, folder: str | os.PathLike[str], *, masks: bo
     for n, footage in enumerate(every):
         entry = _images(footage, folder, masks)
         if depth and n < len(maps):
-            entry["depth"] = write_depth(folder / "depth" / footage.name, maps[n], folder)
+            for k, z in enumerate(maps[n]):
+                steps = np.rint(np.asarray(z, float) / DEPTH_STEP).clip(0, 65535).astype(np.uint16)
+                _png(folder / "depth" / footage.name / f"{k:04d}.png", steps)
+            entry["depth"] = {"frames": f"depth/{footage.name}/*.png", "scale": DEPTH_STEP}
         videos.append(entry)
     for tracks in capture.tracks:
         tracks.save(folder / "tracks" / f"{tracks.name}.npz")
@@ -70,13 +72,6 @@ def _images(footage: Footage, folder: Path, masks: bool) -> dict[str, Any]:
     if masks and footage.masks is not None:
         entry["masks"] = f"masks/{footage.name}/*.png"
     return entry
-
-
-def write_depth(own: Path, maps: Iterable[np.ndarray], folder: Path) -> dict[str, Any]:
-    """Write the depth maps (h,w) of one camera, m, as images in ``own``; its entry in the document of ``folder``."""
-    for k, z in enumerate(maps):
-        _png(own / f"{k:04d}.png", np.rint(np.asarray(z, float) / DEPTH_STEP).clip(0, 65535).astype(np.uint16))
-    return {"frames": f"{own.relative_to(folder).as_posix()}/*.png", "scale": DEPTH_STEP}
 
 
 def _png(path: Path, image: np.ndarray) -> None:

@@ -880,7 +880,7 @@ def rows() -> set[str]:
     """Every option that a test above exercises, refuses, or gives a reason for."""
     plan = {*PLAN, *OF_A_FIT}
     others = {
-        "fit": "scene offsets out held_out tracks truth cache json allow_outside",
+        "fit": "scene offsets out held_out tracks truth view cache json allow_outside",
         "run": "scene out held_out reference truth json allow_outside recording.route recording.cameras "
         "recording.cache recording.allow_outside recording.masks recording.points recording.features",
         "bench": "scene truth rows out cache name lpips_weights json allow_outside gate rebase protocol.held_out "
@@ -891,6 +891,7 @@ def rows() -> set[str]:
         "eval": "result scene held_out offsets truth views lpips_weights out json allow_outside",
         "export": "result format at fps out",
         "demo": "out seed steps",
+        "view": "what port stages allow_outside",
         "simulate": "out cameras held_out frames width height max_offset gain noise exposure readout sheen seed",
     }
     slots = {f"run {o}" for o in options_of(SYNC["sync"]) if slotted(o)}
