@@ -9,6 +9,7 @@ from html import escape
 import numpy as np
 
 from ..types import Alignment, Matches, Offsets, TrackSet, Video
+from ..types.drawing import shared_moment
 from . import figures
 from .clock import inline_image, measured, thumbnail
 
@@ -124,16 +125,8 @@ def both_seen(offsets: Offsets, key: tuple[int, int], tracks: Sequence[TrackSet]
     between = offsets.between(i, j)
     if key not in offsets.matches or not len(offsets.matches[key]) or not np.isfinite(between):
         return None
-    a, b = tracks[i], tracks[j]
-    pairs = offsets.matches[key].best(BEST).pairs
-    there = a.times - between  # seconds on the clock of b, whose rate differs from a's by less than this can show
-    nearest = np.clip(np.round(np.interp(there, b.times, np.arange(b.n_frames))), 0, b.n_frames - 1).astype(int)
-    inside = (there >= b.times[0]) & (there <= b.times[-1])
-    both = a.seen[pairs[:, 0]] & b.seen[pairs[:, 1]][:, nearest] & inside
-    if not both.any():
-        return None
-    k = int(np.argmax(both.sum(0)))
-    return Seen(key, (k, int(nearest[k])), pairs[both[:, k]])
+    found = shared_moment(tracks[i], tracks[j], offsets.matches[key].best(BEST).pairs, between)
+    return None if found is None else Seen(key, found[:2], found[2])
 
 
 def _on_frames(seen: Seen, tracks: Sequence[TrackSet], videos: Sequence[Video]) -> str:
