@@ -107,12 +107,11 @@ def _between(a: Camera, b: Camera) -> Camera:
 
 def told(figures: dict[str, Any], out: Path) -> tuple[str, str, str]:
     """What matters, in three lines."""
-    error, seconds = figures["error_frames"], figures["error_seconds"]
+    error = figures["error_frames"]
     return (
-        f"clocks: {figures['phones']} phones began up to {figures['apart_seconds']:.2f} s apart; "
-        f"{figures['trusted']} of {figures['judged']} offsets are to be trusted, and they are off by "
-        f"{error['mean']:.3f} frames ({1000 * seconds['mean']:.1f} ms) on average, {error['max']:.3f} at most",
-        f"scene: {figures['moving_gaussians']} moving Gaussians; where no phone stood, between two frames: "
-        f"{figures['psnr']:.1f} dB against the truth, {figures['psnr_moving']:.1f} dB where things move",
+        f"clocks: {figures['phones']} phones began up to {figures['apart_seconds']:.2f} s apart; {figures['trusted']} of "
+        f"{figures['judged']} offsets to be trusted, off by {error['mean']:.3f} frames, {error['max']:.3f} at most",
+        f"scene: {figures['moving_gaussians']} moving Gaussians; {figures['psnr']:.1f} dB against the truth where no "
+        f"phone stood, between two frames; {figures['psnr_moving']:.1f} where it moves",
         f"look: {out / 'result' / 'scene.html'} plays the scene, {out / 'result' / 'report.html'} says how sure it is",
     )
