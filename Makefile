@@ -5,7 +5,7 @@ BIN    := $(VENV)/bin
 PIP    := $(BIN)/pip --disable-pip-version-check install --quiet -c constraints.txt
 WORKERS ?= 2
 
-.PHONY: demo test test-all test-floors bench schemas docs stability lint format clean
+.PHONY: demo pictures test test-all test-floors bench schemas docs stability lint format clean
 .DELETE_ON_ERROR:
 
 $(VENV)/.core: pyproject.toml constraints.txt
@@ -45,6 +45,10 @@ lint: $(VENV)/.test
 $(VENV)/.docs: $(VENV)/.core
 	$(PIP) -e '.[docs]'
 	touch $@
+
+pictures: $(VENV)/.test  ## docs/scene.webp and docs/report.webp, of the demo's pages; needs Chromium
+	$(BIN)/otsync --quiet demo --out demo
+	$(BIN)/python -m tests.docs.pictures demo docs
 
 schemas: $(VENV)/.test  ## docs/schemas/, from what the readers ask for
 	$(BIN)/python -m otsync.io.schemas docs/schemas

@@ -107,9 +107,9 @@ def _between(a: Camera, b: Camera) -> Camera:
 
 def told(figures: dict[str, Any], out: Path) -> tuple[str, str, str]:
     """What matters, in three lines."""
-    error = figures["error_frames"]
+    error, apart = figures["error_frames"], figures["apart_seconds"]
     return (
-        f"clocks: {figures['phones']} phones began up to {figures['apart_seconds']:.2f} s apart; {figures['trusted']} of "
+        f"clocks: {figures['phones']} phones began up to {apart:.2f} s apart; {figures['trusted']} of "
         f"{figures['judged']} offsets to be trusted, off by {error['mean']:.3f} frames, {error['max']:.3f} at most",
         f"scene: {figures['moving_gaussians']} moving Gaussians; {figures['psnr']:.1f} dB against the truth where no "
         f"phone stood, between two frames; {figures['psnr_moving']:.1f} where it moves",
