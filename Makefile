@@ -46,7 +46,7 @@ $(VENV)/.docs: $(VENV)/.core
 	$(PIP) -e '.[docs]'
 	touch $@
 
-pictures: $(VENV)/.test  ## docs/scene.webp and docs/report.webp, of the demo's pages; needs Chromium
+pictures: $(VENV)/.test  ## docs/demo.webp and docs/report.webp, of the demo's pages; needs Chromium
 	$(BIN)/otsync --quiet demo --out demo
 	$(BIN)/python -m tests.docs.pictures demo docs
 

@@ -1,6 +1,6 @@
 """The pictures of README and docs, of the demo's own pages: ``python -m tests.docs.pictures demo docs``.
 
-scene.webp     the scene page, from the clocks as filmed to the synchronised ones, then flying past the phones
+demo.webp     the scene page, from the clocks as filmed to the synchronised ones, then flying past the phones
 report.webp    the beginning of the report
 """
 
@@ -32,12 +32,12 @@ def main(demo: Path, docs: Path) -> int:
         frames, lasts = animation(browser, demo / "result" / "scene.html")
         first, *rest = frames
         options: dict[str, Any] = {"save_all": True, "loop": 0, "quality": QUALITY, "method": 6}
-        first.save(docs / "scene.webp", append_images=rest, duration=lasts, **options)
+        first.save(docs / "demo.webp", append_images=rest, duration=lasts, **options)
         shown = Opened(browser, (900, 900)).look(demo / "result" / "report.html")
         pixels = shown.picture()
         shown.close()
         _image(pixels).save(docs / "report.webp", quality=80, method=6)
-    for name in ("scene.webp", "report.webp"):
+    for name in ("demo.webp", "report.webp"):
         print(f"{docs / name}: {(docs / name).stat().st_size / 1000:.0f} kB")
     return 0
 
