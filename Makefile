@@ -43,7 +43,7 @@ lint: $(VENV)/.test
 	$(BIN)/mypy
 
 $(VENV)/.docs: $(VENV)/.core
-	$(PIP) -e '.[docs]'
+	$(PIP) -e '.[docs,video]'
 	touch $@
 
 pictures: $(VENV)/.test  ## docs/demo.webp and docs/report.webp, of the demo's pages; needs Chromium
@@ -55,6 +55,7 @@ schemas: $(VENV)/.test  ## docs/schemas/, from what the readers ask for
 	$(BIN)/python -m recon.result.layout docs/schemas
 
 docs: $(VENV)/.docs  ## the pages of docs/ as HTML in site/; fails on warnings, and on pages that load from a network
+	$(BIN)/python -m tests.docs.gallery docs $(wildcard demo/result)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	$(BIN)/python -m tests.docs.offline site
 	@echo "wrote site/; look at it: $(BIN)/python -m http.server --directory site"
