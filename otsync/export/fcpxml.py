@@ -9,6 +9,7 @@ from xml.etree import ElementTree as xml
 import numpy as np
 
 from ..files.arrays import atomic_write
+from ..types import Camera
 from .slot import Aligned, Clip, Export
 
 WHOLE = 1e-3
@@ -55,8 +56,7 @@ def _document(clips: list[Clip], span: tuple[float, float], step: Fraction) -> x
     root = xml.Element("fcpxml", version="1.9")
     resources = xml.SubElement(root, "resources")
     camera = clips[0].video.camera
-    size = {"width": str(camera.width), "height": str(camera.height)}
-    xml.SubElement(resources, "format", id="r1", frameDuration=_time(step), **size)
+    _format(resources, "r1", step, camera)
     total = _whole(span[1] - span[0], step) + step
     event = xml.SubElement(xml.SubElement(root, "library"), "event", name="otsync")
     project = xml.SubElement(event, "project", name="synchronised")
@@ -66,8 +66,7 @@ def _document(clips: list[Clip], span: tuple[float, float], step: Fraction) -> x
     )
     for n, clip in enumerate(clips, 1):
         own, own_step = clip.video.times, frame_length(clip.video.fps or float(1 / step))
-        own_size = {"width": str(clip.video.camera.width), "height": str(clip.video.camera.height)}
-        xml.SubElement(resources, "format", id=f"f{n}", frameDuration=_time(own_step), **own_size)
+        _format(resources, f"f{n}", own_step, clip.video.camera)
         first, length = _whole(float(own[0]), own_step), _whole(float(own[-1] - own[0]), own_step) + own_step
         assert clip.file is not None
         asset = xml.SubElement(
@@ -102,6 +101,12 @@ def _document(clips: list[Clip], span: tuple[float, float], step: Fraction) -> x
         for key, value in known.items():
             xml.SubElement(metadata, "md", key=f"otsync.{key}", value=value)
     return root
+
+
+def _format(resources: xml.Element, name: str, step: Fraction, camera: Camera) -> None:
+    made = xml.SubElement(resources, "format", id=name, frameDuration=_time(step))
+    made.set("width", str(camera.width))
+    made.set("height", str(camera.height))
 
 
 def _whole(seconds: float, step: Fraction) -> Fraction:

@@ -29,6 +29,9 @@ MAP_PIXELS = 100
 WIDE, HIGH = 4.2, 2.4
 """Inches of a figure: at the width of a phone its letters can still be read, and two fit side by side elsewhere."""
 
+IN_SPACE = 40
+"""Matches that are drawn in space: each takes half a kilobyte."""
+
 MANY = ("#56b4e9", "#e69f00", "#009e73", "#f0e442", "#cc79a7", "#d55e00", "#8fd3c8", "#b8a1e3")
 """Colours of lines that are to be told apart, on pictures (Okabe and Ito, without the dark ones)."""
 
@@ -109,7 +112,9 @@ def in_space(a: Float[np.ndarray, "M 3"], b: Float[np.ndarray, "M 3"], first: st
         return ""
     from matplotlib.figure import Figure
 
-    a, b = a[known], b[known]
+    some = np.flatnonzero(known)
+    some = some[:: -(-len(some) // IN_SPACE)]
+    a, b = a[some], b[some]
     figure = Figure(figsize=(WIDE, HIGH + 0.5), layout="constrained")
     ax: Any = figure.add_subplot(projection="3d")
     draw_matches_in_space(ax, a, b, first, second)
