@@ -24,12 +24,12 @@ from ..types.drawing import (
 )
 
 MAP_PIXELS = 100
-"""Longest side of an embedded cost map: six of them keep the page below 400 KB."""
+"""Longest side of an embedded cost map: five of them keep the page below 400 KB."""
 
 WIDE, HIGH = 4.2, 2.4
 """Inches of a figure: at the width of a phone its letters can still be read, and two fit side by side elsewhere."""
 
-IN_SPACE = 40
+IN_SPACE = 30
 """Matches that are drawn in space: each takes half a kilobyte."""
 
 MANY = ("#56b4e9", "#e69f00", "#009e73", "#f0e442", "#cc79a7", "#d55e00", "#8fd3c8", "#b8a1e3")

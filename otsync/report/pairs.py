@@ -13,7 +13,7 @@ from ..types.drawing import shared_moment
 from . import figures
 from .clock import inline_image, measured, thumbnail
 
-DETAILED_PAIRS = 6
+DETAILED_PAIRS = 5
 """Pairs shown with their figures; the others stand in the table. Keeps the page below 400 KB."""
 
 WIDTH = 300

@@ -39,10 +39,11 @@ class View:
         from recon.view.window import Window
 
         window = Window(shown, self.port)
-        print(f"open {window.address} on this machine; Ctrl-C ends it", flush=True)
         try:
+            print(f"open {window.address} on this machine; Ctrl-C ends it", flush=True)
             window.wait()
         except KeyboardInterrupt:
+            window.stop()
             print("closed")
         return 0
 
