@@ -5,7 +5,7 @@ BIN    := $(VENV)/bin
 PIP    := $(BIN)/pip --disable-pip-version-check install --quiet -c constraints.txt
 WORKERS ?= 2
 
-.PHONY: demo test test-all test-floors bench schemas docs stability lint format clean
+.PHONY: demo pictures test test-all test-floors bench schemas docs stability lint format clean
 .DELETE_ON_ERROR:
 
 $(VENV)/.core: pyproject.toml constraints.txt
@@ -18,8 +18,12 @@ $(VENV)/.test: $(VENV)/.core
 	$(PIP) -e '.[recon,test]'
 	touch $@
 
-demo: $(VENV)/.core  ## simulate, match and synchronise a small world; writes demo/
-	$(BIN)/otsync demo --out demo
+$(VENV)/.demo: $(VENV)/.core
+	$(PIP) -e '.[recon,video]'
+	touch $@
+
+demo: $(VENV)/.demo  ## films a small moving world, and does the whole job on the videos; writes demo/
+	$(BIN)/otsync --quiet demo --out demo
 
 test: $(VENV)/.test lint  ## under ten minutes on two cores
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m "not slow"
@@ -39,14 +43,19 @@ lint: $(VENV)/.test
 	$(BIN)/mypy
 
 $(VENV)/.docs: $(VENV)/.core
-	$(PIP) -e '.[docs]'
+	$(PIP) -e '.[docs,video]'
 	touch $@
+
+pictures: $(VENV)/.test  ## docs/demo.webp and docs/report.webp, of the demo's pages; needs Chromium
+	$(BIN)/otsync --quiet demo --out demo
+	$(BIN)/python -m tests.docs.pictures demo docs
 
 schemas: $(VENV)/.test  ## docs/schemas/, from what the readers ask for
 	$(BIN)/python -m otsync.io.schemas docs/schemas
 	$(BIN)/python -m recon.result.layout docs/schemas
 
 docs: $(VENV)/.docs  ## the pages of docs/ as HTML in site/; fails on warnings, and on pages that load from a network
+	$(BIN)/python -m tests.docs.gallery docs $(wildcard demo/result)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	$(BIN)/python -m tests.docs.offline site
 	@echo "wrote site/; look at it: $(BIN)/python -m http.server --directory site"

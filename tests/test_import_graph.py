@@ -45,7 +45,7 @@ scene
 losses observe
 backdrop fit evaluate simulate
 result
-features
+features view
 pipeline
 bench
 cli

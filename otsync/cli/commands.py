@@ -6,7 +6,6 @@ from ..plugins import entries, registered
 from .shell import Load, from_places
 
 OWN = {
-    "demo": "otsync.cli.simulate:Demo",
     "simulate": "otsync.cli.simulate:Simulate",
     "match": "otsync.cli.match:Match",
     "init": "otsync.cli.recordings:Init",
@@ -21,7 +20,7 @@ OWN = {
 
 
 def commands() -> dict[str, Load]:
-    """What loads each command, by name. Reconstruction's ``run`` comes from :mod:`recon`, as any package's could."""
+    """What loads each command, by name. ``run`` and ``demo`` come from :mod:`recon`, as any package's could."""
     installed = {name: point.load for name, point in entries("commands").items()}
     added = {name: (lambda thing=thing: thing) for name, thing in registered("commands").items()}
     return from_places(OWN) | installed | added

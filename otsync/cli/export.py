@@ -28,10 +28,11 @@ class Export:
     offsets: Path
     """offsets.json as otsync sync and otsync run write it."""
     out: Path = Path("synchronised")
-    """Folder for mosaic.mp4, clips/, frames.csv and timeline.otio."""
+    """Folder for mosaic.mp4, clips/, frames.csv, timeline.otio and timeline.fcpxml."""
     what: tuple[Literal[tuple(e.name for e in EXPORTS)], ...] = tuple(e.name for e in EXPORTS)
     """mosaic: one video of all, as filmed beside synchronised. clips: every video, cut to what all show, with its
-    sound. frames: a table of the frames that belong together. timeline: OpenTimelineIO, for editors."""
+    sound. frames: a table of the frames that belong together. timeline: OpenTimelineIO, for editors.
+    fcpxml: the same for Final Cut Pro and DaVinci Resolve, in whole frames."""
     cameras: tuple[str, ...] = ()
     """Names of the videos to write; default: all that have an offset."""
     width: int | None = None
@@ -75,5 +76,6 @@ class Export:
             for note in notes:
                 tell(f"note: {note}")
             written = [path for path in export.targets(videos, self.out) if path.exists()]
-            print(f"wrote {written[0] if len(written) == 1 else f'{len(written)} files to {written[0].parent}'}")
+            if written:
+                print(f"wrote {written[0] if len(written) == 1 else f'{len(written)} files to {written[0].parent}'}")
         return 0

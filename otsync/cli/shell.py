@@ -26,6 +26,7 @@ EXTRAS = {
     "pycolmap": "calibrate",
     "poselib": "calibrate",
     "gsplat": "cuda",
+    "viser": "view",
     "ott": "rivals",
     "jax": "rivals",
 }

@@ -1,4 +1,4 @@
-"""``otsync demo`` and ``otsync simulate``."""
+"""``otsync simulate``."""
 
 from __future__ import annotations
 
@@ -11,39 +11,8 @@ import tyro
 from ..files.claim import claimed
 from ..sync.verb import unique_names
 from ..types import Offsets
-from .tables import report, with_progress
 
-Motion = Literal["boxes", "juggle", "softball", "tennis", "basketball", "football", "static"]
 Preset = Literal["clean", "mid", "hard", "brutal"]
-
-
-@dataclass
-class Demo:
-    """Simulate a small unsynchronised world, match, synchronise, and show what came out.
-
-    Example: otsync demo --motion tennis --videos 4 --out demo
-    """
-
-    out: Path = Path("demo")
-    """Folder for offsets.json and report.html."""
-    motion: Motion = "softball"
-    preset: Preset = "mid"
-    videos: int = 4
-    seed: int = 1
-
-    def run(self) -> int:
-        with claimed(self.out, "otsync demo"):
-            return self._run()
-
-    def _run(self) -> int:
-        from ..simulate import simulate
-
-        tracks, truth = simulate(self.motion, preset=self.preset, videos=self.videos, seed=self.seed)
-        print(
-            f"{self.videos} videos of a simulated scene ({self.motion}, {self.preset}), filmed without a common clock."
-        )
-        offsets = with_progress(tracks, "matching and synchronising")
-        return report(offsets, tracks, truth.offsets, self.out, f"{self.motion}, {self.preset}: {self.videos} videos")
 
 
 @dataclass

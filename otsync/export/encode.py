@@ -1,4 +1,4 @@
-"""Writing mp4: H.264 with a timestamp of its own for every frame, and AAC sound."""
+"""Writing videos: H.264 with a timestamp of its own for every frame, and AAC sound."""
 
 from __future__ import annotations
 
@@ -20,6 +20,12 @@ CRF = "18"
 CHUNK = 1024
 """Samples of a frame of AAC."""
 
+CONTAINERS = {".mp4": "mp4", ".mov": "mov", ".mkv": "matroska"}
+"""Of files that are written, by their suffix."""
+
+REPEATABLE = "threads=1:lookahead-threads=1:sliced-threads=0:rc-lookahead=0:mbtree=0"
+"""x264 on one thread, without a look ahead: the same images make the same bytes."""
+
 
 def write_video(
     out: Path,
@@ -27,24 +33,31 @@ def write_video(
     fps: float,
     sound: Float[np.ndarray, "C N"] | None = None,
     rate: int = 48_000,
+    *,
+    x264: str = "",
 ) -> int:
     """Write RGB frames (seconds, pixels) of rising seconds from 0 on, and how many there were.
 
     An odd last row or column is left out. The file appears under its name once it is complete.
 
     Args:
+        out: a file of a kind in ``CONTAINERS``.
         fps: about how many frames a second there are; the timestamps alone say when each is shown.
         sound: samples -1..1 of one or two channels, from second 0 on, ``rate`` a second.
+        x264: parameters of the encoder, as x264 spells them.
     """
     import av
 
+    kind = CONTAINERS[out.suffix.lower()]
     out.parent.mkdir(parents=True, exist_ok=True)
     part = out.with_name(f".{out.name}.{os.getpid()}.part")
     count = 0
     try:
         # a clip's first frame may be shown after second 0; a movie's own ticks, 1000 a second, would round when
-        with av.open(str(part), "w", format="mp4", options={"movie_timescale": str(TICKS)}) as container:
-            video = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(60_000), options={"crf": CRF})
+        ticks = {} if kind == "matroska" else {"movie_timescale": str(TICKS)}
+        with av.open(str(part), "w", format=kind, options=ticks) as container:
+            options = {"crf": CRF} | ({"x264-params": x264} if x264 else {})
+            video = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(60_000), options=options)
             video.pix_fmt = "yuv420p"
             video.time_base = video.codec_context.time_base = Fraction(1, TICKS)
             audio = None if sound is None else container.add_stream("aac", rate=rate, layout=_layout(sound))

@@ -21,7 +21,7 @@ MARKS = {
     "recon simulate": ("start.json",),
     "otsync simulate": ("truth.json",),
     "otsync sync": ("sync.json", "offsets.json"),
-    "otsync demo": ("offsets.json",),
+    "otsync demo": ("demo.json",),
     "otsync calibrate": ("calibration.html",),
     "otsync film": ("cameras.json",),
     "recon export": ("frames.json",),

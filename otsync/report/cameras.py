@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Float
 
 from ..calibrate.found import Calibration, FoundCamera
-from .page import write_page
+from .page import cards, footer, write_page
 
-COLOURS = ("#0b6e99", "#b3261e", "#0a7d33", "#8a4fbf", "#c77700", "#00838f", "#ad1457", "#5d4037", "#455a64", "#827717")
+COLOURS = ("#2a83c6", "#d9690f", "#a06cc4", "#159c7c", "#c25b8f", "#a8892b", "#5f7fa8", "#c0573f", "#6f8f3a", "#8a8f98")
 
 VIEWS = {
     "from above": np.array([[1.0, 0, 0], [0, -1, 0]]),
@@ -34,12 +34,14 @@ def write_cameras(path: str | os.PathLike[str], found: Calibration) -> None:
     cameras = [camera for camera in (*found.cameras, *found.helpers) if camera.w2c is not None]
     unit = "metres" if found.unit == "metres" else "units of a scale that is not known (a usual distance is 3)"
     parts = [
-        "<h1>Cameras</h1>",
-        f"<p><b>{good} of {len(found.cameras)}</b> cameras are to be trusted. World in {unit}, z up.</p>",
+        "<p class=kind>Calibration of a recording</p>",
+        f"<h1>{good} of {len(found.cameras)} cameras {'is' if len(found.cameras) == 1 else 'are'} to be trusted</h1>",
+        f"<p class=lead>The world is in {unit}, z up.</p>",
         *([_pictures(cameras, found.points)] if cameras else ["<p>No camera was found.</p>"]),
         "<h2>How sure</h2>",
         _table(found),
         _remedies(found),
+        footer({}),
     ]
     write_page(path, "Cameras", parts)
 
@@ -47,10 +49,9 @@ def write_cameras(path: str | os.PathLike[str], found: Calibration) -> None:
 def _pictures(cameras: Sequence[FoundCamera], points: Float[np.ndarray, "M 3"]) -> str:
     drawn = []
     for title, axes in VIEWS.items():
-        drawn.append(f"<figure style='display:inline-block;margin:0'>{_picture(cameras, points, axes)}")
-        drawn.append(f"<figcaption>{title}</figcaption></figure>")
-    what = "A line is the way of a camera that moves; dots are what stands still."
-    return f"<div>{''.join(drawn)}</div><p class=s>{what}</p>"
+        drawn.append(f"<figure>{_picture(cameras, points, axes)}<figcaption>{title}</figcaption></figure>")
+    what = "A line is the way of a camera that moves; dots are what stands still. Dashed: not to be trusted."
+    return f"<div class=figs>{''.join(drawn)}</div><p class=s>{what}</p>"
 
 
 def _picture(cameras: Sequence[FoundCamera], points: Float[np.ndarray, "M 3"], axes: Float[np.ndarray, "2 3"]) -> str:
@@ -84,24 +85,24 @@ def _picture(cameras: Sequence[FoundCamera], points: Float[np.ndarray, "M 3"], a
         parts.append(f"<text x='{x}' y='{y}' dy='-5' font-size='11' fill='{colour}'>{escape(camera.name)}</text>")
     return (
         f"<svg xmlns='http://www.w3.org/2000/svg' width='{SIZE}' height='{SIZE}' viewBox='0 0 {SIZE} {SIZE}' "
-        f"style='border:1px solid #dfe3e8'>{''.join(parts)}</svg>"
+        f"fill='currentColor'>{''.join(parts)}</svg>"
     )
 
 
 def _table(found: Calibration) -> str:
     unit = "m" if found.unit == "metres" else "units"
-    rows = ["<tr><th>video<th>focal<th>lens<th>turn<th>place<th>matches<th>points<th class=t>status</tr>"]
+    head = [("video", False), ("status", True), ("focal", False), ("lens", False), ("turn", False), ("place", False)]
+    head += [("matches", False), ("points", False)]
+    rows = []
     for c in found.cameras:
-        status = "ok" if c.ok else "doubtful" if c.w2c is not None else "not found"
+        status = "✓ ok" if c.ok else "⚠ doubtful" if c.w2c is not None else "⚠ not found"
         turn, place = (
             f"±{x:.{n}f}{u}" if np.isfinite(x) else "–"
             for x, n, u in ((c.sigma_degrees, 2, "°"), (c.sigma_position, 3, f" {unit}"))
         )
-        rows.append(
-            f"<tr><td>{escape(c.name)}<td>{c.K[0, 0]:.1f}<td>{c.lens}<td>{turn}<td>{place}<td>{c.inliers}<td>{c.points}"
-            f"<td class='t {'ok' if c.ok else 'no'}'>{status}</tr>"
-        )
-    return f"<div class=scroll><table>{''.join(rows)}</table></div>"
+        words = f"<span class={'ok' if c.ok else 'no'}>{status}</span>"
+        rows.append([escape(c.name), words, f"{c.K[0, 0]:.1f}", c.lens, turn, place, str(c.inliers), str(c.points)])
+    return cards(head, rows)
 
 
 def _remedies(found: Calibration) -> str:

@@ -5,18 +5,38 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Mapping, Sequence
+from html import escape
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from ..types import Alignment, Offsets
-from ..types.drawing import CHOSEN, CURVE, GREY, draw_choice, draw_clock_bars, draw_score, plain
+from ..types.drawing import (
+    CHOSEN,
+    CURVE,
+    GREY,
+    TRUTH,
+    draw_choice,
+    draw_matches_in_space,
+    draw_score,
+    plain,
+)
 
 MAP_PIXELS = 100
-"""Longest side of an embedded cost map: eight of them keep the page below 400 KB."""
+"""Longest side of an embedded cost map: five of them keep the page below 400 KB."""
+
+WIDE, HIGH = 4.2, 2.4
+"""Inches of a figure: at the width of a phone its letters can still be read, and two fit side by side elsewhere."""
+
+IN_SPACE = 30
+"""Matches that are drawn in space: each takes half a kilobyte."""
+
+MANY = ("#56b4e9", "#e69f00", "#009e73", "#f0e442", "#cc79a7", "#d55e00", "#8fd3c8", "#b8a1e3")
+"""Colours of lines that are to be told apart, on pictures (Okabe and Ito, without the dark ones)."""
 
 
-def axes_of(width: float, height: float, columns: int = 1):
+def axes_of(width: float = WIDE, height: float = HIGH, columns: int = 1):
     """A figure outside pyplot's global state, and its axes."""
     from matplotlib.figure import Figure
 
@@ -28,76 +48,99 @@ def axes_of(width: float, height: float, columns: int = 1):
 
 
 def svg(figure, label: str) -> str:
-    """The figure as an <svg> element; the same input gives the same bytes."""
+    """The figure as an <svg> element without a ground, in the page's own ink; the same input gives the same bytes."""
     import matplotlib
 
     plain(figure)
     buffer = io.StringIO()
     with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "otsync", "font.size": 8}):
-        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+        figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
+    text = buffer.getvalue()
+    text = text[text.index("<svg") :]
     # a hundredth of a point is finer than any screen; six decimals make up half of the page
-    text = re.sub(r'\bd="[^"]*"', lambda path: re.sub(r"(\.\d\d)\d+", r"\1", path.group()), buffer.getvalue())
-    return text[text.index("<svg") :].replace("<svg ", f'<svg role="img" aria-label="{label}" ', 1)
+    text = re.sub(r'\bd="[^"]*"', lambda path: re.sub(r"(\.\d\d)\d+", r"\1", path.group()), text)
+    # nor does anybody read its comments, its names of groups, and the space between its tags
+    text = re.sub(r"<!--.*?-->|<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    text = re.sub(r">\s+<", "><", re.sub(r'<g id="[^"]*"', "<g", text))
+    # black is the ink of the page, which is bright in the dark; words that black was not asked for have none
+    text = re.sub(r'style="[^"]*"', lambda style: style.group().replace("#000000", "currentColor"), text)
+    text = text.replace("<svg ", f'<svg role="img" aria-label="{escape(label, quote=True)}" fill="currentColor" ', 1)
+    return text
 
 
-def clock_bars(offsets: Offsets, clips: Sequence[tuple[float, float]]) -> str:
-    """Every video as a bar on the common clock: see :func:`otsync.types.drawing.draw_clock_bars`."""
-    figure, ax = axes_of(7.2, 0.9 + 0.24 * len(offsets))
-    draw_clock_bars(ax, offsets, clips)
-    return svg(figure, "videos on the common clock")
-
-
-def pair_figure(
-    pair: Alignment, cost: np.ndarray | None, path: np.ndarray | None, origin: float, truth: float | None
-) -> str:
-    """Left: the frame-to-frame cost with the warping path and the chosen offset; nothing where there is no cost.
-    Right: the score over offsets."""
-    if cost is None:
-        figure, right = axes_of(7.2, 2.2)
-    else:
-        figure, (left, right) = axes_of(7.2, 2.5, 2)
-        step = max(1, -(-max(cost.shape) // MAP_PIXELS))
-        extent = (-0.5, cost.shape[1] - 0.5, cost.shape[0] - 0.5, -0.5)
-        known = cost[np.isfinite(cost)]
-        top = float(np.quantile(known, 0.95)) if known.size else 1.0
-        left.imshow(cost[::step, ::step], extent=extent, cmap="magma", vmax=top, aspect="auto", interpolation="none")
-        if path is not None:
-            left.plot(path[:, 1], path[:, 0], color="#39c0ff", lw=1.2, label="DTW path")
-        j = np.array([0, cost.shape[1] - 1])
-        for offset, color, name in ((pair.offset, "#35e06a", "chosen"), (truth, "#ffffff", "true")):
-            if offset is not None and np.isfinite(offset):
-                i = j + (offset - origin) * pair.fps
-                left.plot(j, i, color=color, lw=1.2, ls="-" if name == "chosen" else ":", label=name)
-        left.set(
-            xlim=(-0.5, cost.shape[1] - 0.5), ylim=(cost.shape[0] - 0.5, -0.5), xlabel="frame of b", ylabel="frame of a"
-        )
-        left.legend(
-            fontsize=6, loc="lower left", bbox_to_anchor=(0, 1), ncols=3, facecolor="#31363f", labelcolor="white"
-        )
-    if pair.curve is not None and len(pair.curve):
-        draw_score(right, pair)
-        draw_choice(right, pair, truth)
-    elif path is not None and len(path):
+def score_figure(pair: Alignment, path: np.ndarray | None, origin: float, truth: float | None) -> str:
+    """The score over offsets, or how often a path takes each; empty where there is neither."""
+    scored = pair.curve is not None and len(pair.curve)
+    if not scored and (path is None or not len(path)):
+        return ""
+    figure, ax = axes_of()
+    if scored:
+        draw_score(ax, pair)
+    elif path is not None:
         values, counts = np.unique(path[:, 0] - path[:, 1], return_counts=True)
-        right.bar(values + origin * pair.fps, counts, color=CURVE, width=1)
-        right.set(xlabel="offset in frames", ylabel="frames of the path")
-        draw_choice(right, pair, truth)
-    else:
-        right.set_axis_off()
-    return svg(figure, "cost map and score")
+        ax.bar(values + origin * pair.fps, counts, color=CURVE, width=1)
+        ax.set(xlabel="offset in frames", ylabel="frames of the path")
+    draw_choice(ax, pair, truth)
+    return svg(figure, "score over offsets")
+
+
+def cost_figure(pair: Alignment, cost: np.ndarray, path: np.ndarray | None, origin: float, truth: float | None) -> str:
+    """The frame-to-frame cost with the warping path and the chosen offset."""
+    figure, ax = axes_of()
+    step = max(1, -(-max(cost.shape) // MAP_PIXELS))
+    extent = (-0.5, cost.shape[1] - 0.5, cost.shape[0] - 0.5, -0.5)
+    known = cost[np.isfinite(cost)]
+    top = float(np.quantile(known, 0.95)) if known.size else 1.0
+    ax.imshow(cost[::step, ::step], extent=extent, cmap="cividis", vmax=top, aspect="auto", interpolation="none")
+    if path is not None:
+        ax.plot(path[:, 1], path[:, 0], color="#3fb9f0", lw=1.2, label="DTW path")
+    j = np.array([0, cost.shape[1] - 1])
+    for offset, color, name in ((pair.offset, "#ff8c2b", "chosen"), (truth, "#e07be0", "true")):
+        if offset is not None and np.isfinite(offset):
+            i = j + (offset - origin) * pair.fps
+            ax.plot(j, i, color=color, lw=1.4, ls="-" if name == "chosen" else ":", label=name)
+    ax.set(xlim=(-0.5, cost.shape[1] - 0.5), ylim=(cost.shape[0] - 0.5, -0.5), xlabel="frame of b", ylabel="frame of a")
+    if ax.get_legend_handles_labels()[0]:
+        ax.legend(fontsize=6.5, loc="lower left", bbox_to_anchor=(0, 1), ncols=3, frameon=False, borderaxespad=0)
+    return svg(figure, "cost of frames against each other")
+
+
+def in_space(a: Float[np.ndarray, "M 3"], b: Float[np.ndarray, "M 3"], first: str, second: str) -> str:
+    """Matched tracks of two videos at one moment in space, a line between the two of each match; empty without any."""
+    known = np.isfinite(a).all(1) & np.isfinite(b).all(1)
+    if not known.any():
+        return ""
+    from matplotlib.figure import Figure
+
+    some = np.flatnonzero(known)
+    some = some[:: -(-len(some) // IN_SPACE)]
+    a, b = a[some], b[some]
+    figure = Figure(figsize=(WIDE, HIGH + 0.5), layout="constrained")
+    ax: Any = figure.add_subplot(projection="3d")
+    draw_matches_in_space(ax, a, b, first, second)
+    return svg(figure, f"matches of {first} and {second} in space")
 
 
 def residual_bars(labels: Sequence[str], frames: np.ndarray, trusted: Sequence[bool]) -> str:
     """How far each pair's own answer lies from the solution of the graph, in frames."""
-    figure, ax = axes_of(7.2, 0.8 + 0.15 * len(labels))
+    figure, ax = axes_of(WIDE, 0.8 + 0.15 * len(labels))
     ax.barh(range(len(labels)), frames, color=[CHOSEN if ok else GREY for ok in trusted], height=0.7)
     ax.axvline(0, color="black", lw=0.6)
-    ax.set_yticks(range(len(labels)), labels, fontsize=6)
+    ax.set_yticks(range(len(labels)), [short(label) for label in labels], fontsize=6.5)
     ax.invert_yaxis()
     if np.abs(frames).max(initial=0.0) > 3:
         ax.set_xscale("symlog", linthresh=0.5)
+        ax.xaxis.set_major_formatter("{x:g}")
     ax.set_xlabel("pair minus graph, frames (grey: flagged pair)")
     return svg(figure, "graph residuals")
+
+
+LONGEST = 30
+"""Letters of a label in a figure."""
+
+
+def short(label: str) -> str:
+    return label if len(label) <= LONGEST else label[: LONGEST - 1] + "…"
 
 
 def effort(
@@ -116,19 +159,33 @@ def effort(
     points = [p for p in points if p[2] > 0 and np.isfinite(p[2])]
     if not points:
         return ""
+    from matplotlib.ticker import LogLocator, NullLocator
+
     names, at, sigma, error = zip(*points, strict=True)
-    figure, ax = axes_of(7.2, 2.3)
+    figure, ax = axes_of()
     ax.plot(at, sigma, "o-", color=CHOSEN, ms=4, lw=1, label="estimated: mean sigma")
     if np.isfinite(error).any():
-        ax.plot(at, error, "x--", color=CURVE, ms=5, lw=1, label="true: mean |error|")
-    for name, x, y in zip(names, at, sigma, strict=True):
-        ax.annotate(f"{name or 'given'}, {x:.3g} s", (x, y), xytext=(4, 5), textcoords="offset points", fontsize=7)
+        ax.plot(at, error, "x--", color=TRUTH, ms=5, lw=1, label="true: mean |error|")
     total = max(ends.values()) or 1.0
+    for name, x, y in zip(names, at, sigma, strict=True):
+        late = x > 0.55 * total  # words that would leave the figure stand on the other side
+        ax.annotate(
+            f"{name.rpartition(': ')[2] or 'given'}, {x:.3g} s",
+            (x, y),
+            xytext=(-4 if late else 4, 6),
+            textcoords="offset points",
+            fontsize=7,
+            ha="right" if late else "left",
+        )
     for name, end in ends.items():
         if name and seconds[name] > 0.03 * total:
             ax.axvline(end, color=GREY, lw=0.5, zorder=0)
-    ax.set(xlabel="wall seconds since the start", ylabel="frames", yscale="log", xlim=(-0.02 * total, 1.15 * total))
-    ax.legend(fontsize=7, loc="upper right")
+    ax.set(xlabel="wall seconds since the start", ylabel="frames", yscale="log", xlim=(-0.02 * total, 1.05 * total))
+    ax.margins(y=0.3)
+    ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    ax.yaxis.set_major_formatter("{x:g}")
+    ax.yaxis.set_minor_locator(NullLocator())
+    ax.legend(fontsize=7, loc="lower left", bbox_to_anchor=(0, 1), ncols=2, frameon=False, borderaxespad=0)
     return svg(figure, "estimated error of the offsets against seconds")
 
 

@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-CHOSEN, PEAK, TRUTH, CURVE, GREY = "#0a7d33", "#c22f2f", "#6b3fa0", "#31507d", "#8a8f98"
+CHOSEN, PEAK, TRUTH, CURVE, GREY = "#2a83c6", "#d9690f", "#a06cc4", "#74849b", "#8a8f98"
+"""Colours that all eyes tell apart, and that show on white and on black."""
 
 SHOWN = 3
 """Videos that an ``Offsets`` names in its line."""
@@ -111,11 +112,12 @@ def offsets_table(o: Any) -> str:
     return table(f"Offsets of {len(o)} videos", head, lines)
 
 
-def new_axes(width: float, height: float) -> Any:
-    """Axes of a figure of pyplot's, which a notebook shows at the end of its cell."""
+def new_axes(width: float, height: float, solid: bool = False) -> Any:
+    """Axes of a figure of pyplot's, which a notebook shows at the end of its cell. solid: three-dimensional ones."""
     from matplotlib import pyplot
 
-    return pyplot.subplots(figsize=(width, height), layout="constrained")[1]
+    how = {"projection": "3d"} if solid else {}
+    return pyplot.subplots(figsize=(width, height), layout="constrained", subplot_kw=how)[1]
 
 
 def plain(artist: Any) -> None:
@@ -136,11 +138,11 @@ def draw_score(ax: Any, pair: Any) -> None:
 def draw_choice(ax: Any, pair: Any, truth: float | None = None) -> None:
     """Lines at the chosen and, where known, at the true offset (seconds), and what all colours mean."""
     if np.isfinite(pair.offset):
-        ax.axvline(pair.frames, color=CHOSEN, lw=1, label="chosen")
+        ax.axvline(pair.frames, color=CHOSEN, lw=1.4, label="chosen")
     if truth is not None:
         ax.axvline(truth * pair.fps, color=TRUTH, lw=1, ls=":", label="true")
-    if ax.get_legend_handles_labels()[0]:
-        ax.legend(fontsize=6)
+    if ax.get_legend_handles_labels()[0]:  # above, where it covers nothing
+        ax.legend(fontsize=6.5, loc="lower left", bbox_to_anchor=(0, 1), ncols=3, frameon=False, borderaxespad=0)
 
 
 def draw_clock_bars(ax: Any, offsets: Any, clips: Sequence[tuple[float, float]]) -> None:
@@ -169,3 +171,96 @@ def clips_of(sources: Sequence[Any] | None, count: int) -> list[tuple[float, flo
     if sources is None:
         return [(0.0, 1.0)] * count
     return [(float(s.times[0]), float(s.times[-1] - s.times[0] + 1 / (s.fps or 1))) for s in sources]
+
+
+def draw_matches_in_space(ax: Any, a: Any, b: Any, first: str, second: str) -> None:
+    """Matched points of two videos, (M,3) each, on three-dimensional axes, a line between the two of each match."""
+    for p, q in zip(a, b, strict=True):
+        ax.plot(*np.stack([p, q]).T, color=GREY, lw=0.7)
+    ax.scatter(*a.T, s=7, color=CHOSEN, label=short(first)[1:-1], depthshade=False)
+    ax.scatter(*b.T, s=7, color=PEAK, marker="x", lw=0.9, label=short(second)[1:-1], depthshade=False)
+    look_in_space(ax, np.concatenate([a, b]))
+
+
+def look_in_space(ax: Any, points: Any) -> None:
+    """Three-dimensional axes about points (M,3), nan left out: one unit in all directions, thin walls, a legend."""
+    from matplotlib.ticker import MaxNLocator
+
+    points = points[np.isfinite(points).all(-1)]
+    low, high = (np.percentile(points, q, axis=0) for q in (1, 99)) if len(points) else (-np.ones(3), np.ones(3))
+    size = np.maximum(high - low, 1e-3 * max(float((high - low).max()), 1e-9))
+    for name, middle, half in zip("xyz", (low + high) / 2, 0.6 * size, strict=True):
+        getattr(ax, f"set_{name}lim")(middle - half, middle + half)
+        axis = getattr(ax, f"{name}axis")
+        axis.set_pane_color((0.5, 0.5, 0.5, 0.06))
+        axis.set_tick_params(labelsize=6, pad=0)
+        axis.set_major_locator(MaxNLocator(4))
+    ax.set_box_aspect(size)
+    if ax.get_legend_handles_labels()[0]:
+        ax.legend(fontsize=6.5, loc="upper left", frameon=False, ncols=2)
+
+
+def shared_moment(a: Any, b: Any, pairs: Any, offset: float) -> tuple[int, int, Any] | None:
+    """The frame k of ``a`` and m of ``b`` at which most pairs of tracks (M,2) are seen in both, and those pairs.
+
+    offset: of b against a, s. None where no pair is seen in both at one moment.
+    """
+    there = a.times - offset
+    nearest = np.clip(np.round(np.interp(there, b.times, np.arange(b.n_frames))), 0, b.n_frames - 1).astype(int)
+    inside = (there >= b.times[0]) & (there <= b.times[-1])
+    both = a.seen[pairs[:, 0]] & b.seen[pairs[:, 1]][:, nearest] & inside
+    if not both.any():
+        return None
+    k = int(np.argmax(both.sum(0)))
+    return k, int(nearest[k]), pairs[both[:, k]]
+
+
+def draw_matches_in_pixels(ax: Any, p: Any, q: Any, a: Any, b: Any) -> None:
+    """Matched pixels (M,2) of two videos, the second's picture beside the first's; pixels as wide as a's."""
+    width = float(a.camera.width if a.camera is not None else np.nanmax(a.uv[..., 0]))
+    shifted = q + np.array([1.05 * width, 0.0])
+    for start, end in zip(p, shifted, strict=True):
+        ax.plot(*np.stack([start, end]).T, color=GREY, lw=0.6)
+    ax.plot(*p.T, ".", ms=4, color=CHOSEN, label=short(a.name or "a")[1:-1])
+    ax.plot(*shifted.T, "x", ms=4, color=PEAK, label=f"{short(b.name or 'b')[1:-1]}, beside it")
+    _like_a_picture(ax)
+    ax.legend(fontsize=6.5, loc="lower left", bbox_to_anchor=(0, 1), ncols=2, frameon=False, borderaxespad=0)
+
+
+def draw_paths_in_space(ax: Any, paths: Any) -> None:
+    """Paths (N,T,3), nan where not seen, in the colours of where they begin, with a dot at the end."""
+    for path, colour in zip(paths, _colours(len(paths)), strict=True):
+        ax.plot(*path.T, color=colour, lw=0.7)
+    ends = last_seen(paths)
+    ax.scatter(*ends.T, s=5, color=_colours(len(paths)), depthshade=False)
+    look_in_space(ax, paths.reshape(-1, 3))
+    ax.set(xlabel="x", ylabel="y", zlabel="z")
+
+
+def draw_paths_in_pixels(ax: Any, paths: Any) -> None:
+    """Paths (N,T,2), nan where not seen, with a dot at the end."""
+    for path, colour in zip(paths, _colours(len(paths)), strict=True):
+        ax.plot(*path.T, color=colour, lw=0.7)
+    ends = last_seen(paths)
+    ax.scatter(*ends.T, s=5, color=_colours(len(paths)))
+    _like_a_picture(ax)
+
+
+def last_seen(paths: Any) -> Any:
+    """(N,D) where each path (N,T,D) was last seen; nan where never."""
+    seen = np.isfinite(paths).all(-1)
+    last = seen.shape[1] - 1 - np.argmax(seen[:, ::-1], 1)
+    return paths[np.arange(len(paths)), last]
+
+
+def _colours(count: int) -> Any:
+    import matplotlib
+
+    return matplotlib.colormaps["cividis"](np.linspace(0, 1, max(count, 1)))[:count]
+
+
+def _like_a_picture(ax: Any) -> None:
+    ax.set_aspect("equal")
+    if not ax.yaxis_inverted():
+        ax.invert_yaxis()
+    ax.set(xlabel="pixels", ylabel="pixels")

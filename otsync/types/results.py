@@ -120,6 +120,38 @@ class Matches:
     def _repr_html_(self) -> str:
         return drawing.matches_table(self)
 
+    def plot(self, a: TrackSet, b: TrackSet, *, offset: float = 0.0, most: int = 100, ax: Any = None) -> Any:
+        """Draw the best matches at the moment at which most of them are seen; the matplotlib axes.
+
+        In space where both sets have positions: points of a and b with a line between the two of each match. Else in
+        pixels, b's picture beside a's.
+
+        Args:
+            a, b: the matched track sets. offset: of b against a in seconds. most: matches that are drawn.
+            ax: axes to draw on, three-dimensional ones for positions; default: those of a new figure.
+
+        ValueError where no match is seen in both at one moment.
+        """
+        self.check("matches", len(a), len(b))
+        seen = drawing.shared_moment(a, b, self.best(most).pairs, offset)
+        if seen is None:
+            raise ValueError(
+                f"offset: expected one at which a match is seen in both; found none at {offset:g} s. Pass "
+                "alignment.offset, or more matches."
+            )
+        k, m, pairs = seen
+        if a.xyz is not None and b.xyz is not None:
+            ax = drawing.new_axes(4.6, 4.0, solid=True) if ax is None else ax
+            first, second = a.positions()[pairs[:, 0], k], b.positions()[pairs[:, 1], m]
+            drawing.draw_matches_in_space(ax, first, second, a.name or "a", b.name or "b")
+        elif a.uv is not None and b.uv is not None:
+            ax = drawing.new_axes(7.2, 2.8) if ax is None else ax
+            drawing.draw_matches_in_pixels(ax, a.uv[pairs[:, 0], k], b.uv[pairs[:, 1], m], a, b)
+        else:
+            raise ValueError("a, b: expected both with positions, or both with pixels; found one of each. Lift both.")
+        drawing.plain(ax)
+        return ax
+
 
 _NO_PEAKS = np.zeros((0, 2))
 

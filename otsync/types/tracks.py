@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 
 from ..files.arrays import MAX_BYTES, read_npz, write_npz
 from ..files.strict import nearest, on_one_line, shown
+from . import drawing
 from .camera import Camera, clock, frame_times
 from .drawing import short
 
@@ -92,6 +93,23 @@ class TrackSet:
         what = [f for f in ("xyz", "uv", "features", "sigma", "labels", "camera") if getattr(self, f) is not None]
         size, rate = f"{len(self)} tracks x {self.n_frames} frames", "" if self.fps is None else f", {self.fps:.5g} fps"
         return f"TrackSet({short(self.name)}, {size}{rate}, {'+'.join(what)})"
+
+    def plot(self, *, most: int = 200, ax: Any = None) -> Any:
+        """Draw the paths of the longest tracks, in space or in pixels; the matplotlib axes.
+
+        Args:
+            most: tracks that are drawn. ax: axes to draw on, three-dimensional ones for positions; default: new ones.
+        """
+        longest = np.argsort(-self.seen.sum(1), kind="stable")[:most]
+        if self.xyz is not None:
+            ax = drawing.new_axes(4.6, 4.0, solid=True) if ax is None else ax
+            drawing.draw_paths_in_space(ax, self.positions()[longest])
+        else:
+            assert self.uv is not None
+            ax = drawing.new_axes(4.6, 3.2) if ax is None else ax
+            drawing.draw_paths_in_pixels(ax, np.where(self.seen[longest][..., None], self.uv[longest], np.nan))
+        drawing.plain(ax)
+        return ax
 
     @property
     def n_frames(self) -> int:

@@ -71,6 +71,7 @@ def reconstructed(
     as_json: bool = False,
     progress: Progress | None = None,
     deadline: Deadline | None = None,
+    watch: Any = None,
 ) -> int:
     """Prepare, fit, evaluate, write, and print the outcome; the exit code."""
     from otsync.files.cache import Cache
@@ -95,6 +96,7 @@ def reconstructed(
             map=pool.map,
             progress=progress or Progress(tell),
             deadline=deadline,
+            watch=watch,
         )
     parts = [out / name for name in ("scene.npz", "offsets.json", "metrics.json", "report.html")]
     wrote = f"wrote {', '.join(map(str, parts))} and {out / SCENE_PAGE}, which plays the scene in a browser"

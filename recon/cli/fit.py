@@ -39,6 +39,8 @@ class Fit:
     """truth.json of a simulated world: adds errors to table and report."""
     plan: Annotated[Plan, tyro.conf.arg(name="")] = field(default_factory=Plan)
     """How it is reconstructed: without --steps and --budget the fit takes 300 seconds."""
+    view: bool = False
+    """Show the fit as it goes on in a browser on this machine (extra view). It ends with the fit."""
     cache: Path | None = None
     """Folder where stages are kept; default: stages in --out."""
     workers: int = 0
@@ -61,16 +63,26 @@ class Fit:
         scene = opened(self.scene, self.allow_outside)
         offsets = Offsets.load(self.offsets)
         tracks = tuple(TrackSet.load(path) for path in self.tracks) or None
-        return reconstructed(
-            scene,
-            offsets,
-            self.out,
-            with_length(self.plan),
-            held_out=self.held_out,
-            tracks=tracks,
-            truth=self.truth,
-            cache=self.cache,
-            workers=self.workers,
-            as_json=self.json,
-            deadline=deadline,
-        )
+        watcher = None
+        if self.view:
+            from recon.view.window import Watcher
+
+            watcher = Watcher({v.name: v.camera for v in scene.videos})
+        try:
+            return reconstructed(
+                scene,
+                offsets,
+                self.out,
+                with_length(self.plan),
+                held_out=self.held_out,
+                tracks=tracks,
+                truth=self.truth,
+                cache=self.cache,
+                workers=self.workers,
+                as_json=self.json,
+                deadline=deadline,
+                watch=watcher,
+            )
+        finally:
+            if watcher is not None:
+                watcher.stop()

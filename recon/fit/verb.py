@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, field, fields, replace
@@ -81,6 +81,10 @@ class Reconstruction:
     stats: dict[str, float] = field(default_factory=dict)
 
 
+Watch = Callable[[Gaussians4D, str], None]
+"""Is shown a fit as it goes on: the scene, and where it stands in words."""
+
+
 def fit(
     scene: Gaussians4D,
     footage: Sequence[Footage],
@@ -89,6 +93,7 @@ def fit(
     *,
     checkpoint: str | PathLike[str] | None = None,
     deadline: Deadline | None = None,
+    watch: Watch | None = None,
     **changes: Any,
 ) -> Reconstruction:
     """Refine a 4D scene, and the clocks of the videos, from their images.
@@ -104,6 +109,8 @@ def fit(
         checkpoint: file that the fit is kept in, every ``save_every`` seconds and on Ctrl-C; a fit that was killed
             continues from it and ends with the same numbers (on a GPU, whose sums run in any order, nearly so).
         deadline: of the whole job, whose seconds ``options.budget`` are: the fit takes what is left of them.
+        watch: called now and then with the scene so far, on the CPU, and in words where the fit stands; it changes
+            nothing.
 
     Raises:
         ValueError: for footage, offsets or rates that do not fit together.
@@ -142,6 +149,9 @@ def fit(
                     bar.total = run.total = calibrate(run.step)
                 if row is not None:
                     bar.set_postfix_str(f"PSNR {row[3]:.1f}, offsets moved {_moved(problem, row[4:])} frames", False)
+                if watch is not None and row is not None:
+                    values = {n: v.detach().clone() for n, v in run.values().items()}
+                    watch(assemble(run.scene, values).to("cpu"), f"step {run.step}, PSNR {row[3]:.1f} dB")
                 if keep.due():
                     keep.save(run.snapshot())
         except KeyboardInterrupt:

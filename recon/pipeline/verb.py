@@ -5,7 +5,7 @@ A run that was killed continues from its stages and its checkpoint, and ends wit
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from otsync.io import Scene
 from otsync.io.mend import cut, on_mended_clocks
 from otsync.metrics import offset_error
 from otsync.progress import Deadline, Progress
-from otsync.types import Clock, Offsets, TrackSet
+from otsync.types import Clock, Offsets, TrackSet, Video
 from recon.evaluate.lpips import Lpips
 from recon.evaluate.views import ViewScore, view
 from recon.fit.verb import Reconstruction, fit
@@ -34,6 +34,7 @@ from recon.result.folder import FilmedBy, SavedReconstruction, load_result, metr
 from recon.result.page import SCENE_PAGE, write_page
 from recon.result.report import write_reconstruction_report
 from recon.result.strips import Strip, strips_of, write_strips
+from recon.scene.gaussians4d import Gaussians4D
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +72,7 @@ def reconstruct(
     map: MapLike = map,
     progress: Progress | None = None,
     deadline: Deadline | None = None,
+    watch: Callable[[Gaussians4D, str], None] | None = None,
 ) -> Outcome:
     """Prepare, fit, evaluate and write the result folder (see :mod:`recon.result.folder`).
 
@@ -85,6 +87,7 @@ def reconstruct(
         cache: an :class:`otsync.files.cache.Cache`; default: ``stages`` in ``out``. map: any map-like callable.
         deadline: of the whole job, whose seconds ``plan.fit.budget`` then are. The static part gets a share of what is
             left, the fit the rest. What that leaves out is noted.
+        watch: is shown the fit as it goes on; see :func:`recon.fit.verb.fit`.
     """
     from otsync.files.cache import Cache
 
@@ -116,7 +119,10 @@ def reconstruct(
             progress.note("what comes before the fit took nearly all of the budget: a longer one gives a better scene")
     with progress.stage("fit"):
         initial = ready.initial.to(plan.device)
-        fitted = fit(initial, ready.footage, ready.offsets, options, checkpoint=out / "fit.npz", deadline=deadline)
+        if watch is not None:
+            watch(ready.initial, "before the first step")
+        kept_in = out / "fit.npz"
+        fitted = fit(initial, ready.footage, ready.offsets, options, checkpoint=kept_in, deadline=deadline, watch=watch)
     _write_fit(out, fitted)
     with progress.stage("views"):
         videos, scores = compared(fitted, effects, ready, plan, progress)
@@ -219,8 +225,14 @@ def _write(
         truth=outcome.truth,
         lpips_reason=outcome.lpips_reason,
         scene_page=SCENE_PAGE,
+        sync_page=SYNC_PAGE if (out / SYNC_PAGE).is_file() else None,
+        filmed=[Video(list(f.images), f.camera, timestamps=f.times, name=f.name) for f in ready.footage],
     )
     write_page(out / SCENE_PAGE, load_result(out), strips, report="report.html")
+
+
+SYNC_PAGE = "sync.html"
+"""Of the clocks, where ``otsync run`` found them."""
 
 
 def _strips(ready: Prepared, progress: Progress) -> tuple[Strip, ...]:

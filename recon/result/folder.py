@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -102,6 +102,22 @@ class SavedReconstruction:
     def __repr__(self) -> str:
         held = sum(v.held_out for v in self.videos)
         return f"SavedReconstruction({len(self.videos)} videos, {held} held out, {self.scene})"
+
+    def show(self, *, camera: str | None = None, moments: int = 4) -> Any:
+        """Draw what a camera sees of the scene at a few moments, evenly over its span; the matplotlib figure.
+
+        Args:
+            camera: name of a video; default: the first. moments: how many.
+        """
+        from recon.result.plot import moments_figure
+
+        if moments < 1:
+            raise ValueError(f"moments: expected at least 1; found {moments}.")
+        video = self.videos[0] if camera is None else self.video(camera)
+        times = np.linspace(*self.scene.span, moments + 2)[1:-1]
+        views = [self.scene.seen_by(replace(video.camera, w2c=video.pose(t)), t, layered=self.layered) for t in times]
+        pictures = [(255 * view.numpy() * video.gain).clip(0, 255).round().astype(np.uint8) for view in views]
+        return moments_figure(video.name, times.tolist(), pictures)
 
     def video(self, name: str) -> FilmedBy:
         """The video of this name. ValueError lists those that there are."""

@@ -46,13 +46,7 @@ def rendered(
 
 def seen_by(result: SavedReconstruction, camera: Camera, t: float) -> Tensor:
     """The image [h,w,3] of a static camera at world second ``t``, layered as in the fit."""
-    scene = result.scene
-    with torch.no_grad():
-        if scene.static is None or not result.layered:
-            return scene.render(camera, t, depth=None).colors[0]
-        moving = scene.moving(t).render(camera, depth=None, near_plane=scene.moving_near)
-        behind = scene.static.render(camera, depth=None, near_plane=scene.near)
-        return moving.colors[0] + (1 - moving.alphas[0]) * behind.colors[0]
+    return result.scene.seen_by(camera, t, layered=result.layered)
 
 
 def at_width(camera: Camera, width: int | None) -> Camera:

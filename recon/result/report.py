@@ -6,16 +6,16 @@ One self-contained HTML file without a script, in the style of the synchronisati
 from __future__ import annotations
 
 import os
-import platform
 from collections.abc import Mapping, Sequence
 from html import escape
+from typing import Any
 
 import numpy as np
 
+from otsync.report.clock import inline_image, measured, stills, timeline
 from otsync.report.figures import CHOSEN, GREY, axes_of, effort, svg
-from otsync.report.frames import inline_image
-from otsync.report.page import number, status_words, write_page
-from otsync.types import Offsets
+from otsync.report.page import cards, extent, footer, number, remedies, stage_bars, status_words, write_page
+from otsync.types import Offsets, Video
 from recon.evaluate.views import ViewScore
 from recon.fit.verb import History, Reconstruction
 
@@ -40,6 +40,8 @@ def write_reconstruction_report(
     truth: np.ndarray | None = None,
     lpips_reason: str = "",
     scene_page: str | None = None,
+    sync_page: str | None = None,
+    filmed: Sequence[Video] = (),
 ) -> None:
     """Write the page, atomically.
 
@@ -50,32 +52,49 @@ def write_reconstruction_report(
         seconds: wall time of every stage. notes: in words, what was missing or assumed.
         truth: (V,) true offsets in seconds relative to the reference, where they are known.
         lpips_reason: why there is no LPIPS; "" where there is.
-        scene_page: address of the page that plays the scene, relative to the report; None: no link.
+        scene_page, sync_page: addresses of the page that plays the scene and of that of the clocks, relative to the
+            report; None: no link.
+        filmed: the videos of ``reconstruction.offsets``, in its order, to show; without them there are no pictures of
+            the common clock.
     """
+    offsets, seconds = reconstruction.offsets, seconds or {}
+    own = [np.asarray(video.times, float) for video in filmed]
+    figure = effort(seconds, _answers(reconstruction, coarse, seconds), truth)
     parts = [
-        "<h1>Reconstruction</h1>",
-        f"<p>{_verdict(reconstruction, views)}</p>",
-        f'<p><a href="{escape(scene_page, quote=True)}">Fly round the scene, in slow motion</a></p>'
-        if scene_page
-        else "",
-        "".join(f"<p class=no>{escape(note)}</p>" for note in notes),
-        "<h2>Offsets</h2>",
+        "<p class=kind>Reconstruction of a recording</p>",
+        f"<h1>{_verdict(reconstruction)}</h1>",
+        f"<p class=lead>{extent(offsets, own) if filmed else ''} {_worth(views)}</p>",
+        _links(scene_page, sync_page),
+        "".join(f"<p class=note><i>⚠</i> {escape(note)}</p>" for note in notes),
+        *([stills(offsets, filmed), "<h2>On the common clock</h2>", timeline(offsets, own, filmed)] if filmed else []),
+        "<h2>How sure</h2>",
         _offset_rows(reconstruction, coarse, truth),
         "<p class=s>In frames of the reference. Before: what the fit began with. Moved: without the common shift "
-        "of all videos, which images cannot tell. t<sub>world</sub> = rate · t<sub>video</sub> + offset.</p>",
-        f"<h2>Convergence</h2><p class=s>{_pace(reconstruction)}</p>",
-        convergence(reconstruction, coarse, videos, truth),
+        "of all videos, which images cannot tell. t<sub>world</sub> = rate · t<sub>video</sub> + offset. ± is one "
+        "standard deviation; the fit's own is a lower bound.</p>",
+        remedies(offsets),
+        "<h2>What accuracy cost</h2>",
+        f"<div class=figs><div>{stage_bars(seconds)}</div><div>{figure}</div></div>",
         "<h2>Views</h2>",
         _view_rows(views, lpips_reason),
-        views_over_time(views) if any(len(v.frames) > 1 for v in views) else "",
         *_pictures(views),
-        "<h2>What accuracy cost</h2>",
-        "<p class=s>Estimated error of the offsets. The fit's own estimate is a lower bound.</p>",
-        effort(seconds or {}, _answers(reconstruction, coarse, seconds or {}), truth),
-        "<h2>Numbers</h2>",
-        _numbers(reconstruction, seconds or {}),
+        f"<div class=figs>{views_over_time(views)}</div>" if any(len(v.frames) > 1 for v in views) else "",
+        f"<h2>Convergence</h2><p class=s>{_pace(reconstruction)}</p>",
+        convergence(reconstruction, coarse, videos, truth),
+        _numbers(reconstruction),
+        footer({}),
     ]
     write_page(path, "Reconstruction", parts)
+
+
+def _links(scene_page: str | None, sync_page: str | None) -> str:
+    """What else there is to look at."""
+    links = []
+    if scene_page:
+        links.append(f'<a class=go href="{escape(scene_page, quote=True)}">Fly round the scene, in slow motion</a>')
+    if sync_page:
+        links.append(f'<a class="go second" href="{escape(sync_page, quote=True)}">How the clocks were found</a>')
+    return f"<p>{''.join(links)}</p>" if links else ""
 
 
 def _answers(reconstruction: Reconstruction, coarse: Offsets, seconds: Mapping[str, float]) -> dict[str, Offsets]:
@@ -85,39 +104,45 @@ def _answers(reconstruction: Reconstruction, coarse: Offsets, seconds: Mapping[s
     return {last: coarse, "fit": reconstruction.offsets}
 
 
-def _verdict(reconstruction: Reconstruction, views: Sequence[ViewScore]) -> str:
+def _verdict(reconstruction: Reconstruction) -> str:
+    moving, static = len(reconstruction.scene), reconstruction.scene.static
+    text = f"{len(reconstruction.offsets)} videos, {moving:,} moving Gaussians"
+    return text if static is None else f"{text}, {len(static):,} static"
+
+
+def _worth(views: Sequence[ViewScore]) -> str:
+    """What cameras that the fit did not see say of the scene."""
     held = [v for v in views if v.held_out]
-    text = f"<b>{len(reconstruction.offsets)} videos, {len(reconstruction.scene)} moving Gaussians"
-    if reconstruction.scene.static is not None:
-        text += f", {len(reconstruction.scene.static)} static"
-    text += ".</b> "
-    if held:
-        mean = {
-            k: float(np.nanmean([v.mean[k] for v in held]))
-            for k in ("psnr", "mask_psnr")
-            if not all(np.isnan(v.mean[k]) for v in held)
-        }
-        text += f"Held-out cameras: {number(mean.get('psnr', np.nan), 2)} dB"
-        text += f", {number(mean['mask_psnr'], 2)} dB where things move." if "mask_psnr" in mean else "."
-    else:
-        text += "No camera was held out: the figures below are of cameras that took part in the fit."
-    return text
+    if not held:
+        return "No camera was held out: the figures of views are of cameras that took part in the fit."
+    mean = {
+        k: float(np.nanmean([v.mean[k] for v in held]))
+        for k in ("psnr", "mask_psnr")
+        if not all(np.isnan(v.mean[k]) for v in held)
+    }
+    text = f"Held-out cameras: {number(mean.get('psnr', np.nan), 2)} dB"
+    return text + (f", {number(mean['mask_psnr'], 2)} dB where things move." if "mask_psnr" in mean else ".")
 
 
 def _offset_rows(reconstruction: Reconstruction, coarse: Offsets, truth: np.ndarray | None) -> str:
     offsets = reconstruction.offsets
-    head = "<th>video<th>before<th>after<th>± sigma<th>moved" + ("<th>true<th>error" if truth is not None else "")
+    head = [("video", False), ("status before the fit", True), ("before", False), ("after", False), ("moved", False)]
+    head += [("true", False), ("error", False)] if truth is not None else []
     rows = []
     for v, name in enumerate(offsets.names):
-        fps = offsets.fps[offsets.component[v]]
-        cells = [coarse.frames[v], offsets.frames[v], offsets.sigma[v] * fps, offsets.frames[v] - coarse.frames[v]]
+        fps = float(offsets.fps[offsets.component[v]])
+        after = float(offsets.frames[v])
+        cells = [
+            escape(name),
+            "reference" if v == offsets.reference else status_words(offsets.status[v], offsets.flags[v]),
+            measured(float(coarse.frames[v]), float(coarse.sigma[v]) * fps),
+            measured(after, float(offsets.sigma[v]) * fps),
+            number(after - float(coarse.frames[v]), 3),
+        ]
         if truth is not None:
-            cells += [truth[v] * fps, offsets.frames[v] - truth[v] * fps]
-        tail = "reference" if v == offsets.reference else status_words(offsets.status[v], offsets.flags[v])
-        rows.append(
-            f"<tr><td>{escape(name)}" + "".join(f"<td>{number(float(x), 3)}" for x in cells) + f"<td class=t>{tail}"
-        )
-    return f"<div class=scroll><table><tr>{head}<th class=t>status before the fit{''.join(rows)}</table></div>"
+            cells += [number(float(truth[v]) * fps, 3), number(after - float(truth[v]) * fps, 3)]
+        rows.append(cells)
+    return cards(head, rows)
 
 
 def convergence(
@@ -125,19 +150,26 @@ def convergence(
 ) -> str:
     """Left: every camera's offset against steps, relative to the reference. Right: PSNR of the training boxes."""
     history, step = reconstruction.history, reconstruction.scene.frame_step
-    figure, (left, right) = axes_of(7.2, 2.7, 2)
-    if len(history.step):
-        for name, curve, is_reference in offset_curves(history, coarse, videos, truth):
-            color = GREY if is_reference else None
-            left.plot(history.step, curve / step, lw=1, color=color, label=name)
-        left.axhline(0, color="black", lw=0.5)
-        left.set(xlabel="step", ylabel="error, frames" if truth is not None else "moved, frames")
-        if len(history.offsets.T) <= 12:
-            left.legend(fontsize=5, ncols=2)
-        known = np.isfinite(history.psnr)
-        right.plot(history.step[known], history.psnr[known], color=CHOSEN, lw=1)
-        right.set(xlabel="step", ylabel="PSNR of training boxes, dB")
-    return svg(figure, "offsets and PSNR over the fit")
+    if not len(history.step):
+        return ""
+    moved, left = axes_of()
+    for name, curve, is_reference in offset_curves(history, coarse, videos, truth):
+        left.plot(history.step, curve / step, lw=1, color=GREY if is_reference else None, label=name)
+    left.axhline(0, color="black", lw=0.5)
+    left.set(xlabel="step", ylabel="error, frames" if truth is not None else "moved, frames")
+    if len(history.offsets.T) <= 12:
+        legend_above(left)
+    better, right = axes_of()
+    known = np.isfinite(history.psnr)
+    right.plot(history.step[known], history.psnr[known], color=CHOSEN, lw=1)
+    right.set(xlabel="step", ylabel="PSNR of training boxes, dB")
+    figures = (svg(moved, "offsets over the fit"), svg(better, "PSNR over the fit"))
+    return f"<div class=figs>{''.join(f'<div>{figure}</div>' for figure in figures)}</div>"
+
+
+def legend_above(ax: Any) -> None:
+    """A legend above the axes, where it covers nothing."""
+    ax.legend(fontsize=6.5, loc="lower left", bbox_to_anchor=(0, 1), ncols=4, frameon=False, borderaxespad=0)
 
 
 def _pace(reconstruction: Reconstruction) -> str:
@@ -172,27 +204,24 @@ def _view_rows(views: Sequence[ViewScore], lpips_reason: str) -> str:
         "mask_psnr": ("PSNR, moving", 2),
         "mask_ssim": ("SSIM, moving", 4),
     }
+    head = [("camera", False), ("role", True), *((title, False) for title, _ in names.values())]
+    head += [("frames", False), ("gain R G B", False), ("clock", True)]
     rows = []
     for v in views:
-        cells = "".join(f"<td>{number(v.mean.get(key, np.nan), digits)}" for key, (_, digits) in names.items())
+        cells = [number(v.mean.get(key, np.nan), digits) for key, (_, digits) in names.items()]
         gain = " ".join(f"{g:.3f}" for g in v.gain)
         role = "held out" if v.held_out else "training"
-        rows.append(
-            f"<tr><td>{escape(v.name)}<td class=t>{role}{cells}<td>{len(v.frames)}"
-            f"<td style='white-space:nowrap'>{gain}<td class=t>{HOW[v.clock.how]}"
-        )
-    head = "".join(f"<th>{title}" for title, _ in names.values())
+        rows.append([escape(v.name), role, *cells, str(len(v.frames)), gain, HOW[v.clock.how]])
     missing = f" LPIPS: {escape(lpips_reason)}." if lpips_reason else ""
     return (
-        f"<div class=scroll><table><tr><th>camera<th class=t>role{head}<th>frames<th>gain R G B<th class=t>clock"
-        f"{''.join(rows)}</table></div><p class=s>Renderings use none of the cameras' own pictures: they are static "
+        f"{cards(head, rows)}<p class=s>Renderings use none of the cameras' own pictures: they are static "
         f"Gaussians, and over them what moves. The gain is fitted to what is static.{missing}</p>"
     )
 
 
 def views_over_time(views: Sequence[ViewScore]) -> str:
     """PSNR of every compared frame: the whole image, and where things move (dashed)."""
-    figure, ax = axes_of(7.2, 2.3)
+    figure, ax = axes_of()
     for n, v in enumerate(views):
         color = f"C{n % 10}" if v.held_out else GREY
         for key, style in (("psnr", "-"), ("mask_psnr", "--")):
@@ -201,7 +230,7 @@ def views_over_time(views: Sequence[ViewScore]) -> str:
                 ax.plot(v.times, values, style, lw=1, color=color, label=v.name if style == "-" else None)
     ax.set(xlabel="world seconds (dashed: what moves)", ylabel="PSNR, dB")
     if len(views) <= 10:
-        ax.legend(fontsize=6, ncols=2)
+        legend_above(ax)
     return svg(figure, "PSNR over time")
 
 
@@ -220,19 +249,15 @@ def _pictures(views: Sequence[ViewScore]) -> list[str]:
             size, box = (PICTURE, height), Image.Resampling.BOX
             cells = [np.asarray(Image.fromarray(x).resize(size, box)) for x in (rendered, filmed, apart)]
             rows.append(np.concatenate(cells, 1))
-        parts.append(f"<p>{escape(v.name)}: rendered, filmed, four times their difference</p>")
-        parts.append(inline_image(np.concatenate(rows), f"{v.name} rendered and filmed"))
+        words = f"{escape(v.name)}: rendered, filmed, four times their difference"
+        picture = inline_image(np.concatenate(rows), f"{v.name} rendered and filmed")
+        parts.append(f"<figure>{picture}<figcaption>{words}</figcaption></figure>")
     return parts
 
 
-def _numbers(reconstruction: Reconstruction, seconds: Mapping[str, float]) -> str:
-    from otsync import __version__
-
-    stages = "".join(f"<tr><td>{escape(k)}<td>{v:.1f} s" for k, v in seconds.items())
+def _numbers(reconstruction: Reconstruction) -> str:
     stats = "".join(f"<tr><td>{escape(k)}<td>{v:.5g}" for k, v in reconstruction.stats.items())
     knots = reconstruction.scene.motion.parameters().get("knots")
     nodes = "" if knots is None else f"<tr><td>scaffold nodes<td>{knots.shape[1]}<tr><td>knots<td>{knots.shape[0]}"
-    return (
-        f"<table>{stages}</table><table>{stats}{nodes}</table>"
-        f"<p class=s>otsync {__version__}, Python {platform.python_version()}, {platform.machine()}.</p>"
-    )
+    table = f"<table class=numbers>{stats}{nodes}</table>"
+    return f"<details><summary>Numbers</summary><div class=inside>{table}</div></details>"

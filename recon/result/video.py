@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
-from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
 
-CONTAINERS = {".mp4": "mp4", ".mov": "mov", ".mkv": "matroska"}
+from otsync.export.encode import CONTAINERS, write_video
 
 
 def check_target(out: Path) -> None:
@@ -55,33 +54,6 @@ def _frames(images: Iterable[np.ndarray], folder: Path) -> int:
 
 
 def _video(images: Iterable[np.ndarray], out: Path, fps: float) -> int:
-    import av
-
     if not (np.isfinite(fps) and fps > 0):
         raise ValueError(f"fps: expected frames per second above 0; found {fps}.")
-    out.parent.mkdir(parents=True, exist_ok=True)
-    part = out.with_name(f".{out.name}.{os.getpid()}.part")
-    count = 0
-    try:
-        with av.open(str(part), "w", format=CONTAINERS[out.suffix.lower()]) as video:
-            stream = None
-            for image in images:
-                even = image[: image.shape[0] // 2 * 2, : image.shape[1] // 2 * 2]
-                if stream is None:
-                    rate = Fraction(fps).limit_denominator(60_000)
-                    stream = video.add_stream("libx264", rate=rate, options={"crf": "18"})
-                    stream.height, stream.width, stream.pix_fmt = *even.shape[:2], "yuv420p"
-                frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24")
-                video.mux(stream.encode(frame))
-                count += 1
-            if stream is None:
-                raise ValueError(f"{out}: expected at least one image to write; found none.")
-            video.mux(stream.encode())
-        os.replace(part, out)
-    except BaseException as error:
-        part.unlink(missing_ok=True)
-        if isinstance(error, OSError) and error.errno is not None:  # FFmpeg's own, which name the temporary file
-            said = f"cannot be written ({os.strerror(error.errno)}); nothing is half written"
-            raise OSError(error.errno, said, str(out)) from None
-        raise
-    return count
+    return write_video(out, ((n / fps, image) for n, image in enumerate(images)), fps)

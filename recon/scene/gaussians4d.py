@@ -130,6 +130,18 @@ class Gaussians4D:
         options.setdefault("near_plane", self.near)
         return self.at(t).render(camera, **options)
 
+    def seen_by(self, camera: Camera, t: float, *, layered: bool = True) -> Tensor:
+        """The image [h,w,3] of a static camera at world second ``t``.
+
+        layered: what moves is drawn over what is static, as in a fit over backgrounds, rather than together with it.
+        """
+        with torch.no_grad():
+            if self.static is None or not layered:
+                return self.render(camera, t, depth=None).colors[0]
+            moving = self.moving(t).render(camera, depth=None, near_plane=self.moving_near)
+            behind = self.static.render(camera, depth=None, near_plane=self.near)
+            return moving.colors[0] + (1 - moving.alphas[0]) * behind.colors[0]
+
     def save(self, path: str | os.PathLike[str], extra: Mapping[str, np.ndarray] | None = None) -> None:
         """Write everything as plain arrays (``.npz``), atomically; NaN is refused."""
         write_npz(path, {**scene_arrays(self), **(extra or {})})

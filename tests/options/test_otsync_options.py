@@ -552,7 +552,7 @@ def test_options_of_export(recording, tmp_path):
     assert export("--what", "frames", "--allow-outside", of=outside)["frames.csv"] == base["frames.csv"]
 
 
-def test_options_of_simulate_and_demo(tmp_path):
+def test_options_of_simulate(tmp_path):
     def world(*args: str) -> dict[str, bytes]:
         out = tmp_path / "-".join(args or ("plain",)).replace("/", "_")
         assert run(["simulate", str(out), "--frames", "20", "--videos", "2", *args])[0] == 0
@@ -570,15 +570,6 @@ def test_options_of_simulate_and_demo(tmp_path):
         ["--own-frames"],
     ):
         assert world(*args) != plain, args
-
-    def demo(*args: str) -> str:
-        out = tmp_path / "demo"
-        assert run(["demo", "--videos", "2", "--out", str(out), *args])[0] in (0, 1)
-        return (out / "offsets.json").read_text()
-
-    first = demo()
-    for args in (["--motion", "tennis"], ["--preset", "clean"], ["--videos", "3"], ["--seed", "4"]):
-        assert demo(*args) != first, args
 
 
 def test_options_of_film(tmp_path):
@@ -726,7 +717,6 @@ def rows() -> set[str]:
         "graph.curves graph.starts graph.seed recording.route recording.cameras recording.cache "
         "recording.allow_outside recording.workers recording.masks recording.points recording.features "
         "recording.selection recording.width",
-        "demo": "out motion preset videos seed",
         "simulate": "out motion preset videos frames fps max_offset own_frames seed",
         "film": "out phones gap handheld walk frames fps width height max_offset contrast seed",
         "calibrate": "folder out force options.intrinsics options.board options.distance options.key_frames "

@@ -24,6 +24,7 @@ import pytest
 
 import otsync.cli
 import recon.cli
+import recon.simulate.phones
 from otsync import DTW, PAPER, Graph, Method, UnbalancedOT, Unrefined
 from otsync.cli.commands import OWN as SYNC
 from otsync.costs import CurveDistance
@@ -819,6 +820,28 @@ def test_options_of_simulate(home):
         assert world(*more) != base, more
 
 
+def test_options_of_the_demo(home, monkeypatch):
+    """What it films, and what it gives to ``otsync run``."""
+    film, seen = recon.simulate.phones.film_phones, {}
+
+    def asked(self):
+        seen["steps"], seen["out"], seen["films"] = self.plan.fit.steps, self.out, contents(self.scene)
+        raise Reached
+
+    def demo(*more: str) -> dict[str, Any]:
+        with contextlib.suppress(Reached):
+            run(otsync.cli.main, ["demo", "--out", str(home / "demo"), *more])
+            raise AssertionError("otsync run was not reached")
+        return dict(seen)
+
+    monkeypatch.setattr("recon.simulate.phones.film_phones", lambda *args: film(*args, seconds=0.1, size=(48, 32)))
+    monkeypatch.setattr("recon.cli.run.Run.run", asked)
+    base = demo()
+    assert base["out"] == home / "demo" / "result" and {"phone0.mp4", "scene.json"} <= set(base["films"])
+    assert demo("--steps", "7") == base | {"steps": 7}
+    assert demo("--seed", "5")["films"] != base["films"]
+
+
 def test_quiet_tells_nothing_but_results(result, home, monkeypatch):
     """Not even which back end renders, which is a line of a logger."""
     args = ["render", str(result), "--camera", "cam1", "--times", "0.1", "--out", str(home / "quiet")]
@@ -863,7 +886,7 @@ def rows() -> set[str]:
     """Every option that a test above exercises, refuses, or gives a reason for."""
     plan = {*PLAN, *OF_A_FIT}
     others = {
-        "fit": "scene offsets out held_out tracks truth cache json allow_outside",
+        "fit": "scene offsets out held_out tracks truth view cache json allow_outside",
         "run": "scene out held_out reference truth json allow_outside recording.route recording.cameras "
         "recording.cache recording.allow_outside recording.masks recording.points recording.features "
         "recording.selection recording.width",
@@ -874,6 +897,8 @@ def rows() -> set[str]:
         "render": "result camera path times frames turns fps width out",
         "eval": "result scene held_out offsets truth views lpips_weights out json allow_outside",
         "export": "result format at fps out",
+        "demo": "out seed steps",
+        "view": "what port stages allow_outside",
         "simulate": "out cameras held_out frames width height max_offset gain noise exposure readout sheen seed",
     }
     slots = {f"run {o}" for o in options_of(SYNC["sync"]) if slotted(o)}

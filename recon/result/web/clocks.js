@@ -5,7 +5,9 @@
 const SLIDE_SECONDS = 0.7; // that the bars take to slide from one to the other
 
 class Clocks {
-  /** @param about the header: of each camera `offset` and `rate`, t_world = rate * t_own + offset, and `first` second. */
+  /**
+   * @param about the header: of each camera `offset` and `rate`, t_world = rate * t_own + offset, and `first` second.
+   */
   constructor({ cameras, reference }) {
     this.cameras = cameras;
     const first = cameras[reference];

@@ -31,7 +31,8 @@ function arraysOf(entries, bytes) {
     at += count * width;
     const joined = new Uint8Array(count * width);
     for (let b = 0; b < width; b++) for (let i = 0; i < count; i++) joined[i * width + b] = planes[b * count + i];
-    const view = new { u8: Uint8Array, u16: Uint16Array, u32: Uint32Array, f32: Float32Array }[entry.kind](joined.buffer);
+    const kinds = { u8: Uint8Array, u16: Uint16Array, u32: Uint32Array, f32: Float32Array };
+    const view = new kinds[entry.kind](joined.buffer);
     found[entry.name] = entry.low ? measured(view, entry.low, entry.step) : view;
   }
   return found;

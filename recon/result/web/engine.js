@@ -28,7 +28,9 @@ class Engine {
     if (moved) this.motion.carry(ask.time, this.placed);
     this.time = ask.time;
     const moving = { positions: this.placed, stride: PLACE, count: this.count, first: 0, near: this.about.moving_near };
-    const still = { positions: this.still, stride: 3, count: this.still.length / 3, first: this.about.row_start, near: ask.near };
+    const still = {
+      positions: this.still, stride: 3, count: this.still.length / 3, first: this.about.row_start, near: ask.near,
+    };
     const layers = ask.still ? [still] : [];
     const order = new Uint32Array(Math.max(1, Math.ceil((this.count + still.count) / ORDER_ROW)) * ORDER_ROW);
     let drawn = 0;
@@ -67,7 +69,8 @@ if (typeof document === 'undefined') {
   self.onmessage = ({ data: { id, call, ask } }) => {
     if (call === 'begin') engine = new Engine(ask.about, ask.arrays);
     const answer = call === 'begin' ? null : engine[call](ask);
-    const given = [answer?.places, answer?.order].filter(Boolean).map((array) => array.buffer); // given away, not copied
+    // given away, not copied
+    const given = [answer?.places, answer?.order].filter(Boolean).map((array) => array.buffer);
     self.postMessage({ id, answer }, given);
   };
 }

@@ -2,25 +2,43 @@
 
 'use strict';
 
-const LINE_VERTEX = `#version 300 es
-precision highp float;
-layout(location = 0) in vec3 place;
-layout(location = 1) in vec4 paint;
-layout(location = 2) in float moment;  // world second that a vertex belongs to
+/** Where a place of the world is seen, in clip coordinates with w = z; in every shader that draws over Gaussians. */
+const PROJECTION = `
 uniform mat3 turn;
 uniform vec3 shift;
 uniform vec4 lens;
 uniform vec2 size;
 uniform float near;
+
+vec4 projected(vec3 place) {
+  vec3 at = turn * place + shift;
+  // with w = z what begins behind the camera is cut by the card
+  vec2 scaled = 2.0 * (lens.xy * at.xy + lens.zw * at.z) / size - at.z;
+  return vec4(scaled.x, -scaled.y, at.z - 2.0 * near, at.z);
+}
+`;
+
+/** Sets the uniforms of `PROJECTION` to a shot. */
+function aim(gl, uniforms, shot, near) {
+  gl.uniformMatrix3fv(uniforms.turn, true, shot.turn);
+  gl.uniform3fv(uniforms.shift, shot.shift);
+  gl.uniform4fv(uniforms.lens, shot.lens);
+  gl.uniform2f(uniforms.size, shot.width, shot.height);
+  gl.uniform1f(uniforms.near, near);
+}
+
+const LINE_VERTEX = `#version 300 es
+precision highp float;
+layout(location = 0) in vec3 place;
+layout(location = 1) in vec4 paint;
+layout(location = 2) in float moment;  // world second that a vertex belongs to
+${PROJECTION}
 uniform float dot_size;
 uniform vec3 trail;  // world second, how long before it a trail begins, how long after it ends; 0: all is drawn alike
 out vec4 color;
 
 void main() {
-  vec3 at = turn * place + shift;
-  // clip coordinates with w = z: lines that begin behind the camera are cut by the card
-  vec2 scaled = 2.0 * (lens.xy * at.xy + lens.zw * at.z) / size - at.z;
-  gl_Position = vec4(scaled.x, -scaled.y, at.z - 2.0 * near, at.z);
+  gl_Position = projected(place);
   gl_PointSize = dot_size;
   float late = moment - trail.x;
   float shown = trail.y + trail.z <= 0.0 ? 1.0 : late <= 0.0 ? 1.0 + late / trail.y : 1.0 - late / max(trail.z, 1e-6);
@@ -81,11 +99,7 @@ class Lines {
     const { gl } = this;
     const { made, uniforms } = this.program;
     gl.useProgram(made);
-    gl.uniformMatrix3fv(uniforms.turn, true, shot.turn);
-    gl.uniform3fv(uniforms.shift, shot.shift);
-    gl.uniform4fv(uniforms.lens, shot.lens);
-    gl.uniform2f(uniforms.size, shot.width, shot.height);
-    gl.uniform1f(uniforms.near, near);
+    aim(gl, uniforms, shot, near);
     gl.uniform1f(uniforms.dot_size, dot);
     gl.uniform1f(uniforms.round_dots, set.mode === gl.POINTS ? 1 : 0);
     gl.uniform3fv(uniforms.trail, trail);

@@ -93,7 +93,9 @@ class ScaffoldMotion {
       const r = j * ROW;
       if (this.about.blend === 'dual-quaternion') {
         rows.set([w, x, y, z], r);
-        rows.set([-sx * x - sy * y - sz * z, sx * w + sy * z - sz * y, sy * w + sz * x - sx * z, sz * w + sx * y - sy * x], r + 4);
+        rows.set([
+          -sx * x - sy * y - sz * z, sx * w + sy * z - sz * y, sy * w + sz * x - sx * z, sz * w + sx * y - sy * x,
+        ], r + 4);
       } else {
         rows.set(R, r);
         rows[r + 9] = sx;
@@ -124,7 +126,8 @@ class ScaffoldMotion {
         const r = slots[SLOTS * groupOf[n] + k] * ROW;
         const q = r + quatAt;
         // q and -q are one rotation: the sign that agrees with the nearest node's
-        const agrees = rows[first] * rows[q] + rows[first + 1] * rows[q + 1] + rows[first + 2] * rows[q + 2] + rows[first + 3] * rows[q + 3];
+        const agrees = rows[first] * rows[q] + rows[first + 1] * rows[q + 1]
+          + rows[first + 2] * rows[q + 2] + rows[first + 3] * rows[q + 3];
         const s = agrees >= 0 ? w : -w;
         if (dual) {
           for (let c = 0; c < 8; c++) sum[c] += s * rows[r + c];

@@ -6,17 +6,11 @@ const SCREEN_VERTEX = `#version 300 es
 precision highp float;
 layout(location = 0) in vec3 place;
 layout(location = 1) in vec2 at;
-uniform mat3 turn;
-uniform vec3 shift;
-uniform vec4 lens;
-uniform vec2 size;
-uniform float near;
+${PROJECTION}
 out vec2 texel;
 
 void main() {
-  vec3 seen = turn * place + shift;
-  vec2 scaled = 2.0 * (lens.xy * seen.xy + lens.zw * seen.z) / size - seen.z;
-  gl_Position = vec4(scaled.x, -scaled.y, seen.z - 2.0 * near, seen.z);
+  gl_Position = projected(place);
   texel = at;
 }`;
 
@@ -77,11 +71,7 @@ class Screens {
     const { gl } = this;
     const { made, uniforms } = this.program;
     gl.useProgram(made);
-    gl.uniformMatrix3fv(uniforms.turn, true, shot.turn);
-    gl.uniform3fv(uniforms.shift, shot.shift);
-    gl.uniform4fv(uniforms.lens, shot.lens);
-    gl.uniform2f(uniforms.size, shot.width, shot.height);
-    gl.uniform1f(uniforms.near, near);
+    aim(gl, uniforms, shot, near);
     gl.uniform1i(uniforms.picture, 0);
     gl.activeTexture(gl.TEXTURE0);
     gl.bindTexture(gl.TEXTURE_2D, screen.texture);

@@ -198,7 +198,9 @@ class Splats {
 
   #unfiltered() {
     const { gl } = this;
-    for (const side of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, side, gl.NEAREST);
+    for (const side of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) {
+      gl.texParameteri(gl.TEXTURE_2D, side, gl.NEAREST);
+    }
   }
 
   /** Places of what is static; those of what moves follow with every instant. */
@@ -215,7 +217,8 @@ class Splats {
   #looksOf(about, arrays) {
     const values = new Float32Array(this.rows.all * ROW_TEXELS * 4);
     for (const [part, count, first] of [['dynamic', about.moving, 0], ['static', about.still, about.row_start]]) {
-      const [scales, opacities, colors] = ['log_scales', 'opacities', 'colors'].map((name) => arrays[`${part}_${name}`]);
+      const names = ['log_scales', 'opacities', 'colors'];
+      const [scales, opacities, colors] = names.map((name) => arrays[`${part}_${name}`]);
       for (let n = 0; n < count; n++) {
         const o = 8 * (first + n);
         for (let c = 0; c < 3; c++) {
@@ -253,7 +256,8 @@ class Splats {
       gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ROW_TEXELS, this.rows.moving, gl.RGBA, gl.FLOAT, places);
     }
     gl.bindTexture(gl.TEXTURE_2D, this.order);
-    gl.texImage2D(gl.TEXTURE_2D, 0, gl.R32UI, ROW_TEXELS, order.length / ROW_TEXELS, 0, gl.RED_INTEGER, gl.UNSIGNED_INT, order);
+    const rows = order.length / ROW_TEXELS;
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.R32UI, ROW_TEXELS, rows, 0, gl.RED_INTEGER, gl.UNSIGNED_INT, order);
     this.#unfiltered();
     this.count = drawn;
   }

@@ -13,9 +13,13 @@ class Stage {
     this.about = about;
     this.quality = 0.5; // until it is known how fast this computer draws
     this.gl = view.getContext('webgl2', { alpha: false, antialias: false, depth: false, preserveDrawingBuffer: true });
-    if (!this.gl) throw new Error('this browser offers no WebGL2. Open the page in a current browser, with hardware acceleration on');
+    if (!this.gl) {
+      const remedy = 'Open the page in a current browser, with hardware acceleration on';
+      throw new Error(`this browser offers no WebGL2. ${remedy}`);
+    }
     this.splats = new Splats(this.gl, about, arrays);
-    view.addEventListener('webglcontextlost', () => stop(new Error('the graphics card took its memory back. Reload it')));
+    const lost = new Error('the graphics card took its memory back. Reload it');
+    view.addEventListener('webglcontextlost', () => stop(lost));
     this.lines = new Lines(this.gl);
     this.screens = new Screens(this.gl);
   }
@@ -91,7 +95,7 @@ class Stage {
     this.tried = (this.tried ?? 0) + 1;
   }
 
-  /** Draws everything. `look`: which layers, the gain, the seconds that are shown, the camera that is looked through. */
+  /** Draws everything. `look`: which layers, the gain, the seconds that are shown, the camera looked through. */
   draw(shot, look) {
     if ((this.tried ?? 0) < 2) this.#tryOut(() => this.#draw(shot, look)); // shaders are compiled on the first one
     else this.#draw(shot, look);
@@ -178,7 +182,8 @@ function cornersOf(camera, pose, size) {
   const [fx, fy, cx, cy] = camera.lens;
   const [w, h] = [camera.width, camera.height];
   const back = transposed(pose.turn);
-  return [[0, 0], [w, 0], [w, h], [0, h]].map(([u, v]) => add(pose.eye, times(turn(back, [(u - cx) / fx, (v - cy) / fy, 1]), size)));
+  const corners = [[0, 0], [w, 0], [w, h], [0, h]].map(([u, v]) => [(u - cx) / fx, (v - cy) / fy, 1]);
+  return corners.map((ray) => add(pose.eye, times(turn(back, ray), size)));
 }
 
 /** The edges of a camera's pyramid, with a mark on its upper side. */

@@ -70,7 +70,8 @@ function slerp(p, q, s) {
   const sign = cosine < 0 ? -1 : 1;
   cosine = Math.min(1, cosine * sign);
   const angle = Math.acos(cosine);
-  const [a, b] = angle < 1e-4 ? [1 - s, s] : [Math.sin((1 - s) * angle) / Math.sin(angle), Math.sin(s * angle) / Math.sin(angle)];
+  const share = (part) => (angle < 1e-4 ? part : Math.sin(part * angle) / Math.sin(angle));
+  const [a, b] = [share(1 - s), share(s)];
   const out = p.map((x, k) => a * x + b * sign * q[k]);
   const norm = Math.hypot(out[0], out[1], out[2], out[3]);
   return out.map((x) => x / norm);

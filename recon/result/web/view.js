@@ -131,7 +131,8 @@ class View {
     const { cameras } = this.about;
     const azimuths = cameras.map((camera) => this.around.of(camera.poses[0].eye).azimuth);
     const order = cameras.map((_, i) => i).sort((a, b) => azimuths[a] - azimuths[b]);
-    const gaps = order.map((i, k) => (azimuths[order[(k + 1) % order.length]] - azimuths[i] + 2 * Math.PI) % (2 * Math.PI));
+    const next = (k) => azimuths[order[(k + 1) % order.length]];
+    const gaps = order.map((i, k) => (next(k) - azimuths[i] + 2 * Math.PI) % (2 * Math.PI));
     const widest = gaps.indexOf(Math.max(...gaps));
     if (order.length < 3 || gaps[widest] < (120 * Math.PI) / 180) return order;
     const row = [...order.slice(widest + 1), ...order.slice(0, widest + 1)];

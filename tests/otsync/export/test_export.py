@@ -6,6 +6,7 @@ import csv
 import json
 from fractions import Fraction
 from pathlib import Path
+from xml.etree import ElementTree
 
 import av
 import numpy as np
@@ -13,6 +14,7 @@ import pytest
 
 from otsync.cli import main
 from otsync.export import EXPORTS, aligned
+from otsync.export.fcpxml import frame_length
 from otsync.export.slot import file_names
 from otsync.io import open_scene
 from otsync.io.frames import VideoFrames
@@ -182,6 +184,32 @@ def test_the_timeline_holds_exact_offsets(exported, recording):
         assert clip["metadata"]["otsync"]["offset_seconds"] == OFFSETS[v]
         assert (exported / clip["media_references"]["DEFAULT_MEDIA"]["target_url"]).resolve() == recording / f"{v}.mp4"
         assert bool(clip["effects"]) == (RATES[v] != 1)
+
+
+def test_fcpxml_has_whole_frames_and_the_exact_offsets(exported, recording):
+    root = ElementTree.parse(exported / "timeline.fcpxml").getroot()
+
+    def seconds(text: str) -> Fraction:
+        return Fraction(text.removesuffix("s"))
+
+    clips = root.findall(".//asset-clip")
+    assert root.get("version") == "1.9" and [c.get("name") for c in clips] == list(NAMES)
+    low = min(world(v)[0] for v in range(3))
+    sources = {a.get("id"): a.find("media-rep").get("src") for a in root.findall(".//asset")}
+    for v, clip in enumerate(clips):
+        told = {md.get("key"): md.get("value") for md in clip.findall("metadata/md")}
+        assert float(told["otsync.offset_seconds"]) == pytest.approx(OFFSETS[v])
+        assert float(told["otsync.begins_seconds"]) == pytest.approx(world(v)[0] - low)
+        begins = seconds(clip.get("offset"))
+        assert (begins * 30).denominator == 1 and abs(float(begins) - (world(v)[0] - low)) <= 0.5 / FPS + 1e-9
+        assert sources[clip.get("ref")] == (recording / f"{v}.mp4").resolve().as_uri()
+        assert (clip.find("timeMap") is not None) == (RATES[v] != 1)
+
+
+def test_rates_of_frames_are_those_of_editors():
+    expected = {30: Fraction(1, 30), 30_000 / 1001: Fraction(1001, 30_000), 23.976: Fraction(1001, 24_000)}
+    assert {fps: frame_length(fps) for fps in expected} == expected
+    assert float(frame_length(12.34)) == pytest.approx(1 / 12.34, rel=1e-4)
 
 
 def test_the_timeline_is_read_by_opentimelineio(exported):

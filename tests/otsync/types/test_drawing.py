@@ -114,6 +114,41 @@ def test_bars_stand_on_the_common_clock():
     assert [text.get_text() for text in alone.plot().texts] == ["b: on a clock of its own group"]
 
 
+def moving(name: str, late: float = 0.0, camera: Camera | None = None) -> TrackSet:
+    """Points that run along x at a unit a second."""
+    times = np.arange(20) / 10
+    xyz = np.arange(4.0)[:, None, None] + (times + late)[None, :, None] * [1.0, 0, 0]
+    return TrackSet(xyz, uv=xyz[..., :2], fps=10.0, name=name, camera=camera)
+
+
+def test_matches_are_drawn_where_they_are_seen():
+    a, b = moving("$a$"), moving("b", 0.3)
+    matches = Matches([[0, 0], [1, 1], [3, 2]], [3, 2, 1])
+    ax = matches.plot(a, b, offset=0.3)
+    ends = [np.array(line.get_data_3d()).T for line in ax.lines]
+    np.testing.assert_allclose([end[1] - end[0] for end in ends], [[0, 0, 0], [0, 0, 0], [-1, -1, -1]], atol=1e-9)
+    assert not any(text.get_parse_math() for text in ax.get_legend().get_texts())
+    flat = matches.plot(replace(a, xyz=None), replace(b, xyz=None), offset=0.3, most=2)
+    assert len(flat.lines) == 2 + 2 and flat.yaxis_inverted()
+    with pytest.raises(ValueError, match="found none at 9 s"):
+        matches.plot(a, b, offset=9.0)
+    with pytest.raises(ValueError, match="found one of each"):
+        matches.plot(replace(a, uv=None), replace(b, xyz=None), offset=0.3)
+    with pytest.raises(ValueError, match="Are a and b swapped"):
+        Matches([[9, 0]]).plot(a, b)
+
+
+def test_paths_end_where_they_are_last_seen():
+    tracks = moving("a")
+    seen = np.ones((4, 20), bool)
+    seen[1, 5:] = seen[2] = False
+    ax = replace(tracks, visible=seen).plot()
+    assert len(ax.lines) == 4
+    x = np.array(ax.collections[0]._offsets3d[0])
+    np.testing.assert_allclose(sorted(x[np.isfinite(x)]), sorted([1.9, 1.4, 4.9]))
+    assert len(replace(tracks, xyz=None).plot(most=2).lines) == 2
+
+
 def test_words_and_tables_load_no_drawing():
     code = (
         "import sys, numpy as np; from otsync import Offsets; o = Offsets.known(('a',), np.zeros(1), 30.0);"

@@ -23,7 +23,7 @@ from recon.result.images import rendered
 from recon.result.packing import Packing
 from recon.result.page import ENGINE, PAGE, write_page
 from recon.result.strips import read_strips, strips_of, write_strips
-from tests.recon.result.browser import Opened, chromium, psnr
+from tests.browser import Opened, chromium, psnr
 from tests.recon.result.filmed import FAR, MOTIONS, SIZE, footage_like, reconstruction, scene_of
 
 WEB = Path(__file__).parents[3] / "recon/result/web"

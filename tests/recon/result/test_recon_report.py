@@ -13,8 +13,10 @@ from otsync.types import Clock, Offsets
 from recon.evaluate.views import ViewScore
 from recon.fit.verb import History, Reconstruction
 from recon.motion import Static
+from recon.result.images import rendered
 from recon.result.report import convergence, offset_curves, write_reconstruction_report
 from recon.scene.gaussians4d import Gaussians4D
+from tests.recon.result.filmed import reconstruction as filmed
 from tests.recon.result.test_export import blobs
 
 STEP = 1 / 30
@@ -83,7 +85,7 @@ def test_the_page_is_one_small_file_without_a_script(coarse, tmp_path):
         "300 steps",
     ):
         assert text in page, text
-    assert page.count("<img") == 2 and page.count("<svg") == 2
+    assert page.count("<img") == 2 and page.count("<svg") == 3
 
 
 def test_a_page_needs_no_opencv_and_goes_without_pictures_where_pillow_lacks(coarse, tmp_path, monkeypatch):
@@ -103,6 +105,21 @@ def test_the_page_is_the_same_for_the_same_fit(coarse, tmp_path):
             tmp_path / name, reconstruction(coarse), coarse, ["a", "b", "<c>"], [score("h", True)]
         )
     assert (tmp_path / "one").read_text() == (tmp_path / "two").read_text()
+
+
+def test_a_result_shows_itself():
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    result = filmed()
+    figure = result.show(camera="b", moments=3)
+    pictures = [ax.images[0].get_array() for ax in figure.axes]
+    times = [float(ax.get_title().split()[0]) for ax in figure.axes]
+    assert len(pictures) == 3 and times == sorted(times)
+    expected = next(iter(rendered(result, [np.linspace(*result.scene.span, 5)[1]], "b")))
+    np.testing.assert_array_equal(pictures[0], expected)
+    with pytest.raises(ValueError, match="camera: expected one of a, b, c; found 'x'"):
+        result.show(camera="x")
 
 
 def test_curves_are_relative_to_the_reference_and_to_the_truth(coarse):

@@ -63,6 +63,19 @@ class Opened:
         self.page.wait_for_selector("html[data-ready=yes]", state="attached")
         return self.rested()
 
+    def look(self, path: Path) -> Opened:
+        """Open a page without a script."""
+        self.page.goto(path.resolve().as_uri())
+        return self
+
+    def too_wide(self) -> list[str]:
+        """What sticks out of the window to the right."""
+        code = """() => [...document.querySelectorAll('body *:not(svg *):not(.bar *):not(.mosaic *)')].filter((e) => {
+            const box = e.getBoundingClientRect();
+            return box.width && box.right > document.documentElement.clientWidth + 0.5;
+        }).map((e) => e.outerHTML.slice(0, 80))"""
+        return self.page.evaluate(code)
+
     def rested(self) -> Opened:
         """Once everything that was asked for is drawn, with every pixel."""
         self.page.wait_for_selector("html[data-state=still]", state="attached")
