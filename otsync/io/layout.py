@@ -36,6 +36,14 @@ class DepthFile(Document, frozen=True, kw_only=True):
     scale: float = 1.0
 
 
+class TracksFile(Document, frozen=True, kw_only=True):
+    """Point tracks of a video, as a tracker wrote them."""
+
+    file: Text
+    kind: Literal["cotracker", "spatialtracker", "tapir", "tapvid3d"] | None = None
+    size: Annotated[list[Pixels], Meta(min_length=2, max_length=2)] | None = None
+
+
 class VideoFile(Document, frozen=True, kw_only=True):
     """One video of a scene."""
 
@@ -49,6 +57,7 @@ class VideoFile(Document, frozen=True, kw_only=True):
     depth: DepthFile | None = None
     masks: Files | None = None
     labels: Files | None = None
+    tracks: TracksFile | None = None
 
 
 class CalibratedFile(Document, frozen=True, kw_only=True):

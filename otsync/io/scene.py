@@ -21,7 +21,6 @@ after they were taken). Synchronisation undoes it.
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -37,6 +36,7 @@ from .document import FORMAT, VERSION
 from .frames import ArrayFrames, FrameRange, ImageFrames, LazyFrames, VideoFrames
 from .images import read_depth, read_image, read_labels, read_mask
 from .layout import MAX_FILES, SceneFile
+from .order import natural
 from .readers import describe_folder
 
 
@@ -305,8 +305,3 @@ class Paths:
         if self.allow_outside:
             return files
         return [self.one(f"{base}/{p.name}" if base else p.name) for p in files]
-
-
-def natural(path: Path) -> list[Any]:
-    """Sort key by which frame_9 comes before frame_10."""
-    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name[:255])]

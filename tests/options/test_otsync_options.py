@@ -502,6 +502,10 @@ def test_options_of_init(recording, tmp_path):
 
     plain = document()
     assert plain != document("--fps", "25")
+    assert run(["init", str(folder), "--force", "--order", "cam0"])[0] == 2  # a reader that knows no order refuses it
+    frames = len(list((folder / "cam0").iterdir()))
+    (tmp_path / "times.csv").write_text("video,seconds\n" + "".join(f"cam0,{0.1 * k}\n" for k in range(frames)))
+    assert plain != document("--timestamps", str(tmp_path / "times.csv"))
     assert run(["init", str(folder)])[0] == 2  # it is there already
     run(["init", str(folder), "--out", str(folder / "other.json")])
     assert (folder / "other.json").is_file()
@@ -726,7 +730,7 @@ def rows() -> set[str]:
         "film": "out phones gap handheld walk frames fps width height max_offset contrast seed",
         "calibrate": "folder out force options.intrinsics options.board options.distance options.key_frames "
         "options.width options.seed json",
-        "init": "folder out reader fps force",
+        "init": "folder out reader fps order timestamps force",
         "check": "scene every_frame allow_outside",
         "export": "recording offsets out what cameras width fps force allow_outside",
         "bench": "suite scene out gate rebase promises first_seed seeds only sizes limit json cache",
