@@ -131,6 +131,8 @@ class RecordingOptions:
     """What moves, where the scene has no masks."""
     points: prior("points") = None
     """The tracker of points."""
+    flow: prior("flow") = None
+    """Optical flow that the tracker follows."""
     features: prior("features") = None
     """What describes a track."""
     workers: int = 0
@@ -140,7 +142,7 @@ class RecordingOptions:
         """The objects of every stage. ValueError names a prior that there is not."""
         from ..recordings.stages import stages_from
 
-        return stages_from(masks=self.masks, points=self.points, features=self.features)
+        return stages_from(masks=self.masks, points=self.points, flow=self.flow, features=self.features)
 
     def threads(self) -> int:
         """How many threads. ValueError for fewer than none."""

@@ -26,6 +26,10 @@ EXTRAS = {
     "pycolmap": "calibrate",
     "poselib": "calibrate",
     "gsplat": "cuda",
+    "transformers": "learned",
+    "torchvision": "learned",
+    "onnxruntime": "learned",
+    "onnx": "learned",
     "ott": "rivals",
     "jax": "rivals",
 }

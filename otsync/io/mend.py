@@ -49,7 +49,12 @@ def keep_frames(scene: Scene, index: Sequence[Sequence[int]]) -> Scene:
         frames, fps = _some(video.frames, picks), None if thinned else video.fps
         told = times if rising else np.sort(times)  # of frames in another order the caller tells the times
         videos.append(replace(video, frames=frames, camera=camera, fps=fps, timestamps=told, depth=depth))
-    return replace(scene, videos=tuple(videos), masks=tuple(masks), labels=tuple(labels) if scene.labels else ())
+    tracks = tuple(
+        t if t is None or np.array_equal(picks, np.arange(len(v.frames))) else t.take(picks)
+        for t, v, picks in zip(scene.tracks, scene.videos, index, strict=False)
+    )
+    labels_left = tuple(labels) if scene.labels else ()
+    return replace(scene, videos=tuple(videos), masks=tuple(masks), labels=labels_left, tracks=tracks)
 
 
 def on_mended_clocks(scene: Scene, offsets: Offsets) -> Scene:

@@ -38,6 +38,7 @@ from .images import read_depth, read_image, read_labels, read_mask
 from .layout import MAX_FILES, SceneFile
 from .order import natural
 from .readers import describe_folder
+from .tracks import TrackFile
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +52,7 @@ class Scene:
         root: the folder that paths are relative to.
         notes: what the reader assumed or could not find.
         labels: per video a sequence of (H,W) integer labels that all videos share, 0 none; or None. Empty: none at all.
+        tracks: per video the file of point tracks that came along, or None. Empty: none at all.
         doubtful: why the camera of a video is not to be trusted, by its name: what ``otsync calibrate`` says.
     """
 
@@ -60,6 +62,7 @@ class Scene:
     root: Path = Path()
     notes: tuple[str, ...] = field(default_factory=tuple)
     labels: tuple[Sequence[np.ndarray] | None, ...] = ()
+    tracks: tuple[TrackFile | None, ...] = ()
     doubtful: Mapping[str, str] = field(default_factory=dict)
 
     @property
@@ -76,7 +79,11 @@ class Scene:
         index = [self.names.index(n) for n in names]
         labels = tuple(self.labels[i] for i in index) if self.labels else ()
         return replace(
-            self, videos=tuple(self.videos[i] for i in index), masks=tuple(self.masks[i] for i in index), labels=labels
+            self,
+            videos=tuple(self.videos[i] for i in index),
+            masks=tuple(self.masks[i] for i in index),
+            labels=labels,
+            tracks=tuple(self.tracks[i] for i in index) if self.tracks else (),
         )
 
 
@@ -149,6 +156,7 @@ def scene_from_document(
         Path(root),
         tuple(str(n) for n in document.get("notes", ())),
         tuple(labels for _, _, labels in built),
+        tuple(_tracks(entry, builder) for entry in entries) if any(e.get("tracks") for e in entries) else (),
         _doubtful(document),
     )
 
@@ -248,6 +256,19 @@ def _depth(value: Any, paths: Paths) -> LazyFrames | None:
     if "file" in value:
         return ArrayFrames(paths.one(value["file"]), scale)
     return ImageFrames(paths.many(value["frames"]), lambda path: read_depth(path, scale), f"depth*{scale:g}")
+
+
+def _tracks(entry: dict[str, Any], paths: Paths) -> TrackFile | None:
+    """The file of a video's tracks. ValueError beside ``range``, of which nobody knows whether it is cut too."""
+    told = entry.get("tracks")
+    if told is None:
+        return None
+    if entry.get("range") is not None:
+        raise ValueError(
+            "tracks, range: expected one of them. Cut the frames and track those, or leave the tracks out."
+        )
+    size = told.get("size")
+    return TrackFile(paths.one(told["file"]), told.get("kind"), None if size is None else (size[0], size[1]))
 
 
 def _images(value: Any, paths: Paths, read: Callable[[Path], np.ndarray], kind: str) -> LazyFrames | None:

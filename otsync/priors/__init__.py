@@ -7,19 +7,22 @@ flow.py         optical flow between neighbouring frames
 points.py       point tracks
 features.py     descriptors of tracks
 stereo.py       depth of tracked points of a rig by visual hull and correlation
+learned/        features, flow, tracks of learned models
 dense.py        the same at every pixel of a mask
 """
 
 from ..files.cache import Cache
 from .features import Daisy, LabHistogram
 from .flow import DISFlow
+from .learned import Dinov2, Dinov3, Onnx, Raft, Transformers
 from .masks import FlowResidual, GivenMasks, MedianBackground
 from .points import ChainedFlow
-from .slots import Describer, Masker, Tracker
+from .slots import Describer, Flow, Masker, Tracker
 from .working import WorkingFrames
 
 __all__ = [
     "DESCRIBERS",
+    "FLOWS",
     "MASKERS",
     "TRACKERS",
     "Cache",
@@ -27,6 +30,7 @@ __all__ = [
     "DISFlow",
     "Daisy",
     "Describer",
+    "Flow",
     "FlowResidual",
     "GivenMasks",
     "LabHistogram",
@@ -42,5 +46,8 @@ MASKERS = (MedianBackground, FlowResidual)
 TRACKERS = (ChainedFlow,)
 """Trackers of points that the shell offers; plugins come on top."""
 
-DESCRIBERS = (LabHistogram, Daisy)
+FLOWS = (DISFlow, Raft)
+"""Optical flows that the shell offers; plugins come on top."""
+
+DESCRIBERS = (LabHistogram, Daisy, Dinov3, Dinov2, Transformers, Onnx)
 """Describers of tracks that the shell offers; plugins come on top."""

@@ -197,9 +197,9 @@ def track_all(
     """
     started, done = time.perf_counter(), []
 
-    def one(item: tuple[Video, Any, Any]) -> dict[str, np.ndarray]:
-        video, masks, labels = item
-        tracked = stages.tracking(video, masks, cache)
+    def one(item: tuple[Video, Any, Any, Any]) -> dict[str, np.ndarray]:
+        video, masks, labels, given = item
+        tracked = stages.tracking(video, masks, cache, given)
         if labels is not None:
             size, uv = (video.camera.width, video.camera.height), tracked["uv"]
             key = (sequence_key(labels), size, content_key(uv))
@@ -210,7 +210,8 @@ def track_all(
         return tracked
 
     labels = scene.labels or (None,) * len(scene.videos)
-    return list(map(one, list(zip(scene.videos, scene.masks, labels, strict=True))))
+    tracks = scene.tracks or (None,) * len(scene.videos)
+    return list(map(one, list(zip(scene.videos, scene.masks, labels, tracks, strict=True))))
 
 
 def select(video: Video, raw: dict[str, np.ndarray], stages: Stages, frame: str) -> TrackSet:

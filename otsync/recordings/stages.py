@@ -17,7 +17,7 @@ from ..io.scene import Scene
 from ..match.slot import Matcher
 from ..match.unbalanced import UnbalancedOT
 from ..plugins import available, made
-from ..priors import DESCRIBERS, MASKERS, TRACKERS
+from ..priors import DESCRIBERS, FLOWS, MASKERS, TRACKERS
 from ..priors.stereo import HullStereo, TrackDepth
 from ..refine.slot import Refiner
 from ..refine.splines import SplineRefine
@@ -78,32 +78,49 @@ class Stages:
 PRIORS: dict[str, tuple[str, str, Iterable[Any]]] = {
     "masks": ("masker", "maskers", MASKERS),
     "points": ("points", "trackers", TRACKERS),
+    "flow": ("flow", "flows", FLOWS),
     "features": ("features", "describers", DESCRIBERS),
 }
-"""Option of the shell: field of :class:`Tracking`, group of plugins, otsync's own choices."""
+"""Option of the shell: field of :class:`Tracking` (flow: of its tracker), group of plugins, our own choices."""
 
 
 def stages_from(
-    stages: Stages | None = None, *, masks: str | None = None, points: str | None = None, features: str | None = None
+    stages: Stages | None = None,
+    *,
+    masks: str | None = None,
+    points: str | None = None,
+    flow: str | None = None,
+    features: str | None = None,
 ) -> Stages:
     """``stages`` with priors as the shell spells them: ``name``, or ``name:field=value,field=value``.
 
     Args:
         stages: what the other slots hold; default :class:`Stages`.
-        masks: of otsync's own or of the plugins in the group "maskers"; points: "trackers"; features: "describers".
-            None leaves what is there. ValueError lists the choices, or names a field that does not fit.
+        masks: of otsync's own or of the plugins in the group "maskers"; points: "trackers"; flow: "flows";
+            features: "describers". None leaves what is there. ValueError lists the choices, or names a field that does
+            not fit.
 
     Example:
         >>> stages_from(points="chained-flow:every=5", features="daisy").tracking.points.every
         5
     """
     stages = stages or Stages()
-    spelled = {"masks": masks, "points": points, "features": features}
+    spelled = {"masks": masks, "points": points, "flow": flow, "features": features}
     chosen = {}
     for option, text in spelled.items():
         if text is not None:
             slot, group, own = PRIORS[option]
             chosen[slot] = made(text, available(group, own), f"--{option}")
+    if "flow" in chosen:
+        tracker = chosen.get("points", stages.tracking.points)
+        if "flow" not in getattr(tracker, "__dataclass_fields__", {}):
+            raise ValueError(
+                f"--flow: expected a tracker that follows flow, such as chained-flow; found {type(tracker).__name__}. "
+                "Leave one of both out."
+            )
+        chosen["points"] = replace(tracker, flow=chosen.pop("flow"))
+    if points is not None:
+        chosen["given"] = False  # a tracker that is named goes before tracks that came along
     return replace(stages, tracking=replace(stages.tracking, **chosen))
 
 

@@ -12,7 +12,9 @@ from pathlib import Path
 from ...files.arrays import existing
 from .slot import LARGEST, Filmed, Known
 
-LINE = re.compile(r"--> Camera (.+?) and (.+?): (-?\d+) frames offset(?: \([^)]*\))?, correlation (-?\d+(?:\.\d+)?|nan)")
+LINE = re.compile(
+    r"--> Camera (.+?) and (.+?): (-?\d+) frames offset(?: \([^)]*\))?, correlation (-?\d+(?:\.\d+)?|nan)"
+)
 SIGMA = 1.0
 """Frames: whole frames, of the correlation of one vertical speed."""
 

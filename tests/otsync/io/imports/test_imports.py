@@ -1,4 +1,4 @@
-"""Offsets from elsewhere: every kind is read with its sign, set against the pictures, and refused where it is unsound."""
+"""Offsets from elsewhere: each kind with its sign, set against the pictures, refused where it is unsound."""
 
 from __future__ import annotations
 
