@@ -5,15 +5,30 @@ mosaic.py    Mosaic: all videos in one, as filmed beside synchronised
 clips.py     Clips: every video, cut to what all show, on the common clock, with its sound
 frames.py    FrameList: which frames belong together, as CSV
 timeline.py  Timeline: an OpenTimelineIO file for editors
+datasets.py  the layouts that other reconstructions read
 encode.py, sound.py   writing mp4 with exact timestamps; sound on the common clock
 """
 
 from .clips import Clips
+from .datasets import Colmap, Dynamic3DGaussians, Nerfstudio
 from .frames import FrameList
 from .mosaic import Mosaic
 from .slot import Aligned, Clip, Export, aligned
 from .timeline import Timeline
 
-EXPORTS: tuple[Export, ...] = (Mosaic(), Clips(), FrameList(), Timeline())
+EXPORTS: tuple[Export, ...] = (Mosaic(), Clips(), FrameList(), Timeline(), Nerfstudio(), Dynamic3DGaussians(), Colmap())
 
-__all__ = ["EXPORTS", "Aligned", "Clip", "Clips", "Export", "FrameList", "Mosaic", "Timeline", "aligned"]
+__all__ = [
+    "EXPORTS",
+    "Aligned",
+    "Clip",
+    "Clips",
+    "Colmap",
+    "Dynamic3DGaussians",
+    "Export",
+    "FrameList",
+    "Mosaic",
+    "Nerfstudio",
+    "Timeline",
+    "aligned",
+]

@@ -77,7 +77,7 @@ def document_of(folder: Path, path: Path, meta: dict[str, Any], fps: float | Non
     groups = {key: groups[key] for key in sorted(groups, key=lambda key: natural(Path(key)))}
     names = _names(list(groups), by)
     notes: list[str] = []
-    clocks = _clocks(path, groups, fps, notes)
+    clocks = _clocks(path, meta, groups, fps, notes)
     videos = [
         _video(folder, path, meta, name, group, clocks.get(key), fps)
         for name, (key, group) in zip(names, groups.items(), strict=True)
@@ -96,7 +96,11 @@ def _names(keys: list[str], by: str | None) -> list[str]:
 
 
 def _clocks(
-    path: Path, groups: dict[str, list[tuple[int, dict[str, Any]]]], fps: float | None, notes: list[str]
+    path: Path,
+    meta: dict[str, Any],
+    groups: dict[str, list[tuple[int, dict[str, Any]]]],
+    fps: float | None,
+    notes: list[str],
 ) -> dict[str, np.ndarray]:
     """``time`` of the frames of every group, sorted into the group's order, in seconds; empty where no frame has it.
 
@@ -123,6 +127,11 @@ def _clocks(
         if fps is not None:
             raise ValueError(f"fps: expected none, because {path} gives times in seconds; found {fps:g}. Leave it out.")
         return times
+    if "otsync_seconds" in meta:  # otsync export's own, which knows the unit
+        if fps is not None:
+            raise ValueError(f"fps: expected none, because {path} tells otsync_seconds; found {fps:g}. Leave it out.")
+        own = positive(meta["otsync_seconds"], f"{path}: otsync_seconds")
+        return {key: t * own for key, t in times.items()}
     if fps is None:
         return {}
     unit = 1 / (fps * float(np.min(steps)))

@@ -189,7 +189,7 @@ def _transformers(path: Path, device: str, dtype: str) -> Loaded:
             out = model(pixel_values=pixels.to(device, model.dtype), **more).last_hidden_state
         return out.float().cpu()
 
-    # what becomes of a known size tells more than the configuration: a convolutional one's patch is its first step alone
+    # what becomes of a known size tells more than the configuration, whose patch may be the first step alone
     out = cells(torch.zeros(1, 3, PROBE, PROBE))
     if out.ndim != 4 and not (out.ndim == 3 and isinstance(patch, int) and patch > 0):
         raise ValueError(f"{path}: expected a backbone with patches or a map; found {tuple(out.shape)}. Take another.")
