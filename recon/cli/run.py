@@ -68,7 +68,7 @@ class Run:
         from recon.pipeline.intake import given_clocks, readable
         from recon.pipeline.verb import check_effects_of
 
-        for name in ("masks", "points", "features"):
+        for name in ("masks", "points", "flow", "features"):
             if getattr(self.recording, name) is not None:
                 raise ValueError(
                     f"--recording.{name}: expected without it, since the reconstruction tracks by its own; found "

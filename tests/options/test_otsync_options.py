@@ -724,13 +724,15 @@ def rows() -> set[str]:
         "sync": "tracks out reference truth method rate rematch costs frames workers json refiner:Unrefined "
         "graph.extra graph.complete "
         "graph.curves graph.starts graph.seed recording.route recording.cameras recording.cache "
-        "recording.allow_outside recording.workers recording.masks recording.points recording.features",
+        "recording.allow_outside recording.workers recording.masks recording.points recording.flow recording.features",
         "demo": "out motion preset videos seed",
         "simulate": "out motion preset videos frames fps max_offset own_frames seed",
         "film": "out phones gap handheld walk frames fps width height max_offset contrast seed",
         "calibrate": "folder out force options.intrinsics options.board options.distance options.key_frames "
         "options.width options.seed json",
         "init": "folder out reader fps order timestamps force",
+        "audit": "scene out tolerance cameras allow_outside json",
+        "import-offsets": "source recording kind sigma offsets out allow_outside",
         "check": "scene every_frame allow_outside",
         "export": "recording offsets out what cameras width fps force allow_outside",
         "bench": "suite scene out gate rebase promises first_seed seeds only sizes limit json cache",

@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 from ...files.arrays import read_json
@@ -33,9 +34,7 @@ class Polysync:
         files = _sidecars(path)
         if not files:
             raise ValueError(f"{path}: expected {self.looks_for}; found none. Run polysync, or check the path.")
-        return [
-            told(file, "source, reference and delta_seconds", lambda file=file: _edge(file, filmed)) for file in files
-        ]
+        return [told(file, "source, reference and delta_seconds", partial(_edge, file, filmed)) for file in files]
 
 
 def _sidecars(path: Path) -> list[Path]:

@@ -86,7 +86,7 @@ class Dense:
         tile = model.fixed or (side, side)
         height, width = (max(n, fixed) if model.fixed else n for n, fixed in zip((height, width), tile, strict=True))
         seen = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA if self.scale < 1 else cv2.INTER_LINEAR)
-        normal = (seen.astype(np.float32) / 255 - np.float32(model.mean)) / np.float32(model.std)
+        normal = (seen.astype(np.float32) / 255 - np.array(model.mean, np.float32)) / np.array(model.std, np.float32)
         return tiled(normal, model.run, tile=tile, overlap=self.overlap, stride=model.stride, batch=self.batch)
 
     def __call__(
@@ -193,7 +193,7 @@ def _transformers(path: Path, device: str, dtype: str) -> Loaded:
     out = cells(torch.zeros(1, 3, PROBE, PROBE))
     if out.ndim != 4 and not (out.ndim == 3 and isinstance(patch, int) and patch > 0):
         raise ValueError(f"{path}: expected a backbone with patches or a map; found {tuple(out.shape)}. Take another.")
-    stride = PROBE // out.shape[-1] if out.ndim == 4 else patch
+    stride = PROBE // int(out.shape[-1]) if out.ndim == 4 else int(patch or 0)
 
     def run(batch: np.ndarray) -> np.ndarray:
         pixels = torch.from_numpy(np.ascontiguousarray(batch.transpose(0, 3, 1, 2)))
