@@ -170,16 +170,14 @@ def measure(size: tuple[int, int, int], channels: int, repeats: int, names: Sequ
     memory = {}
     for name, case in cases.items():
         memory[name] = _peak_megabytes(case.both)
-    for r in range(repeats):
+    for _ in range(repeats):
         for name, case in cases.items():
-            # the torch back end is measured a third as often: it takes most of the time of a run
-            if name != "torch" or r % 3 == 0:
-                time.sleep(SETTLE)
-                times[name].append(case.both())
+            time.sleep(SETTLE)
+            times[name].append(case.both())
     truth = cases["torch"].forward()
     pairs = splats_per_pixel(tensors, width, height) * width * height
     bound = pairs * (FLOPS_PER_PAIR[0] + FLOPS_PER_PAIR[1] * (channels + 1)) / peak_gflops() * 1e-6
-    torch_ms = float(np.median([t[1] for t in times["torch"]]))
+    torch_ms = np.array([t[1] for t in times["torch"]])
     rows = []
     for name in names:
         forward, total = (np.array(column) for column in zip(*times[name], strict=True))
@@ -196,7 +194,8 @@ def measure(size: tuple[int, int, int], channels: int, repeats: int, names: Sequ
                 "forward_ms": round(float(np.median(forward)), 3),
                 "total_ms": round(float(np.median(total)), 3),
                 "total_ms_min": round(float(total.min()), 3),
-                "times_torch": round(torch_ms / float(np.median(total)), 2),
+                # of each round, whose measurements lie side by side: the machine's speed changes between rounds
+                "times_torch": round(float(np.median(torch_ms / total)), 2),
                 "peak_mb": round(memory[name], 1),
                 "bound_ms": round(bound, 3),
                 "above_bound": round(float(np.median(total)) / bound, 1),
