@@ -465,7 +465,8 @@ def test_options_of_recordings(recording, tmp_path):
     assert first != answer([*base, "--recording.route", "epipolar"])
     names = [video["name"] for video in json.loads(first)["videos"]]
     assert first != answer([*base, "--recording.cameras", *names[:2]])
-    for priors in (["masks", "flow-residual"], ["points", "chained-flow:every=3"], ["features", "daisy"]):
+    flow = ["flow", "dis-flow:preset=fast"]
+    for priors in (["masks", "flow-residual"], ["points", "chained-flow:every=3"], flow, ["features", "daisy"]):
         assert first != answer([*base, f"--recording.{priors[0]}", priors[1]]), priors
         code, _, err = run([*base, f"--recording.{priors[0]}", "nothing"])
         assert code == 2 and f"--{priors[0]}" in err

@@ -526,7 +526,7 @@ def test_the_other_options_of_a_run(arriving, world, outside, home):
         assert asked(option, scene=outside)["fit"]["names"] == base["fit"]["names"]
     refused(otsync.cli.main, running(outside, home / "r"), "outside")
     refused(otsync.cli.main, running(world, home / "r", "--recording.workers", "-1"), "--recording.workers")
-    for name in ("masks", "points", "features"):
+    for name in ("masks", "points", "flow", "features"):
         refused(otsync.cli.main, running(world, home / "r", f"--recording.{name}", "daisy"), f"--recording.{name}")
 
 

@@ -15,13 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from ..files.cache import Cache
-from ..io import open_scene
-from ..progress import counted
-from ..recordings.audit import audit_offsets
-from ..recordings.routes import pairs_in_pixels, select, track_all
-from ..recordings.stages import Stages
-from .record import table, write_rows
+from ...files.cache import Cache
+from ...io import open_scene
+from ...progress import counted
+from ...recordings.audit import audit_offsets
+from ...recordings.routes import pairs_in_pixels, select, track_all
+from ...recordings.stages import Stages
+from ..record import table, write_rows
 
 MOVES = (0, 1, 2, 5)
 """Frames that one camera is moved by; 0: none is."""
