@@ -34,6 +34,7 @@ GROUPS: dict[str, str] = {
     "methods": "what stands in every slot under one name: objects of otsync.Method",
     "maskers": "what moves in a video: callables (WorkingFrames) -> masks",
     "trackers": "callables (WorkingFrames, masks, fps) -> point tracks",
+    "flows": "optical flow: objects with pair(before, after) -> flow there, flow back",
     "describers": "callables (WorkingFrames, masks, uv, fps) -> a feature per track",
     "readers": "layouts of recordings: objects with claims(folder) and describe(folder)",
     "exporters": "formats of a reconstruction: objects with write(scene, out, ...)",

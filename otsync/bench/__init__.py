@@ -8,6 +8,7 @@ hard_cases/  the catalogue of hard cases, and running it
 panoptic.py  the paper's protocol on a truly synchronised recording
 own_frames.py  clock and pose without a common frame, on worlds and on a truly synchronised recording
 calibrate.py  cameras from videos alone, against simulated and given ones
+rig/  a synchronised recording with one camera moved: which one, and by how much
 trust/  whether "ok" is right: classes of worlds, claims and errors
 record.py  tables on disk, machine and versions, the gate against a committed baseline
 """
@@ -32,6 +33,7 @@ OWN = {
     "own-frames": "own_frames",
     "trust": "trust.run",
     "calibrate": "calibrate",
+    "audit": "rig.audit",
 }
 """Our own suites, and where they are."""
 

@@ -127,7 +127,11 @@ def run(
             own = type(Stages().tracking.features)
             for name, kind in available("describers", DESCRIBERS).items():
                 describer = kind() if isinstance(kind, type) else kind
-                seen_by = material if kind is own else material.described_by(describer, kept, pool.map)
+                try:
+                    seen_by = material if kind is own else material.described_by(describer, kept, pool.map)
+                except (ImportError, FileNotFoundError) as lacking:  # a learned prior without its package or weights
+                    tell(f"table of matchers, without {name}: {lacking}")
+                    continue
                 matched += matching_table(seen_by, protocol, pool.map, name, every=kind is own)
     about = {"note": NOTE, "published": PUBLISHED, "protocol": vars(protocol), "cameras": list(opened.names)}
     write_rows(out, "panoptic", rows, about)

@@ -13,6 +13,8 @@ OWN = {
     "calibrate": "otsync.cli.calibrate:Calibrate",
     "check": "otsync.cli.recordings:Check",
     "sync": "otsync.cli.sync:Sync",
+    "audit": "otsync.cli.audit:Audit",
+    "import-offsets": "otsync.cli.import_offsets:ImportOffsets",
     "export": "otsync.cli.export:Export",
     "bench": "otsync.cli.bench:Bench",
     "plugins": "otsync.cli.plugins:Plugins",

@@ -20,6 +20,8 @@ class Export:
 
     Example: otsync export recording/ --offsets result/offsets.json --out synchronised
 
+    For nerfstudio, with exact times: otsync export recording/ --offsets result/offsets.json --what nerfstudio
+
     Only a mosaic, as filmed beside synchronised: otsync export recording/ --offsets result/offsets.json --what mosaic
     """
 
@@ -28,11 +30,12 @@ class Export:
     offsets: Path
     """offsets.json as otsync sync and otsync run write it."""
     out: Path = Path("synchronised")
-    """Folder for mosaic.mp4, clips/, frames.csv, timeline.otio and timeline.fcpxml."""
-    what: tuple[Literal[tuple(e.name for e in EXPORTS)], ...] = tuple(e.name for e in EXPORTS)
+    """Folder for mosaic.mp4, clips/, frames.csv, timeline.otio, timeline.fcpxml, and folders of datasets."""
+    what: tuple[Literal[tuple(e.name for e in EXPORTS)], ...] = tuple(e.name for e in EXPORTS if e.default)
     """mosaic: one video of all, as filmed beside synchronised. clips: every video, cut to what all show, with its
-    sound. frames: a table of the frames that belong together. timeline: OpenTimelineIO, for editors.
-    fcpxml: the same for Final Cut Pro and DaVinci Resolve, in whole frames."""
+    sound. frames: a table of the frames that belong together. timeline: OpenTimelineIO, for editors. fcpxml: the
+    same for Final Cut Pro and DaVinci Resolve, in whole frames. nerfstudio, dynamic3dgs, colmap: images, cameras and
+    times in the layouts that other reconstructions read."""
     cameras: tuple[str, ...] = ()
     """Names of the videos to write; default: all that have an offset."""
     width: int | None = None

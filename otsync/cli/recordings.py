@@ -33,27 +33,38 @@ class Init:
     """
 
     folder: tyro.conf.Positional[Path]
-    """Panoptic layout, video files, one folder of images per camera, or a layout that a plugin reads."""
+    """Video files, one folder of images per camera, a dataset's layout (docs/recording.md lists them), or a layout that
+    a plugin reads."""
     out: Path | None = None
     """Where to write; default: scene.json in the folder."""
     reader: one_of("readers", READERS) | None = None
     """Name of the reader; default: the first that claims the folder."""
     fps: float | None = None
     """Frames per second of images, which carry no clock."""
+    order: tuple[str, ...] = ()
+    """Names of the videos in the order of the calibration's cameras, where their names do not tell."""
+    timestamps: Path | None = None
+    """A CSV with the time of every frame: a column seconds (or milliseconds, microseconds, nanoseconds), and video
+    where there are several."""
     force: bool = False
     """Replace an existing scene.json."""
 
     def run(self) -> int:
         from ..files.arrays import write_json
         from ..io import describe_folder, find_reader
+        from ..io.readers import claiming
+        from ..io.timestamps import with_timestamps
+        from ..recordings.check import looking_wrong
 
+        if self.fps is not None and not 0 < self.fps < 1e6:
+            raise ValueError(f"--fps: expected frames per second above 0; found {self.fps:g}.")
         out = self.out or self.folder / "scene.json"
         if out.exists() and not self.force:
             raise ValueError(f"{out}: exists already. Pass --force to replace it, or --out for another place.")
         if out.parent.resolve() != self.folder.resolve():
             print(f"note: paths in {out} are relative to {self.folder}; keep it there to use it", file=sys.stderr)
         name, _ = find_reader(self.folder, self.reader)
-        document = describe_folder(self.folder, reader=name, fps=self.fps)
+        document = describe_folder(self.folder, reader=name, fps=self.fps, order=self.order or None)
         if any("file" in video and (video.get("camera") or {}).get("K") is None for video in document["videos"]):
             from ..calibrate.clips import fill_lenses
             from ..io.document import missing_fields
@@ -61,10 +72,17 @@ class Init:
             document = fill_lenses(document, self.folder)
             if document.get("missing"):
                 document["missing"] = missing_fields(document["videos"])
+        if self.timestamps is not None:
+            document = with_timestamps(document, self.folder, self.timestamps)
         write_json(out, document)
         print(f"wrote {out}: {len(document['videos'])} videos (reader: {name})")
+        others = [other for other in claiming(self.folder) if other != name]
+        if self.reader is None and others:
+            print(f"note: these could read the folder too: {', '.join(others)} (--reader)")
         for note in document.get("notes", ()):
             print(f"note: {note}")
+        for finding in looking_wrong(document):
+            print(f"{finding.severity}: {finding.video or 'scene'}: {finding.what} {finding.remedy}", file=sys.stderr)
         for item in document.get("missing", ()):
             print(f"missing: {item}", file=sys.stderr)
         return 1 if document.get("missing") else 0
@@ -78,7 +96,7 @@ class Check:
     """
 
     scene: tyro.conf.Positional[Path]
-    """A scene.json, a folder that holds one, or a calibrated folder that a reader knows (Panoptic)."""
+    """A scene.json, a folder that holds one, or a calibrated folder that a reader knows (Panoptic, COLMAP, ...)."""
     every_frame: bool = True
     """Decode every image; off: the first, the middle and the last."""
     allow_outside: bool = False
@@ -120,6 +138,8 @@ class RecordingOptions:
     """What moves, where the scene has no masks."""
     points: prior("points") = None
     """The tracker of points."""
+    flow: prior("flow") = None
+    """Optical flow that the tracker follows."""
     features: prior("features") = None
     """What describes a track."""
     selection: Annotated[str | None, tyro.conf.arg(metavar="FIELD=VALUE,...")] = None
@@ -135,7 +155,12 @@ class RecordingOptions:
         from ..recordings.stages import stages_from
 
         return stages_from(
-            masks=self.masks, points=self.points, features=self.features, selection=self.selection, width=self.width
+            masks=self.masks,
+            points=self.points,
+            flow=self.flow,
+            features=self.features,
+            selection=self.selection,
+            width=self.width,
         )
 
     def threads(self) -> int:

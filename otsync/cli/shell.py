@@ -27,6 +27,10 @@ EXTRAS = {
     "poselib": "calibrate",
     "gsplat": "cuda",
     "viser": "view",
+    "transformers": "learned",
+    "torchvision": "learned",
+    "onnxruntime": "learned",
+    "onnx": "learned",
     "ott": "rivals",
     "jax": "rivals",
 }

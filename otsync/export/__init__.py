@@ -6,16 +6,41 @@ clips.py     Clips: every video, cut to what all show, on the common clock, with
 frames.py    FrameList: which frames belong together, as CSV
 timeline.py  Timeline: an OpenTimelineIO file for editors
 fcpxml.py    FinalCut: the same as FCPXML
+datasets.py  the layouts that other reconstructions read
 encode.py, sound.py   writing mp4 with exact timestamps; sound on the common clock
 """
 
 from .clips import Clips
+from .datasets import Colmap, Dynamic3DGaussians, Nerfstudio
 from .fcpxml import FinalCut
 from .frames import FrameList
 from .mosaic import Mosaic
 from .slot import Aligned, Clip, Export, aligned
 from .timeline import Timeline
 
-EXPORTS: tuple[Export, ...] = (Mosaic(), Clips(), FrameList(), Timeline(), FinalCut())
+EXPORTS: tuple[Export, ...] = (
+    Mosaic(),
+    Clips(),
+    FrameList(),
+    Timeline(),
+    FinalCut(),
+    Nerfstudio(),
+    Dynamic3DGaussians(),
+    Colmap(),
+)
 
-__all__ = ["EXPORTS", "Aligned", "Clip", "Clips", "Export", "FinalCut", "FrameList", "Mosaic", "Timeline", "aligned"]
+__all__ = [
+    "EXPORTS",
+    "Aligned",
+    "Clip",
+    "Clips",
+    "Colmap",
+    "Dynamic3DGaussians",
+    "Export",
+    "FinalCut",
+    "FrameList",
+    "Mosaic",
+    "Nerfstudio",
+    "Timeline",
+    "aligned",
+]

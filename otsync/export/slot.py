@@ -143,6 +143,9 @@ class Export(ABC):
     heeds: ClassVar[frozenset[str]] = frozenset()
     """Which of the options ``width`` and ``fps`` it reads."""
 
+    default: ClassVar[bool] = True
+    """Whether it is written where nobody says what."""
+
     @abstractmethod
     def targets(self, videos: Aligned, folder: Path) -> list[Path]:
         """The files that :meth:`write` would write."""

@@ -17,6 +17,7 @@ class VideoFiles:
 
     name = "video-files"
     looks_for = f"video files ({', '.join(sorted(VIDEO_SUFFIXES))}), one a camera"
+    brings = "names, sizes, clocks"
 
     def claims(self, folder: Path) -> bool:
         return bool(_video_paths(folder))
@@ -30,6 +31,7 @@ class ImageFolders:
 
     name = "image-folders"
     looks_for = f"one folder of images ({', '.join(IMAGE_SUFFIXES)}) per camera"
+    brings = "names, sizes"
 
     def claims(self, folder: Path) -> bool:
         return bool(_image_patterns(folder))
@@ -43,6 +45,7 @@ class VideosAndImages:
 
     name = "videos-and-images"
     looks_for = "video files beside folders of images"
+    brings = "names, sizes, clocks of videos"
 
     def claims(self, folder: Path) -> bool:
         return bool(_video_paths(folder) and _image_patterns(folder))

@@ -17,14 +17,40 @@ FORMATS = ("JPEG", "PNG", "BMP")
 """Decoders that are offered a stranger's bytes; Pillow knows thirty more."""
 
 
+def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
+    """Width and height, of the header alone. ValueError names a file that is no image, or a larger one than is read."""
+    from PIL import Image
+
+    path = existing(path)
+    try:
+        with Image.open(path, formats=FORMATS) as image:
+            size = image.size
+    except Exception as error:  # decoders raise OSError, SyntaxError, struct.error, ... on damaged bytes
+        raise ValueError(
+            f"{path}: expected a readable image ({', '.join(FORMATS)}); {type(error).__name__}: {error}. Copy it again."
+        ) from None
+    if size[0] * size[1] > MAX_PIXELS:
+        raise ValueError(f"{path}: expected at most {MAX_PIXELS} pixels; found {size[0]} x {size[1]}. Reduce it.")
+    return size
+
+
 def read_image(path: str | os.PathLike[str]) -> UInt8[np.ndarray, "H W 3"]:
     """An RGB image. ValueError names the file when it is truncated, damaged, too large or no image at all."""
     return np.asarray(_decode(path).convert("RGB"))
 
 
 def read_mask(path: str | os.PathLike[str]) -> Bool[np.ndarray, "H W"]:
-    """Foreground where an image is brighter than half of its own maximum (files hold 0/1 as well as 0/255)."""
-    values = np.asarray(_decode(path).convert("L"))
+    """Foreground where an image is brighter than half of its own maximum (files hold 0/1 as well as 0/255).
+
+    An image, ``.npy``, or ``.npz`` with one array.
+    """
+    if os.path.splitext(path)[1].lower() in (".npy", ".npz"):
+        values = _array(path, "mask")
+        if values.ndim != 2 or values.dtype.kind not in "biuf":
+            raise ValueError(f"{path}: expected a mask (H,W); found {values.dtype} of {values.shape}. Write it again.")
+        values = np.nan_to_num(values.astype(np.float32))
+    else:
+        values = np.asarray(_decode(path).convert("L"))
     return values > values.max(initial=0) / 2
 
 
@@ -45,19 +71,23 @@ def read_depth(path: str | os.PathLike[str], scale: float) -> Float[np.ndarray, 
     A 16-bit PNG, ``.npy``, or ``.npz`` with one array.
     """
     suffix = os.path.splitext(path)[1].lower()
-    if suffix == ".npy":
-        values = read_npy(path)
-    elif suffix == ".npz":
-        arrays = read_npz(path, max_bytes=8 * MAX_PIXELS)
-        if len(arrays) != 1 and "depth" not in arrays:
-            raise ValueError(f"{path}: expected one array, or one named 'depth'; found {', '.join(arrays)}.")
-        values = arrays["depth"] if "depth" in arrays else next(iter(arrays.values()))
-    else:
-        values = np.asarray(_decode(path))
+    values = _array(path, "depth") if suffix in (".npy", ".npz") else np.asarray(_decode(path))
     if values.ndim != 2 or values.dtype.kind not in "iuf":
         raise ValueError(f"{path}: expected a depth map (H,W) of numbers; found {values.dtype} of {values.shape}.")
     depth = values.astype(np.float32) * np.float32(scale)
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
+
+
+def _array(path: str | os.PathLike[str], name: str) -> np.ndarray:
+    """The one array of an ``.npy`` or ``.npz``, or that of a name."""
+    if os.path.splitext(path)[1].lower() == ".npy":
+        return read_npy(path)
+    arrays = read_npz(path, max_bytes=8 * MAX_PIXELS)
+    if len(arrays) != 1 and name not in arrays:
+        raise ValueError(
+            f"{path}: expected one array, or one named {name!r}; found {', '.join(arrays)}. Write it again."
+        )
+    return arrays[name] if name in arrays else next(iter(arrays.values()))
 
 
 def read_npy(path: str | os.PathLike[str], *, memmap: bool = False) -> np.ndarray:

@@ -47,6 +47,14 @@ class PointsFile(Document, frozen=True, kw_only=True):
     least: float = LEAST_SCORE
 
 
+class TracksFile(Document, frozen=True, kw_only=True):
+    """Point tracks of a video, as a tracker wrote them."""
+
+    file: Text
+    kind: Literal["cotracker", "spatialtracker", "tapir", "tapvid3d"] | None = None
+    size: Annotated[list[Pixels], Meta(min_length=2, max_length=2)] | None = None
+
+
 class VideoFile(Document, frozen=True, kw_only=True):
     """One video of a scene."""
 
@@ -61,6 +69,7 @@ class VideoFile(Document, frozen=True, kw_only=True):
     masks: Files | None = None
     labels: Files | None = None
     points: PointsFile | None = None
+    tracks: TracksFile | None = None
 
 
 class CalibratedFile(Document, frozen=True, kw_only=True):

@@ -52,12 +52,17 @@ def keep_frames(scene: Scene, index: Sequence[Sequence[int]]) -> Scene:
         frames, fps = _some(video.frames, picks), None if thinned else video.fps
         told = times if rising else np.sort(times)  # of frames in another order the caller tells the times
         videos.append(replace(video, frames=frames, camera=camera, fps=fps, timestamps=told, depth=depth))
+    tracks = tuple(
+        t if t is None or np.array_equal(picks, np.arange(len(v.frames))) else t.take(picks)
+        for t, v, picks in zip(scene.tracks, scene.videos, index, strict=False)
+    )
     return replace(
         scene,
         videos=tuple(videos),
         masks=tuple(masks),
         labels=tuple(labels) if scene.labels else (),
         points=tuple(points) if scene.points else (),
+        tracks=tracks,
     )
 
 

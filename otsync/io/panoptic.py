@@ -26,6 +26,7 @@ class Panoptic:
 
     name = "panoptic"
     looks_for = f"{' or '.join(METAS)} beside ims/"
+    brings = "cameras, masks"
 
     def claims(self, folder: Path) -> bool:
         return any((folder / meta).is_file() for meta in METAS) and (folder / "ims").is_dir()

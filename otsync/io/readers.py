@@ -9,13 +9,18 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from ..plugins import available
+from .datasets import DATASETS
 from .footage import ImageFolders, VideoFiles, VideosAndImages
 from .panoptic import Panoptic
 from .pose2sim import Pose2Sim
 
 
 class Reader(Protocol):
-    """A layout of recordings in a folder."""
+    """A layout of recordings in a folder.
+
+    Two attributes may be missing: ``brings``, what it takes from there, in words, for the table in the docs; and
+    ``insists``, whether it describes a folder that it does not claim where it is named (it does not).
+    """
 
     name: str
     """As ``otsync init --reader`` spells it."""
@@ -36,7 +41,7 @@ class Reader(Protocol):
         ...
 
 
-READERS: tuple[Reader, ...] = (Panoptic(), Pose2Sim(), VideosAndImages(), VideoFiles(), ImageFolders())
+READERS: tuple[Reader, ...] = (Panoptic(), Pose2Sim(), *DATASETS, VideosAndImages(), VideoFiles(), ImageFolders())
 """otsync's own readers, in the order in which they are asked; plugins are asked before them."""
 
 
@@ -65,10 +70,31 @@ def find_reader(folder: str | os.PathLike[str], name: str | None = None) -> tupl
         raise ValueError(f"reader: expected one of {', '.join(known)}; found {name!r}.")
     asked = list(known) if name is None else [name]
     for each in asked:
-        if known[each].claims(folder):
+        if known[each].claims(folder) or (name is not None and getattr(known[each], "insists", False)):
             return each, known[each]
     wanted = "; ".join(f"{each}: {_looks_for(known[each])}" for each in asked)
     raise ValueError(f"{folder}: expected a layout that a reader knows ({wanted}); found none. Check the path.")
+
+
+def claiming(folder: str | os.PathLike[str]) -> list[str]:
+    """The names of all readers that claim the folder, in the order in which they are asked."""
+    return [name for name, reader in readers().items() if reader.claims(Path(folder))]
+
+
+def options_of(reader: Reader) -> list[str]:
+    """The names of the options that a reader takes."""
+    parameters = list(inspect.signature(reader.describe).parameters.values())[1:]
+    return [p.name for p in parameters if p.kind is not p.VAR_KEYWORD]
+
+
+def table() -> str:
+    """otsync's own readers as a table in Markdown, of their own declarations: what docs/recording.md holds."""
+    rows = ["| reader | looks for | takes from there | options |", "|---|---|---|---|"]
+    for reader in READERS:
+        options = ", ".join(f"`--{option}`" for option in options_of(reader)) or "–"
+        brings = getattr(reader, "brings", "–")
+        rows.append(f"| `{reader.name}` | {reader.looks_for} | {brings} | {options} |")
+    return "\n".join(rows) + "\n"
 
 
 def describe_folder(folder: str | os.PathLike[str], *, reader: str | None = None, **options: Any) -> dict[str, Any]:
@@ -83,8 +109,8 @@ def describe_folder(folder: str | os.PathLike[str], *, reader: str | None = None
     """
     name, chosen = find_reader(folder, reader)
     given = {option: value for option, value in options.items() if value is not None}
-    parameters = list(inspect.signature(chosen.describe).parameters.values())[1:]
-    takes = [parameter.name for parameter in parameters]
+    takes = options_of(chosen)
+    parameters = inspect.signature(chosen.describe).parameters.values()
     anything = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters)
     for option in given:
         if option not in takes and not anything:

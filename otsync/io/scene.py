@@ -24,7 +24,6 @@ after they were taken). Synchronisation undoes it.
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -41,7 +40,9 @@ from .frames import ArrayFrames, FrameRange, ImageFrames, LazyFrames, VideoFrame
 from .images import read_depth, read_image, read_labels, read_mask
 from .keypoints import KEYPOINTS, Detections, read_detections
 from .layout import LEAST_SCORE, MAX_FILES, SceneFile
+from .order import natural
 from .readers import describe_folder
+from .tracks import TrackFile
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +56,7 @@ class Scene:
         root: the folder that paths are relative to.
         notes: what the reader assumed or could not find.
         labels: per video a sequence of (H,W) integer labels that all videos share, 0 none; or None. Empty: none at all.
+        tracks: per video the file of point tracks that came along, or None. Empty: none at all.
         doubtful: why the camera of a video is not to be trusted, by its name: what ``otsync calibrate`` says.
         points: per video what another program found in it, used in place of our own tracks; or None. Empty: none.
     """
@@ -65,6 +67,7 @@ class Scene:
     root: Path = Path()
     notes: tuple[str, ...] = field(default_factory=tuple)
     labels: tuple[Sequence[np.ndarray] | None, ...] = ()
+    tracks: tuple[TrackFile | None, ...] = ()
     doubtful: Mapping[str, str] = field(default_factory=dict)
     points: tuple[Detections | None, ...] = ()
 
@@ -86,6 +89,7 @@ class Scene:
             masks=tuple(self.masks[i] for i in index),
             labels=tuple(self.labels[i] for i in index) if self.labels else (),
             points=tuple(self.points[i] for i in index) if self.points else (),
+            tracks=tuple(self.tracks[i] for i in index) if self.tracks else (),
         )
 
 
@@ -158,6 +162,7 @@ def scene_from_document(
         Path(root),
         tuple(str(n) for n in document.get("notes", ())),
         tuple(labels for _, _, labels, _ in built),
+        tuple(_tracks(entry, builder) for entry in entries) if any(e.get("tracks") for e in entries) else (),
         _doubtful(document),
         tuple(points for _, _, _, points in built),
     )
@@ -286,6 +291,19 @@ def _points(value: Any, paths: Paths, frames: int, used: range) -> Detections | 
     return sure.within(used)
 
 
+def _tracks(entry: dict[str, Any], paths: Paths) -> TrackFile | None:
+    """The file of a video's tracks. ValueError beside ``range``, of which nobody knows whether it is cut too."""
+    told = entry.get("tracks")
+    if told is None:
+        return None
+    if entry.get("range") is not None:
+        raise ValueError(
+            "tracks, range: expected one of them. Cut the frames and track those, or leave the tracks out."
+        )
+    size = told.get("size")
+    return TrackFile(paths.one(told["file"]), told.get("kind"), None if size is None else (size[0], size[1]))
+
+
 def _images(value: Any, paths: Paths, read: Callable[[Path], np.ndarray], kind: str) -> LazyFrames | None:
     return None if value is None else ImageFrames(paths.many(value), read, kind)
 
@@ -341,8 +359,3 @@ class Paths:
         if self.allow_outside:
             return files
         return [self.one(f"{base}/{p.name}" if base else p.name) for p in files]
-
-
-def natural(path: Path) -> list[Any]:
-    """Sort key by which frame_9 comes before frame_10."""
-    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name[:255])]

@@ -9,6 +9,7 @@ blobs.py        tracks of things too small for flow, and the choice by their siz
 linking.py      detections of single frames joined to tracks
 features.py     descriptors of tracks
 stereo.py       depth of tracked points of a rig by visual hull and correlation
+learned/        features, flow, tracks of learned models
 dense.py        the same at every pixel of a mask
 """
 
@@ -16,13 +17,15 @@ from ..files.cache import Cache
 from .blobs import Blobs, BySize
 from .features import Daisy, LabHistogram
 from .flow import DISFlow
+from .learned import Dinov2, Dinov3, Onnx, Raft, Transformers
 from .masks import FlowResidual, GivenMasks, MedianBackground
 from .points import ChainedFlow
-from .slots import Describer, Masker, Tracker
+from .slots import Describer, Flow, Masker, Tracker
 from .working import WorkingFrames
 
 __all__ = [
     "DESCRIBERS",
+    "FLOWS",
     "MASKERS",
     "TRACKERS",
     "Blobs",
@@ -32,6 +35,7 @@ __all__ = [
     "DISFlow",
     "Daisy",
     "Describer",
+    "Flow",
     "FlowResidual",
     "GivenMasks",
     "LabHistogram",
@@ -47,5 +51,8 @@ MASKERS = (MedianBackground, FlowResidual)
 TRACKERS = (BySize, ChainedFlow, Blobs)
 """Trackers of points that the shell offers; plugins come on top."""
 
-DESCRIBERS = (LabHistogram, Daisy)
+FLOWS = (DISFlow, Raft)
+"""Optical flows that the shell offers; plugins come on top."""
+
+DESCRIBERS = (LabHistogram, Daisy, Dinov3, Dinov2, Transformers, Onnx)
 """Describers of tracks that the shell offers; plugins come on top."""

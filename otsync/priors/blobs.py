@@ -65,17 +65,17 @@ class BySize:
     Args:
         small: pixels across (the root of the area of a typical component) below which a thing is a blob. It does not
             scale with the image: flow needs so many pixels.
-        flow, blobs: what is chosen from.
+        large, blobs: what is chosen from.
     """
 
     small: float = 16.0
-    flow: Tracker = field(default_factory=ChainedFlow)
+    large: Tracker = field(default_factory=ChainedFlow)
     blobs: Tracker = field(default_factory=Blobs)
 
     def __call__(self, frames: WorkingFrames, masks: Sequence[np.ndarray], fps: float) -> Float[np.ndarray, "N T 2"]:
         """Working pixel indices of every track, nan where it is not seen."""
         area = typical_area(masks, frames.unit)
-        chosen = self.blobs if 0 < area < self.small**2 else self.flow
+        chosen = self.blobs if 0 < area < self.small**2 else self.large
         return chosen(frames, masks, fps)
 
 

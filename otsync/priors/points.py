@@ -5,11 +5,13 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from .flow import DISFlow
+from .slots import Flow, cache_key
 from .working import WorkingFrames, bilinear
 
 
@@ -40,7 +42,15 @@ class ChainedFlow:
     most: int = 4000
     max_gap: int = 0
     join: float = 4.0
-    flow: DISFlow = field(default_factory=DISFlow)
+    flow: Flow = field(default_factory=DISFlow)
+
+    @property
+    def cache_key(self) -> Any:
+        """Its fields, of the flow what it is told apart by."""
+        if cache_key(self.flow) is self.flow:
+            return self
+        held = {k: v for k, v in vars(self).items() if k != "flow"}
+        return (type(self).__name__, tuple(sorted(held.items())), cache_key(self.flow))
 
     def __call__(self, frames: WorkingFrames, masks: Sequence[np.ndarray], fps: float) -> Float[np.ndarray, "N T 2"]:
         """Working pixel indices of every track, nan where it is not followed."""
@@ -66,7 +76,8 @@ class ChainedFlow:
         square = np.ones((5, 5), np.uint8)
         x, ids = np.zeros((0, 2), np.float32), np.zeros(0, int)
         steps, seeds, count = [], [], 0
-        gray = frames.gray(0)
+        seen = frames.__getitem__ if getattr(self.flow, "colour", False) else frames.gray
+        now = seen(0)
         for t in range(T):
             if (t - self.phase) % every == 0:
                 core = cv2.erode(masks[t].astype(np.uint8), square)
@@ -79,14 +90,14 @@ class ChainedFlow:
                 count += len(new)
             steps.append((t, ids, x))
             if t + 1 < T:
-                after = frames.gray(t + 1)
-                there, back = self.flow.pair(gray, after)
+                after = seen(t + 1)
+                there, back = self.flow.pair(now, after)
                 size = flows.shape[3], flows.shape[2]
                 flows[t, 0] = cv2.resize(there, size, interpolation=cv2.INTER_AREA)
                 flows[t, 1] = cv2.resize(back, size, interpolation=cv2.INTER_AREA)
                 x, alive = self._step(x, flows[t, 0], flows[t, 1], masks[t + 1], frames)
                 x, ids = x[alive], ids[alive]
-                gray = after
+                now = after
         return steps, seeds
 
     def _backwards(self, seeds, masks, flows, frames):

@@ -35,6 +35,19 @@ class Tracker(Protocol):
         ...
 
 
+class Flow(Protocol):
+    """The ``flow`` slot: optical flow between two frames, there and back.
+
+    One that declares ``colour = True`` gets (H,W,3) instead of grey.
+    """
+
+    def pair(
+        self, before: np.ndarray, after: np.ndarray
+    ) -> tuple[Float[np.ndarray, "H W 2"], Float[np.ndarray, "H W 2"]]:
+        """Pixels that each point moves by, from ``before`` to ``after`` and from ``after`` back."""
+        ...
+
+
 class Describer(Protocol):
     """The ``features`` slot: what tells a track from others, whichever camera sees it."""
 

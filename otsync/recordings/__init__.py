@@ -7,12 +7,14 @@ routes.py       which way from a scene to offsets, in which stages
 kept_pairs.py   pairs of videos kept on disk
 dense_depth.py  depth maps of synchronised recordings
 placement.py    which cameras may stand elsewhere than the scene says
+audit.py        otsync audit: which camera of a rig is not in sync
 check.py        otsync check: what commonly goes wrong in a recording
 """
 
+from .audit import audit_scene
 from .check import check_scene
 from .dense_depth import depth_maps
 from .routes import Synchronized, synchronize_scene
 from .stages import Stages, stages_from
 
-__all__ = ["Stages", "Synchronized", "check_scene", "depth_maps", "stages_from", "synchronize_scene"]
+__all__ = ["Stages", "Synchronized", "audit_scene", "check_scene", "depth_maps", "stages_from", "synchronize_scene"]

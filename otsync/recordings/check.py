@@ -115,6 +115,18 @@ def check_scene(
     return sorted(findings, key=lambda f: f.severity)
 
 
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
+def looking_wrong(document: dict[str, Any]) -> list[Finding]:
+    """What the poses of a document alone give away, before any file is read: mirrored, inverted, looking elsewhere.
+
+    Videos without a camera are left out.
+    """
+    entries = [e for e in document["videos"] if (e.get("camera") or {}).get("w2c") is not None]
+    unmirrored = _unmirrored(entries)
+    findings = [finding for entry in entries for finding in _pose(entry, entry["name"], unmirrored)]
+    return [*findings, *_common_volume(_cameras(entries))]
+
+
 def _layout(document: dict[str, Any], file: Path) -> tuple[list[Finding], list[dict[str, Any]]]:
     """What the schema says of the document and of each video, and the videos that are as it says, named."""
     entries = document.get("videos")

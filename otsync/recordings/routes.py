@@ -207,10 +207,14 @@ def track_all(
             "have none. Add them, leave these videos out, or take all points out of scene.json."
         )
 
-    def one(item: tuple[Video, Any, Any, Any]) -> dict[str, np.ndarray]:
-        video, masks, labels, found = item
+    def one(item: tuple[Video, Any, Any, Any, Any]) -> dict[str, np.ndarray]:
+        video, masks, labels, found, given = item
+        if found is not None and given is not None:
+            raise ValueError(
+                f"video {video.name}: points, tracks: expected one of them in scene.json; found both. Leave one out."
+            )
         if found is None:
-            tracked = stages.tracking(video, masks, cache)
+            tracked = stages.tracking(video, masks, cache, given)
         else:
             tracked = tracks_of(found, len(video.frames), video.fps or 30.0, video.camera.width / WIDTH, parts)
         if labels is not None:
@@ -223,7 +227,8 @@ def track_all(
         return tracked
 
     labels = scene.labels or (None,) * len(scene.videos)
-    return list(map(one, list(zip(scene.videos, scene.masks, labels, points, strict=True))))
+    tracks = scene.tracks or (None,) * len(scene.videos)
+    return list(map(one, list(zip(scene.videos, scene.masks, labels, points, tracks, strict=True))))
 
 
 def select(video: Video, raw: dict[str, np.ndarray], stages: Stages, frame: str) -> TrackSet:

@@ -18,7 +18,8 @@ from ..io.scene import Scene
 from ..match.slot import Matcher
 from ..match.unbalanced import UnbalancedOT
 from ..plugins import available, made
-from ..priors import DESCRIBERS, MASKERS, TRACKERS
+from ..priors import DESCRIBERS, FLOWS, MASKERS, TRACKERS
+from ..priors.blobs import BySize
 from ..priors.stereo import HullStereo, TrackDepth
 from ..refine.slot import Refiner
 from ..refine.splines import SplineRefine
@@ -81,9 +82,10 @@ class Stages:
 PRIORS: dict[str, tuple[str, str, Iterable[Any]]] = {
     "masks": ("masker", "maskers", MASKERS),
     "points": ("points", "trackers", TRACKERS),
+    "flow": ("flow", "flows", FLOWS),
     "features": ("features", "describers", DESCRIBERS),
 }
-"""Option of the shell: field of :class:`Tracking`, group of plugins, otsync's own choices."""
+"""Option of the shell: field of :class:`Tracking` (flow: of its tracker), group of plugins, our own choices."""
 
 
 LEAST_WIDTH = 64
@@ -95,6 +97,7 @@ def stages_from(
     *,
     masks: str | None = None,
     points: str | None = None,
+    flow: str | None = None,
     features: str | None = None,
     selection: str | None = None,
     width: int | None = None,
@@ -103,8 +106,9 @@ def stages_from(
 
     Args:
         stages: what the other slots hold; default :class:`Stages`.
-        masks: of otsync's own or of the plugins in the group "maskers"; points: "trackers"; features: "describers".
-            None leaves what is there. ValueError lists the choices, or names a field that does not fit.
+        masks: of otsync's own or of the plugins in the group "maskers"; points: "trackers"; flow: "flows";
+            features: "describers". None leaves what is there. ValueError lists the choices, or names a field that does
+            not fit.
         selection: ``field=value,field=value`` of :class:`otsync.recordings.tracking.Selection`: which tracks are kept.
         width: pixels of width that videos are tracked at.
 
@@ -113,7 +117,7 @@ def stages_from(
         5
     """
     stages = stages or Stages()
-    spelled = {"masks": masks, "points": points, "features": features}
+    spelled = {"masks": masks, "points": points, "flow": flow, "features": features}
     chosen = {}
     for option, text in spelled.items():
         if text is not None:
@@ -128,7 +132,23 @@ def stages_from(
         if not isinstance(kept, Selection):
             raise ValueError("--recording.selection: expected field=value,field=value; found nothing.")
         stages = replace(stages, selection=kept)
+    if "flow" in chosen:
+        chosen["points"] = following(chosen.get("points", stages.tracking.points), chosen.pop("flow"))
+    if points is not None:
+        chosen["given"] = False  # a tracker that is named goes before tracks that came along
     return replace(stages, tracking=replace(stages.tracking, **chosen))
+
+
+def following(tracker: Any, flow: Any) -> Any:
+    """``tracker`` with another optical flow. ValueError where it follows none."""
+    if isinstance(tracker, BySize):
+        return replace(tracker, large=following(tracker.large, flow))
+    if "flow" not in getattr(tracker, "__dataclass_fields__", {}):
+        raise ValueError(
+            f"--flow: expected a tracker that follows flow, such as chained-flow; found {type(tracker).__name__}. "
+            "Leave one of both out."
+        )
+    return replace(tracker, flow=flow)
 
 
 def with_method(stages: Stages, route: str, method: Method) -> Stages:

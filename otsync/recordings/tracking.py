@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 
 from ..files.cache import Cache
 from ..files.digest import content_key, sequence_key
+from ..io.tracks import TrackFile
 from ..priors.blobs import BySize
 from ..priors.features import LabHistogram
 from ..priors.masks import FlowResidual, GivenMasks, MedianBackground
@@ -146,6 +147,25 @@ def track_labels(
     return np.where(sure, names[winner], -1)
 
 
+def on_foreground(
+    uv: Float[np.ndarray, "N T 2"], masks: Sequence[np.ndarray], most: float = 0.5
+) -> Float[np.ndarray, "N T 2"]:
+    """The tracks of which at least ``most`` of the samples lie on the foreground: trackers follow walls as well.
+
+    Args:
+        uv: working pixel indices, nan unseen. masks: (h,w) per frame.
+    """
+    seen = np.isfinite(uv[..., 0])
+    inside = np.zeros(seen.shape, bool)
+    for k in range(uv.shape[1]):
+        at = np.flatnonzero(seen[:, k])
+        if len(at):
+            mask = masks[k]
+            x, y = np.round(uv[at, k]).astype(int).T
+            inside[at, k] = mask[np.clip(y, 0, mask.shape[0] - 1), np.clip(x, 0, mask.shape[1] - 1)]
+    return uv[inside.sum(1) >= np.maximum(most * seen.sum(1), 1)]
+
+
 class PackedMasks(Sequence[np.ndarray]):
     """Masks of one bit a pixel, unpacked when a frame is asked for: 29 kB for 640 x 360."""
 
@@ -169,30 +189,44 @@ class Tracking:
         points: by the size of what moves optical flow that is chained, or blobs. features: colours, or
             :class:`otsync.priors.Daisy`. Any object with the call of its slot (:mod:`otsync.priors.slots`) will do.
         width: working resolution; larger frames are reduced to it.
+        given: use point tracks that came with the recording, where there are any.
     """
 
     masker: Masker | None = None
     points: Tracker = field(default_factory=BySize)
     features: Describer = field(default_factory=LabHistogram)
     width: int = WIDTH
+    given: bool = True
 
     def __call__(
-        self, video: Video, masks: Sequence[np.ndarray] | None = None, cache: Cache | None = None
+        self,
+        video: Video,
+        masks: Sequence[np.ndarray] | None = None,
+        cache: Cache | None = None,
+        tracks: TrackFile | None = None,
     ) -> dict[str, np.ndarray]:
         """``uv`` (N,T,2), the camera's pixels with its distortion, nan unseen; ``features`` (N,D); ``seconds``.
+
+        ``tracks``: a file of tracks that takes the tracker's place, unless ``given`` is off.
 
         Each of masks and tracks is kept on its own, so that a run that was killed continues between them.
         """
         cache = cache or Cache()
         frames = WorkingFrames(video.frames, (video.camera.width, video.camera.height), self.width)
         fps = video.fps or 30.0
-        priors = [cache_key(prior) for prior in (self.masker, self.points, self.features)]
+        brought = tracks if self.given else None
+        follower = self.points if brought is None else brought.digest()
+        priors = [cache_key(prior) for prior in (self.masker, follower, self.features)]
 
         def track() -> dict[str, np.ndarray]:
             started = time.perf_counter()
             mask = self.masks(video, masks, cache)
             masked = time.perf_counter()
-            uv = self.points(frames, mask, fps)
+            if brought is None:
+                uv = self.points(frames, mask, fps)
+            else:
+                size = (video.camera.width, video.camera.height)
+                uv = on_foreground(frames.from_full(brought.read(len(video.frames), size)), mask)
             tracked = time.perf_counter()
             features = self.features(frames, mask, uv, fps).astype(np.float32)
             spent = np.diff([started, masked, tracked, time.perf_counter()])

@@ -69,7 +69,7 @@ class Run:
         from recon.pipeline.intake import given_clocks, readable
         from recon.pipeline.verb import check_effects_of
 
-        for name in ("masks", "points", "features", "selection", "width"):
+        for name in ("masks", "points", "flow", "features", "selection", "width"):
             if getattr(self.recording, name) is not None:
                 raise ValueError(
                     f"--recording.{name}: expected without it, since the reconstruction tracks by its own; found "

@@ -1,9 +1,32 @@
 """The folder of a reconstruction, and ways to show it: images, video, exports, the report page."""
 
 from recon.result.export import Checkpoint, Exporter, Ply, PlySequence, Splat, Tracks
+from recon.result.others import Dynamic3DGaussians, SuperSplat, TapVid3D
 from recon.result.page import Page
 
-EXPORTERS: tuple[Exporter, ...] = (Ply(), PlySequence(), Splat(), Checkpoint(), Tracks(), Page())
+EXPORTERS: tuple[Exporter, ...] = (
+    Ply(),
+    SuperSplat(),
+    PlySequence(),
+    Splat(),
+    Checkpoint(),
+    Tracks(),
+    TapVid3D(),
+    Dynamic3DGaussians(),
+    Page(),
+)
 """Our own formats."""
 
-__all__ = ["EXPORTERS", "Checkpoint", "Exporter", "Page", "Ply", "PlySequence", "Splat", "Tracks"]
+__all__ = [
+    "EXPORTERS",
+    "Checkpoint",
+    "Dynamic3DGaussians",
+    "Exporter",
+    "Page",
+    "Ply",
+    "PlySequence",
+    "Splat",
+    "SuperSplat",
+    "TapVid3D",
+    "Tracks",
+]

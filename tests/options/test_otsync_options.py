@@ -465,7 +465,8 @@ def test_options_of_recordings(recording, tmp_path):
     assert first != answer([*base, "--recording.route", "epipolar"])
     names = [video["name"] for video in json.loads(first)["videos"]]
     assert first != answer([*base, "--recording.cameras", *names[:2]])
-    for priors in (["masks", "flow-residual"], ["points", "chained-flow:every=3"], ["features", "daisy"]):
+    flow = ["flow", "dis-flow:preset=fast"]
+    for priors in (["masks", "flow-residual"], ["points", "chained-flow:every=3"], flow, ["features", "daisy"]):
         assert first != answer([*base, f"--recording.{priors[0]}", priors[1]]), priors
         code, _, err = run([*base, f"--recording.{priors[0]}", "nothing"])
         assert code == 2 and f"--{priors[0]}" in err
@@ -506,6 +507,10 @@ def test_options_of_init(recording, tmp_path):
 
     plain = document()
     assert plain != document("--fps", "25")
+    assert run(["init", str(folder), "--force", "--order", "cam0"])[0] == 2  # a reader that knows no order refuses it
+    frames = len(list((folder / "cam0").iterdir()))
+    (tmp_path / "times.csv").write_text("video,seconds\n" + "".join(f"cam0,{0.1 * k}\n" for k in range(frames)))
+    assert plain != document("--timestamps", str(tmp_path / "times.csv"))
     assert run(["init", str(folder)])[0] == 2  # it is there already
     run(["init", str(folder), "--out", str(folder / "other.json")])
     assert (folder / "other.json").is_file()
@@ -715,13 +720,15 @@ def rows() -> set[str]:
         "sync": "tracks out reference truth method rate rematch costs frames workers json refiner:Unrefined "
         "graph.extra graph.complete "
         "graph.curves graph.starts graph.seed recording.route recording.cameras recording.cache "
-        "recording.allow_outside recording.workers recording.masks recording.points recording.features "
+        "recording.allow_outside recording.workers recording.masks recording.points recording.flow recording.features "
         "recording.selection recording.width",
         "simulate": "out motion preset videos frames fps max_offset own_frames seed",
         "film": "out phones gap handheld walk frames fps width height max_offset contrast seed",
         "calibrate": "folder out force options.intrinsics options.board options.distance options.key_frames "
         "options.width options.seed json",
-        "init": "folder out reader fps force",
+        "init": "folder out reader fps order timestamps force",
+        "audit": "scene out tolerance cameras allow_outside json",
+        "import-offsets": "source recording kind sigma offsets out allow_outside",
         "check": "scene every_frame allow_outside",
         "export": "recording offsets out what cameras width fps force allow_outside",
         "bench": "suite scene out gate rebase promises first_seed seeds only sizes limit json cache",

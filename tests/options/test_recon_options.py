@@ -530,6 +530,7 @@ def test_the_other_options_of_a_run(arriving, world, outside, home):
     for name, value in (
         ("masks", "a"),
         ("points", "a"),
+        ("flow", "a"),
         ("features", "daisy"),
         ("selection", "count=9"),
         ("width", "99"),
@@ -888,7 +889,7 @@ def rows() -> set[str]:
     others = {
         "fit": "scene offsets out held_out tracks truth view cache json allow_outside",
         "run": "scene out held_out reference truth json allow_outside recording.route recording.cameras "
-        "recording.cache recording.allow_outside recording.masks recording.points recording.features "
+        "recording.cache recording.allow_outside recording.masks recording.points recording.flow recording.features "
         "recording.selection recording.width",
         "bench": "scene truth rows out cache name lpips_weights json allow_outside gate rebase protocol.held_out "
         "protocol.cameras protocol.amplitudes protocol.seeds protocol.lengths protocol.held_out_tracks",

@@ -15,6 +15,7 @@ from PIL import Image
 from otsync.cli import main
 from otsync.files.arrays import write_npz
 from otsync.io import READERS, ImageFrames, VideoFrames, describe_folder, find_reader, open_scene, readers
+from otsync.io.datasets import DATASETS
 from otsync.io.document import FORMAT, VERSION, document, write_document
 from otsync.io.frames import ArrayFrames, _Errors
 from otsync.io.images import read_depth, read_image, read_mask
@@ -419,11 +420,12 @@ def test_a_registered_reader_is_asked_first_and_opens_its_folders(folder, thing)
     assert "slides" not in readers()
 
 
+FOOTAGE = ("videos-and-images", "video-files", "image-folders")
+
+
 def test_the_readers_of_otsync_are_asked_from_the_most_special_to_the_most_general():
     assert list(readers()) == [reader.name for reader in READERS]
-    assert [reader.name for reader in READERS] == [
-        *("panoptic", "pose2sim", "videos-and-images", "video-files", "image-folders")
-    ]
+    assert [reader.name for reader in READERS] == ["panoptic", "pose2sim", *(r.name for r in DATASETS), *FOOTAGE]
 
 
 def test_init_says_which_reader_took_the_folder(folder, capsys):

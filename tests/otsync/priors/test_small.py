@@ -75,8 +75,8 @@ def test_large_things_are_followed_by_flow_with_the_limits_of_people():
         return np.zeros((0, len(frames), 2))
 
     frames = WorkingFrames([np.zeros((240, 320, 3), np.uint8)] * 20, SIZE)
-    BySize(flow=flow, blobs=None)(frames, masks, 25.0)
-    assert asked == [25.0] and BySize().flow == ChainedFlow()
+    BySize(large=flow, blobs=None)(frames, masks, 25.0)
+    assert asked == [25.0] and BySize().large == ChainedFlow()
 
 
 def test_small_things_stay_and_neighbours_are_not_closed_to_one():

@@ -163,7 +163,8 @@ def test_priors_are_spelled_as_the_shell_spells_them():
     assert stages_from(base) == base
     made = stages_from(base, masks="median-background:threshold=20", points="chained-flow:every=5", features="daisy")
     assert made.selection == base.selection
-    assert made.tracking == Tracking(MedianBackground(threshold=20), ChainedFlow(every=5), Daisy())
+    # a tracker that is named goes before tracks that came with the recording
+    assert made.tracking == Tracking(MedianBackground(threshold=20), ChainedFlow(every=5), Daisy(), given=False)
     with pytest.raises(ValueError, match=r"--features: expected some of lab-histogram, daisy; found 'dino'"):
         stages_from(features="dino")
     with pytest.raises(ValueError, match=r"--points: 'chained-flow:pace=3' cannot be made"):

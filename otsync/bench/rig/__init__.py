@@ -1,0 +1,1 @@
+"""Benchmarks on synchronised rigs: audit.py, with one camera moved."""

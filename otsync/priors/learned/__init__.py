@@ -1,0 +1,12 @@
+"""Learned priors, each a leaf that loads its package when it is used (extra ``learned``).
+
+loading.py    weights and packages: found, or refused with what to install and where to put the file
+tiles.py      large images in tiles that overlap
+backbones.py  features of transformers' backbones and of ONNX models
+raft.py       torchvision's RAFT
+"""
+
+from .backbones import Dinov2, Dinov3, Onnx, Transformers
+from .raft import Raft
+
+__all__ = ["Dinov2", "Dinov3", "Onnx", "Raft", "Transformers"]
