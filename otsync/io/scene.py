@@ -164,7 +164,7 @@ def scene_from_document(
         tuple(labels for _, _, labels, _ in built),
         tuple(_tracks(entry, builder) for entry in entries) if any(e.get("tracks") for e in entries) else (),
         _doubtful(document),
-        tuple(points for _, _, _, points in built),
+        tuple(points for _, _, _, points in built) if any(p is not None for *_, p in built) else (),
     )
 
 

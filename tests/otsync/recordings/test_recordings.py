@@ -64,8 +64,8 @@ def test_pixels_to_offsets(synced):
 
 def test_report_has_pictures_and_no_script(synced):
     page = (synced / "report.html").read_text()
-    assert page.count("data:image/webp;base64,") == 3
-    assert "contact sheet before" in page and "matches on frames" in page
+    assert page.count("<b>Before</b>") == page.count("<b>After</b>") == 1
+    assert 'alt="matches on ' in page and page.count("data:image/webp;base64,") >= 3
     assert "<script" not in page and 'src="http' not in page and 'href="http' not in page
     assert len(page) < 400_000
 
@@ -165,7 +165,7 @@ def test_priors_are_spelled_as_the_shell_spells_them():
     assert made.selection == base.selection
     # a tracker that is named goes before tracks that came with the recording
     assert made.tracking == Tracking(MedianBackground(threshold=20), ChainedFlow(every=5), Daisy(), given=False)
-    with pytest.raises(ValueError, match=r"--features: expected some of lab-histogram, daisy; found 'dino'"):
+    with pytest.raises(ValueError, match=r"--features: expected some of lab-histogram, daisy, .*onnx; found 'dino'"):
         stages_from(features="dino")
     with pytest.raises(ValueError, match=r"--points: 'chained-flow:pace=3' cannot be made"):
         stages_from(points="chained-flow:pace=3")
