@@ -171,7 +171,14 @@ def material_of(
         tracks = tuple(t for t in tracks if t.name in train.names)
     held = scene.take(protocol.held_out) if protocol.held_out else None
     if held is not None:
-        train = replace(train, videos=(*train.videos, *held.videos), masks=(*train.masks, *held.masks), labels=())
+        train = replace(
+            train,
+            videos=(*train.videos, *held.videos),
+            masks=(*train.masks, *held.masks),
+            labels=(),
+            tracks=(*train.tracks, *held.tracks),
+            points=(*train.points, *held.points),
+        )
     rng = np.random.default_rng(5)
     out = [rng.random(len(t)) < protocol.held_out_tracks for t in tracks]
     return Material(
