@@ -83,6 +83,26 @@ def _call(builder, name, result, arguments):
     return builder.call(function, arguments)
 
 
+_DOUBLES = ir.VectorType(ir.DoubleType(), LANES)
+
+
+def _spread_double(builder, value):
+    undefined = ir.Constant(_DOUBLES, ir.Undefined)
+    one = builder.insert_element(undefined, value, ir.Constant(_I32, 0))
+    return builder.shuffle_vector(one, undefined, ir.Constant(ints.ir, [0] * LANES))
+
+
+def _call_double(builder, name, argument):
+    function_type = ir.FunctionType(_DOUBLES, [_DOUBLES])
+    function = cgutils.get_or_insert_function(builder.module, function_type, f"llvm.{name}.v{LANES}f64")
+    return builder.call(function, [argument])
+
+
+def _line(builder, start, slope):
+    steps = ir.Constant(_DOUBLES, [float(k) for k in range(LANES)])
+    return builder.fadd(_spread_double(builder, start), builder.fmul(_spread_double(builder, slope), steps))
+
+
 def _define_operator(op, left, right_scalar, result, emit):
     """Type and lower `op` for two vectors, and for a vector with a scalar on either side."""
     pairs = [(left, left), (left, right_scalar), (right_scalar, left)] if right_scalar else [(left, left)]
@@ -163,6 +183,31 @@ def counting_from(typingctx, start):
         return builder.fadd(first, ir.Constant(floats.ir, [float(k) for k in range(LANES)]), flags=FLAGS)
 
     return floats(start), lower
+
+
+@_intrinsic
+def line_whole(typingctx, start, slope, limit):
+    """Per lane k the integer nearest to start + k slope, kept within +-limit; start, slope and limit are float64."""
+
+    def lower(context, builder, sig, args):
+        centre = _line(builder, args[0], args[1])
+        high, low = (_spread_double(builder, v) for v in (args[2], builder.fneg(args[2])))
+        centre = builder.select(builder.fcmp_ordered("<", centre, high), centre, high)
+        centre = builder.select(builder.fcmp_ordered(">", centre, low), centre, low)
+        return builder.fptosi(_call_double(builder, "rint", centre), ints.ir)
+
+    return ints(start, slope, limit), lower
+
+
+@_intrinsic
+def line_rest(typingctx, start, slope, whole):
+    """Per lane k what start + k slope (float64) is more than `whole`, rounded to float32 at the end."""
+
+    def lower(context, builder, sig, args):
+        rest = builder.fsub(_line(builder, args[0], args[1]), builder.sitofp(args[2], _DOUBLES))
+        return builder.fptrunc(rest, floats.ir)
+
+    return floats(start, slope, whole), lower
 
 
 @_intrinsic

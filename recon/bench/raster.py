@@ -247,6 +247,7 @@ def run(
     """Measure, print, and write raster.csv, raster.json and raster.png to the folder `out`; returns an exit code.
 
     gate: return 1 when a ratio is below its floor or fell behind the committed baseline.
+    repeats: rounds of the largest size; smaller ones get more.
     with_fit: measure the toy fit of :mod:`recon.bench.toy` too. rebase: make this run the baseline.
     """
     out = Path(out)
@@ -258,7 +259,9 @@ def run(
     rows: list[dict[str, Any]] = []
     print("   size              C  back end    forward     total       min  x torch  peak MB  x bound")
     for size, c in counted(list(itertools.product(scenes, channels)), "rasterizer", "size"):
-        for row in measure(size, c, repeats, names):
+        # small scenes are measured more often: a median over a second says little about a machine that others use
+        rounds = repeats * max(1, round(math.sqrt(SIZES[-1][2] / size[2])))
+        for row in measure(size, c, rounds, names):
             rows.append(row)
             say(
                 f"{row['width']:4}x{row['height']:<4}{row['gaussians']:7} {c:4}  {row['backend']:7}"

@@ -34,7 +34,7 @@ from recon.raster.cpu.lists import (
 )
 from recon.raster.rendering import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 
-F32, F64, I32 = np.float32, np.float64, np.int32
+F32, F64, I32, U64 = np.float32, np.float64, np.int32, np.uint64
 PIXELS = TILE_WIDTH * TILE_HEIGHT
 # planes do not start a power of two apart: their lines would all fall into the same two sets of the L1 cache
 PLANE = PIXELS + LANES
@@ -47,6 +47,10 @@ LEAST_WEIGHT = F32(1e-10)  # of an expected depth: the floor of the alpha that i
 FAR = 1e6  # pixels: whole numbers of pixels are kept within int32
 LINE = 16  # floats of a cache line
 SHAPE_GRADIENTS = 6  # moments kept per intersection, before the channels
+
+CHUNKS = PIXELS // LANES  # of a tile
+FEW_CHANNELS = 8  # up to these a splat's channels are added at once
+QUEUE = 16  # splats that wait at a chunk of a tile with many channels
 
 _raster_kernel = kernel(fastmath={"contract", "reassoc", "arcp", "nsz"})
 _inline = kernel(fastmath={"contract", "reassoc", "arcp", "nsz"}, inline="never")
@@ -78,14 +82,14 @@ def _row_spans(records, at, mx, my, last_x, lefts, rights):
 
 
 @_inline
-def _row_centres(records, at, mx, my, top, bottom, wholes, rests):
-    """Where the splat is centred on rows top..bottom: the nearest pixel, and the rest to full precision."""
+def _row_centres(records, at, mx, my, wholes, rests):
+    """Where the splat is centred on every row of the tile: the nearest pixel, and the rest to full precision."""
     slope = F64(records[at + SLOPE]) + F64(records[at + REST_SLOPE])
-    for y in range(top, bottom + 1):
-        centre = mx + slope * (y - my)
-        whole = np.rint(min(max(centre, -FAR), FAR))
-        wholes[y] = I32(whole)
-        rests[y] = F32(centre - whole)
+    for y in range(0, TILE_HEIGHT, LANES):
+        start = mx + slope * (y - my)
+        whole = simd.line_whole(start, slope, FAR)
+        simd.store(wholes, y, whole)
+        simd.store(rests, y, simd.line_rest(start, slope, whole))
 
 
 @_inline
@@ -120,7 +124,7 @@ def _visit(records, rank, x, y, wide, tall, spans):
     my = F64(records[at + MEAN_Y]) + F64(records[at + REST_Y]) - (y + 0.5)
     top, bottom = _rows_reached(records, at, F32(my), F32(tall - 1))
     _row_spans(records, at, F32(mx), F32(my), F32(wide - 1), lefts, rights)
-    _row_centres(records, at, mx, my, top, bottom, wholes, rests)
+    _row_centres(records, at, mx, my, wholes, rests)
     return top, bottom, my, HALF_LOG2E / records[at + VAR_X], HALF_LOG2E * records[at + PER_VAR_Y]
 
 
@@ -129,6 +133,56 @@ def _new_spans():
     """Scratch for one visit, an entry per row: first and last pixel of the span, whole and rest of the centre."""
     integers = np.empty((3, TILE_HEIGHT), np.int32)
     return integers[0], integers[1], integers[2], np.empty(TILE_HEIGHT, np.float32)
+
+
+@_inline
+def _chunks(left, right, aligned):
+    """First pixel and number of the chunks that cover pixels left..right of a row.
+
+    As few as possible; `aligned` ones lie on the grid of LANES pixels.
+    """
+    if aligned:
+        x = I32(left & ~(LANES - 1))
+        return x, I32((right - x + LANES) // LANES)
+    chunks = I32((right - left + LANES) // LANES)
+    return min(left, I32(TILE_WIDTH - chunks * LANES)), chunks
+
+
+@_inline
+def _new_queue(needed):
+    """For every chunk of the grid the weights and ranks of up to QUEUE splats, and how many wait there.
+
+    With many channels their planes do not fit into the L1 cache, and to read and write them for each splat takes most
+    of the time: splats wait at a chunk until it is worth it. With few channels it is the queue that costs more.
+    """
+    size = QUEUE * CHUNKS if needed else 0
+    return _aligned(size * LANES), np.empty(size, np.int32), np.zeros(CHUNKS, np.int32)
+
+
+@_inline
+def _add_channels(planes, features, n_channels, weights, waiting, chunk, count):
+    """Add what waits at a chunk to its channels, four of them at a time in registers."""
+    begin, end = chunk * QUEUE, chunk * QUEUE + count
+    fours = n_channels - n_channels % 4
+    for c in range(0, fours, 4):
+        i0 = chunk * LANES + (c + 1) * PLANE
+        i1, i2, i3 = i0 + PLANE, i0 + 2 * PLANE, i0 + 3 * PLANE
+        s0, s1, s2, s3 = simd.load(planes, i0), simd.load(planes, i1), simd.load(planes, i2), simd.load(planes, i3)
+        for q in range(begin, end):
+            weight = simd.load(weights, q * LANES)
+            f = U64(waiting[q]) * U64(n_channels) + U64(c)  # unsigned: numba need not ask for negative ones
+            s0, s1 = s0 + weight * features[f], s1 + weight * features[f + U64(1)]
+            s2, s3 = s2 + weight * features[f + U64(2)], s3 + weight * features[f + U64(3)]
+        simd.store(planes, i0, s0)
+        simd.store(planes, i1, s1)
+        simd.store(planes, i2, s2)
+        simd.store(planes, i3, s3)
+    for c in range(fours, n_channels):
+        i0 = chunk * LANES + (c + 1) * PLANE
+        s0 = simd.load(planes, i0)
+        for q in range(begin, end):
+            s0 = s0 + simd.load(weights, q * LANES) * features[U64(waiting[q]) * U64(n_channels) + U64(c)]
+        simd.store(planes, i0, s0)
 
 
 @_inline
@@ -152,6 +206,8 @@ def forward(first, last, tile_lists, features, n_channels, depth_mode, tiling, o
     tile_starts, ranks, records = tile_lists
     planes = _aligned((1 + n_channels) * PLANE)  # transmittance, channels
     drawn_last = np.empty(PLANE, np.int32)
+    queued = n_channels > FEW_CHANNELS
+    weights, waiting, counts = _new_queue(queued)
     spans = _new_spans()
     lefts, rights, wholes, rests = spans
     for tile in range(first, last):
@@ -169,10 +225,9 @@ def forward(first, last, tile_lists, features, n_channels, depth_mode, tiling, o
             for y in range(top, bottom + 1):
                 if rights[y] < lefts[y]:
                     continue
-                chunks = (rights[y] - lefts[y] + LANES) // LANES
+                x, chunks = _chunks(lefts[y], rights[y], queued)
                 dy = F32(y - my)
                 power_y = fall_y * dy * dy
-                x = min(lefts[y], I32(TILE_WIDTH - chunks * LANES))
                 for _ in range(chunks):
                     i = y * TILE_WIDTH + x
                     before = simd.load(planes, i)
@@ -187,10 +242,23 @@ def forward(first, last, tile_lists, features, n_channels, depth_mode, tiling, o
                     simd.store(planes, i, simd.select(touched, simd.select(goes_on, after, ZERO - before), before))
                     simd.store(drawn_last, i, simd.select(drawn, I32(k), simd.load(drawn_last, i)))
                     weight = simd.select(drawn, weight, ZERO)
-                    for c in range(n_channels):
-                        j = i + (c + 1) * PLANE
-                        simd.store(planes, j, simd.load(planes, j) + weight * features[rank * n_channels + c])
+                    if queued:
+                        chunk = i // LANES
+                        entry = chunk * QUEUE + counts[chunk]
+                        simd.store(weights, entry * LANES, weight)
+                        waiting[entry] = rank
+                        counts[chunk] += 1
+                        if counts[chunk] == QUEUE:
+                            _add_channels(planes, features, n_channels, weights, waiting, chunk, QUEUE)
+                            counts[chunk] = 0
+                    else:
+                        for c in range(n_channels):
+                            j = i + (c + 1) * PLANE
+                            simd.store(planes, j, simd.load(planes, j) + weight * features[rank * n_channels + c])
                     x += LANES
+        for chunk in range(CHUNKS):
+            _add_channels(planes, features, n_channels, weights, waiting, chunk, counts[chunk])
+            counts[chunk] = 0
         _store_tile(planes, drawn_last, pixel, wide, tall, tiling[0], n_channels, depth_mode, outputs)
 
 
@@ -248,10 +316,9 @@ def backward(first, last, tile_lists, slots, features, n_channels, depth_mode, t
             for y in range(top, bottom + 1):
                 if rights[y] < lefts[y]:
                     continue
-                chunks = (rights[y] - lefts[y] + LANES) // LANES
+                x, chunks = _chunks(lefts[y], rights[y], False)
                 dy = F32(y - my)
                 power_y = fall_y * dy * dy
-                x = min(lefts[y], I32(TILE_WIDTH - chunks * LANES))
                 for _ in range(chunks):
                     i = y * TILE_WIDTH + x
                     dx = simd.counting_from(I32(x - wholes[y])) - rests[y]
