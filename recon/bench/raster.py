@@ -246,7 +246,7 @@ def run(
 ) -> int:
     """Measure, print, and write raster.csv, raster.json and raster.png to the folder `out`; returns an exit code.
 
-    gate: return 1 when a ratio is below its floor or fell behind the committed baseline.
+    gate: return 1 when a ratio is below its floor or fell behind the committed baseline, twice in a row.
     repeats: rounds of the largest size; smaller ones get more.
     with_fit: measure the toy fit of :mod:`recon.bench.toy` too. rebase: make this run the baseline.
     """
@@ -258,10 +258,16 @@ def run(
     warmup()
     rows: list[dict[str, Any]] = []
     print("   size              C  back end    forward     total       min  x torch  peak MB  x bound")
+    baseline = read_json(record.baseline_path("raster"))["figures"] if gate and not rebase else {}
     for size, c in counted(list(itertools.product(scenes, channels)), "rasterizer", "size"):
         # small scenes are measured more often: a median over a second says little about a machine that others use
         rounds = repeats * max(1, round(math.sqrt(SIZES[-1][2] / size[2])))
-        for row in measure(size, c, rounds, names):
+        measured = measure(size, c, rounds, names)
+        if gate and (problems := fallen_behind(measured, baseline)):
+            # a slower renderer is slow both times, a machine that was busy for a while is not
+            say(f"measured again, because of {'; '.join(problems)}")
+            measured = measure(size, c, rounds, names)
+        for row in measured:
             rows.append(row)
             say(
                 f"{row['width']:4}x{row['height']:<4}{row['gaussians']:7} {c:4}  {row['backend']:7}"
@@ -273,11 +279,10 @@ def run(
     _plot(out, rows)
     if rebase:
         record.save_baseline("raster", {_key(row): row["times_torch"] for row in rows if row["backend"] == "cpu"})
-    baseline = read_json(record.baseline_path("raster"))["figures"] if gate else {}
-    problems = fallen_behind(rows, baseline)
+    problems = fallen_behind(rows, baseline) if gate else []
     for problem in problems:
         print("behind:", problem)
-    return 1 if gate and problems else 0
+    return 1 if problems else 0
 
 
 def _toy_fit() -> dict[str, float]:

@@ -20,7 +20,8 @@ from recon.raster.cpu import kernels, lists
 from recon.raster.cpu import project as projection
 from recon.raster.rendering import Settings, Splats
 
-GAUSSIANS_PER_PART = 1024  # fixed, so that sums over parts do not depend on the threads
+# fixed, so that sums over parts do not depend on the threads; fewer are done sooner than another thread is woken
+GAUSSIANS_PER_PART = 2048
 logger = logging.getLogger("recon.raster")
 
 DEPTH_MODES = {None: kernels.NO_DEPTH, "accumulated": kernels.ACCUMULATED, "expected": kernels.EXPECTED}
