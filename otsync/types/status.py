@@ -60,6 +60,10 @@ class Status(StrEnum):
         "The tracks leave the pose between the videos loose: they lie on a line, close together, or agree badly. Track "
         "more of the scene, or use longer clips."
     )
+    CONTRADICTED = (
+        "The photometric fit moved this clock by more than three sigmas of what tracks and pictures say together: one "
+        "of them is wrong. Fit longer (--steps), or keep the clock of the tracks (--freeze offsets)."
+    )
     MISPLACED = (
         "The camera of this video may stand elsewhere than the scene says: its calibration is doubtful, or most of its "
         "pairs are. Look at calibration in scene.json (otsync calibrate says what to film), run otsync check, or leave "

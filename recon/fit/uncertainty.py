@@ -6,7 +6,9 @@ At the end of a fit each frame of a video proposes one Gauss-Newton step of that
 
 with the residuals r of its pixels. Pixels of one frame err together (a wrong shape, a highlight), frames further apart
 much less: so frames, not pixels, are taken as independent (a sandwich estimate, White 1980). What the frames agree on
-beyond the answer is a bias that the fit did not follow, and is added. The motion is held, so this is a lower bound.
+beyond the answer is a bias that the fit did not follow, and is added. The motion is held, so this is a lower bound:
+what a short fit has not settled yet is added too (:func:`unsettled`), and the clock that the fit began with, where it
+has a sigma of its own, is the other witness (:func:`reconciled`).
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ Look = Callable[[int, int, float], Tensor]
 Target = Callable[[int, int], Tensor]
 
 FRAMES = 12
+CONTRADICTION = 3.0  # sigmas between two answers, from which one of them is wrong
 STEP = 0.1  # frames between the instants of the central difference, half
 
 
@@ -54,6 +57,44 @@ def newton_sigma(
     sigma = np.sqrt(variance + variance[reference])
     sigma[reference] = 0.0
     return sigma
+
+
+def unsettled(history: np.ndarray, reference: int) -> np.ndarray:
+    """[V] how far each offset, relative to the reference's, still moved in the last third of a fit.
+
+    Args:
+        history: (R,1+V) rows of (step, offsets in seconds), the last one at the end; nan where it has fewer than two.
+    """
+    if len(history) < 2:
+        return np.full(history.shape[1] - 1, np.nan)
+    relative = history[:, 1:] - history[:, 1 + reference, None]
+    late = relative[history[:, 0] >= 2 / 3 * history[-1, 0]]
+    return np.abs(late - relative[-1]).max(0)
+
+
+def reconciled(
+    start: np.ndarray, start_sigma: np.ndarray, fitted: np.ndarray, fitted_sigma: np.ndarray, reference: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Two witnesses of each offset, tracks and pictures: (offset, sigma, whether they contradict each other), [V] each.
+
+    They are averaged by their variances; sigma grows by their discord (Birge's ratio). Beyond CONTRADICTION sigmas one
+    of them is wrong, nobody can say which, and sigma covers both. A start without a sigma, or with none (0: it was
+    declared, not measured), is no witness: the fit's answer stands.
+
+    Args:
+        start, fitted: seconds relative to the reference's, whose entries are returned as they are.
+    """
+    known = np.isfinite(start_sigma) & (start_sigma > 0) & np.isfinite(fitted_sigma)
+    known[reference] = False
+    before = np.where(known, start_sigma, 1.0) ** 2
+    after = np.where(known, fitted_sigma, 1.0) ** 2
+    gap = fitted - start
+    discord = np.square(gap) / (before + after)
+    contradicted = known & (discord > CONTRADICTION**2)
+    variance = before * after / (before + after) * np.maximum(1.0, discord)
+    variance = np.where(contradicted, variance + np.square(gap), variance)
+    offset = np.where(known, start + gap * before / (before + after), fitted)
+    return offset, np.where(known, np.sqrt(variance), fitted_sigma), contradicted
 
 
 def sandwich(g: np.ndarray, h: np.ndarray) -> float:

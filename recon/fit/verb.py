@@ -19,16 +19,19 @@ from os import PathLike
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 from tqdm import tqdm
 
 from otsync.compute.threads import MapLike
 from otsync.progress import Deadline, is_quiet
-from otsync.types import Offsets
+from otsync.types import Offsets, Status
+from otsync.types.status import in_order
 from recon.fit.checkpoint import Checkpoint
 from recon.fit.options import FitOptions
 from recon.fit.problem import Problem, assemble, check_groups
 from recon.fit.run import Diverged, Run
+from recon.fit.uncertainty import reconciled, unsettled
 from recon.fit.undisturbed import one_thread_each, uninterrupted
 from recon.footage.footage import Footage
 from recon.observe.effects import initial_parameters
@@ -69,7 +72,8 @@ class Reconstruction:
 
     Args:
         scene: asked for any world time by ``scene.at(t)``.
-        offsets: the videos' clocks, refined where "offsets" had a rate; sigma from the frames' own votes.
+        offsets: the videos' clocks, refined where "offsets" had a rate; sigma from the frames' own votes, from what was
+            not settled yet, and from the sigma of the clocks that the fit began with.
         parameters: of the effects, by group.
         history: convergence. stats: steps, seconds, images, loss, psnr, gaussians.
     """
@@ -192,13 +196,22 @@ def _finish(run: Run, seconds: float) -> Reconstruction:
     values = {n: v.detach() for n, v in run.values().items()}
     scene = assemble(run.scene, values)
     refined = values["offsets"].cpu().numpy()
-    sigma = run.sigma(values) if "offsets" in run.adam.groups else p.offsets.sigma[p.index]
     drift = float(refined[p.reference] - p.start[p.reference])
-    scene = replace(scene, motion=scene.motion.shifted(-drift, values["offsets"] - drift)).to("cpu")
+    refined, sigma = refined - drift, p.offsets.sigma[p.index]
+    flags = list(p.offsets.flags)
+    if "offsets" in run.adam.groups:
+        moving = unsettled(np.vstack([run.rows[:, [0, *range(4, run.rows.shape[1])]], _last_row(run)]), p.reference)
+        fitted = np.hypot(run.sigma(values), np.nan_to_num(moving))
+        refined, sigma, contradicted = reconciled(p.start, sigma, refined, fitted, p.reference)
+        for v in np.flatnonzero(contradicted):
+            flags[p.index[v]] = in_order((*flags[p.index[v]], Status.CONTRADICTED))
+    clocks = torch.as_tensor(refined).to(values["offsets"])
+    scene = replace(scene, motion=scene.motion.shifted(-drift, clocks)).to("cpu")
     offsets = replace(
         p.offsets,
-        seconds=_put(p.offsets.seconds, p.index, refined - drift),
+        seconds=_put(p.offsets.seconds, p.index, refined),
         sigma=_put(p.offsets.sigma, p.index, sigma),
+        flags=tuple(flags),
         rates=_put(p.offsets.rates, p.index, values["clock_rates"].cpu().numpy()),
     )
     history = History.of(run.rows)
@@ -213,6 +226,11 @@ def _finish(run: Run, seconds: float) -> Reconstruction:
     }
     learned = {n: values[n].cpu() for n in initial_parameters(p.effects, len(p.clips))}
     return Reconstruction(scene, offsets, learned, history, stats)
+
+
+def _last_row(run: Run) -> np.ndarray:
+    """[1,1+V] the step that was reached, and the offsets there."""
+    return np.array([[run.step, *run.values()["offsets"].detach().cpu().numpy()]])
 
 
 def _put(array: np.ndarray, index: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from ...types import Matches, TrackSet
-from .case import FLAGGED, RIGHT, TRUST, Case, cloud, near
+from .case import FLAGGED, RIGHT, Case, cloud, near
 
 N, FRAMES = 40, 150
 ALL = Matches(np.stack([np.arange(N)] * 2, 1))
@@ -27,10 +28,18 @@ def canon(later: int = 20) -> Given:
     return filmed(first, 1), filmed(second, 2), ALL
 
 
-def takes() -> Given:
-    """Two takes of one choreography at one place, with a little freedom: there is no true offset."""
-    dance, freedom = cloud(N, FRAMES, 22, 0.5), cloud(N, FRAMES, 23, 0.03)
-    return filmed(dance, 1), filmed(dance + freedom - freedom[:, :1], 2), ALL
+def takes(hurry: float = 0.1) -> Given:
+    """Two takes of one choreography at one place: nobody moves twice alike, nor keeps time better than ``hurry`` s
+    (rms; now early, now late, in turns of four seconds).
+
+    A second take with the very timing of the first, and only freedom in space, has no row: its arrays are those of one
+    take whose trackers drift, which has a true offset. No method on tracks can answer the one and flag the other.
+    """
+    dance, freedom = cloud(N, FRAMES + 30, 22, 0.5), cloud(N, FRAMES, 23, 0.03)
+    frame = np.arange(FRAMES)
+    pace = 30 * hurry * np.sqrt(2) * np.sin(2 * np.pi * 0.25 * frame / 30 + 0.7)
+    again = CubicSpline(np.arange(FRAMES + 30), dance, axis=1)(15 + frame + pace)
+    return filmed(dance[:, 15 : 15 + FRAMES], 1), filmed(again + freedom - freedom[:, :1], 2), ALL
 
 
 def drift(seed: int, size: float) -> np.ndarray:
@@ -69,8 +78,6 @@ def dropped(frames: int) -> Given:
 
 
 def rated(rate: float, frames: int) -> Given:
-    from scipy.interpolate import CubicSpline
-
     xyz = cloud(N, round(frames * rate) + 60, 29)
     b = CubicSpline(np.arange(xyz.shape[1]), xyz, axis=1)(10 + rate * np.arange(frames))
     return filmed(xyz[:, :frames], 1), filmed(b, 2), ALL
@@ -120,12 +127,11 @@ CASES: tuple[Case, ...] = (
     ),
     Case(
         "two takes of one choreography",
-        "motions agree, and places too",
+        "motions and places agree, up to a tenth of a second",
         "flagged: there is no true offset",
         takes,
         (FLAGGED,),
         check=wrong_anywhere,
-        open=TRUST,
     ),
     Case(
         "trackers that settle",

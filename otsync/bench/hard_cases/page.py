@@ -30,6 +30,7 @@ PLAIN: tuple[Callable[..., Any], ...] = (
     plain.aligning,
     plain.scanning,
     plain.graph,
+    plain.graph,
 )
 """The plain solver of every section."""
 

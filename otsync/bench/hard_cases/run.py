@@ -10,7 +10,7 @@ from typing import Any
 
 from ...progress import counted
 from ..record import table, write_rows
-from . import adversaries, aligning, epipolar, graphs, matching, rematching
+from . import adversaries, aligning, epipolar, graphs, matching, own_frames, rematching
 from .case import Case
 from .solvers import (
     SPECIAL,
@@ -23,6 +23,7 @@ from .solvers import (
     matchers,
     matching_solver,
     outcome,
+    own_frames_solver,
     refiners,
     refining_solver,
     rematchers,
@@ -75,6 +76,7 @@ def sections() -> tuple[Section, ...]:
             graphs.CASES,
             {name: graph_solver(graph) for name, graph in combinations().items()},
         ),
+        Section("Without a common frame", own_frames.CASES, {"OwnFrames": own_frames_solver}),
     )
 
 

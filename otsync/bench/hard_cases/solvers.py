@@ -26,7 +26,7 @@ from ...match import (
 )
 from ...refine import REFINERS, refine
 from ...sync import Graph, synchronize
-from ...types import Alignment, Clock, Matches, Offsets
+from ...types import Alignment, Clock, Matches, Offsets, TrackSet
 from .case import FLAGGED, REFUSED, RIGHT, Case
 
 Answer = Matches | Alignment | Offsets
@@ -71,6 +71,11 @@ def rematchers() -> dict[str, Callable[[Clock], Any]]:
 def graphs() -> dict[str, Graph]:
     """Ways to combine pairs."""
     return {"Graph": Graph(), "Graph, star": Graph(extra=0), "Graph, no curves": Graph(curves=False)}
+
+
+def own_frames_solver(tracks: list[TrackSet], _: None) -> Offsets:
+    """(tracks, None) to offsets and transforms, each video in a frame of its own."""
+    return synchronize(tracks, frames="own")
 
 
 def _objects(group: str, own: Iterable[Any]) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from recon.fit.uncertainty import newton_sigma, sandwich
+from recon.fit.uncertainty import newton_sigma, reconciled, sandwich, unsettled
 
 
 def test_sandwich_is_the_variance_of_the_weighted_step():
@@ -72,3 +72,44 @@ def test_the_reference_s_own_error_counts():
         1 / 30,
     )
     assert sigma[0] == 0 and sigma[1] == pytest.approx(0.004, rel=0.1)
+
+
+def test_two_witnesses_that_agree_are_averaged_by_their_variances():
+    start, fitted = np.array([0.0, 1.00, 2.00]), np.array([0.0, 1.02, 2.01])
+    before, after = np.array([0.0, 0.02, 0.03]), np.array([0.0, 0.02, 0.01])
+    offset, sigma, contradicted = reconciled(start, before, fitted, after, 0)
+    assert offset == pytest.approx([0, 1.01, 2.009])
+    assert sigma == pytest.approx([0, 0.02 / np.sqrt(2), 0.03 * 0.01 / np.hypot(0.03, 0.01)])
+    assert not contradicted.any()
+
+
+def test_two_witnesses_that_disagree_are_covered_and_said():
+    offset, sigma, contradicted = reconciled(
+        np.zeros(3), np.array([0, 0.1, 0.1]), np.array([0, 0.25, 0.8]), np.array([0, 0.02, 0.02]), 0
+    )
+    assert contradicted.tolist() == [False, False, True]
+    assert sigma[1] > 0.02 * 0.25 / 0.11  # wider than either of two that agree would make it
+    assert abs(offset[2] - 0.0) <= sigma[2] and abs(offset[2] - 0.8) <= sigma[2]
+
+
+@pytest.mark.parametrize("sigma", [0.0, np.nan, np.inf])
+def test_a_start_without_a_sigma_is_no_witness(sigma):
+    before, after, fitted = np.array([0, sigma]), np.array([0, 0.01]), np.array([0, 5.0])
+    offset, found, contradicted = reconciled(np.zeros(2), before, fitted, after, 0)
+    assert offset.tolist() == fitted.tolist() and found.tolist() == after.tolist() and not contradicted.any()
+
+
+def test_witnesses_cover_the_truth_as_often_as_they_say():
+    rng = np.random.default_rng(0)
+    before, after = rng.uniform(0.02, 0.1, 4000), rng.uniform(0.02, 0.1, 4000)
+    start, fitted = before * rng.normal(size=4000), after * rng.normal(size=4000)
+    offset, sigma, contradicted = reconciled(start, before, fitted, after, 0)
+    inside = np.abs(offset[1:]) < sigma[1:]
+    assert 0.68 <= inside.mean() < 0.8  # discord can only widen it
+    assert contradicted.mean() < 0.01
+
+
+def test_what_still_moved_is_told():
+    history = np.array([[0, 0, 0], [60, 0.0, 0.5], [70, 0.1, 0.9], [100, 0.1, 1.0]])
+    assert unsettled(history, 0) == pytest.approx([0, 0.1])
+    assert np.isnan(unsettled(history[:1], 0)).all()
