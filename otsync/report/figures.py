@@ -85,7 +85,7 @@ def score_figure(pair: Alignment, path: np.ndarray | None, origin: float, truth:
 
 
 def cost_figure(pair: Alignment, cost: np.ndarray, path: np.ndarray | None, origin: float, truth: float | None) -> str:
-    """The frame-to-frame cost with the warping path and the chosen offset."""
+    """The frame-to-frame cost with the chosen offset, and the warping path where the pair has one."""
     figure, ax = axes_of()
     step = max(1, -(-max(cost.shape) // MAP_PIXELS))
     extent = (-0.5, cost.shape[1] - 0.5, cost.shape[0] - 0.5, -0.5)

@@ -8,6 +8,8 @@ from html import escape
 
 import numpy as np
 
+from ..align.warping import geometric_cost
+from ..clocks.common import common_clock
 from ..types import Alignment, Matches, Offsets, TrackSet, Video
 from ..types.drawing import shared_moment
 from . import figures
@@ -163,7 +165,10 @@ def _on_frames(seen: Seen, tracks: Sequence[TrackSet], videos: Sequence[Video]) 
 def _cost_map(
     pair: Alignment, key: tuple[int, int], matches: Mapping[tuple[int, int], Matches], tracks: Sequence[TrackSet] | None
 ) -> tuple[np.ndarray | None, np.ndarray | None, float]:
-    """The pair's own cost map and path, or the paper's made from tracks and matches; and the offset of lag 0."""
+    """The pair's own cost map and path, or D_geo made from tracks and matches; and the offset of lag 0.
+
+    No path is made where the pair has none: it did not tell the answer, and tslearn compiles for seconds.
+    """
     if tracks is None or key not in matches or len(matches[key]) == 0:
         return pair.cost, pair.path, 0.0
     if pair.transform is not None:  # positions are in two frames
@@ -174,7 +179,4 @@ def _cost_map(
         return pair.cost, pair.path, origin
     if tracks[i].xyz is None or tracks[j].xyz is None:  # D_geo is of positions
         return None, None, origin
-    from ..align.warping import DTW
-
-    paper = DTW()(tracks[i], tracks[j], matches[key])
-    return paper.cost, paper.path, origin
+    return geometric_cost(common_clock(tracks[i], tracks[j], matches[key]), "position"), None, origin
