@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...types import Matches, Offsets, TrackSet
-from . import case, epipolar, graphs, rematching
+from . import case, epipolar, graphs, own_frames, rematching
 from .case import cloud
 from .run import sections
 from .solvers import SPECIAL
@@ -33,12 +33,13 @@ DRAWS: tuple[Callable[[int], tuple[Any, ...]], ...] = (
     shifted,
     lambda seed: epipolar.videos(seed=seed),
     lambda seed: graphs.given(graphs.videos(seed=seed)),
+    lambda seed: own_frames.seen(seed=seed)(),
 )
 """An easy input of every section's slot."""
 
 
 def draws() -> Iterator[tuple[str, str, bool]]:
-    """(section, solver, whether it flags) for every slot, solver and seed; 48 inputs."""
+    """(section, solver, whether it flags) for every slot, solver and seed; 56 inputs."""
     for section, draw in zip(sections(), DRAWS, strict=True):
         for seed in SEEDS:
             given = draw(seed)

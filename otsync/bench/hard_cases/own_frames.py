@@ -23,10 +23,10 @@ Given = tuple[list[TrackSet], None]
 
 
 @cache
-def world(motion: str = "softball", preset: str = "clean", videos: int = 2, **how: Any) -> tuple[Any, Any]:
+def world(motion: str = "softball", preset: str = "clean", videos: int = 2, seed: int = 21) -> tuple[Any, Any]:
     """(track sets, truth) of one simulated scene."""
     late = LATE[:videos]
-    return simulate(motion, preset=preset, videos=videos, offsets=late, own_frames=True, seed=21, **how)
+    return simulate(motion, preset=preset, videos=videos, offsets=late, own_frames=True, seed=seed)
 
 
 def seen(*, of: Callable[[TrackSet], TrackSet] = lambda t: t, both: bool = False, **how: Any) -> Callable[[], Given]:

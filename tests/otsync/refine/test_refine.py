@@ -145,6 +145,17 @@ def test_wrong_matches_lose_their_weight():
     assert found.stats["effective_matches"] < 20
 
 
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_tracks_that_fit_three_times_worse_hardly_count(seed):
+    """Their weight falls with the fourth power of what they are off: less than by their variance."""
+    a, b, m = films(seed, n=24, noise=0.01)
+    worse = b.xyz.copy()
+    worse[:8] += 0.04 * np.random.default_rng(seed).normal(size=worse[:8].shape)
+    found = refine(a, dataclasses.replace(b, xyz=worse), m, near(0.3), throw=False)
+    assert found.offset == pytest.approx(0.3, abs=0.04 / 30)
+    assert 15 < found.stats["effective_matches"] < 18.5
+
+
 def test_gaps_are_never_bridged():
     """Samples inside gaps are garbage; the answer must not see them."""
     a, b, m = films(noise=0.002)
