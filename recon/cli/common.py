@@ -75,7 +75,7 @@ def reconstructed(
 ) -> int:
     """Prepare, fit, evaluate, write, and print the outcome; the exit code."""
     from otsync.files.cache import Cache
-    from otsync.types import Offsets
+    from otsync.types import Offsets, Status
     from recon.pipeline.verb import reconstruct
     from recon.result.folder import metrics_of
     from recon.result.page import SCENE_PAGE
@@ -112,4 +112,8 @@ def reconstructed(
         print(wrote)
     if doubtful:
         print(f"begun from offsets that are not to be trusted: {', '.join(doubtful)}", file=sys.stderr)
-    return 1 if doubtful or outcome.left_out else 0
+    fitted = outcome.fitted.offsets
+    contradicted = [n for n, flags in zip(fitted.names, fitted.flags, strict=True) if Status.CONTRADICTED in flags]
+    for name in contradicted:
+        print(f"{name}: {Status.CONTRADICTED.code}: {Status.CONTRADICTED}", file=sys.stderr)
+    return 1 if doubtful or contradicted or outcome.left_out else 0

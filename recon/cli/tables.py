@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 def offset_rows(outcome: Outcome) -> list[dict[str, Any]]:
-    """Offsets before and after, their sigma, and truth and error where it is known: in frames of the reference."""
+    """Offsets before and after in frames of the reference, their sigma and status, and error where truth is known."""
     offsets, true = outcome.fitted.offsets, outcome.truth
     fps = float(offsets.fps[offsets.reference])
     rows = []
@@ -18,6 +18,7 @@ def offset_rows(outcome: Outcome) -> list[dict[str, Any]]:
         row: dict[str, Any] = {"video": name, "reference": v == offsets.reference}
         row |= {"before": float(outcome.coarse.frames[v]), "after": float(offsets.frames[v])}
         row["sigma"] = float(offsets.sigma[v]) * fps
+        row["status"] = offsets.status[v].code
         if true is not None:
             row |= {"true": float(true[v]) * fps, "error": float(offsets.frames[v]) - float(true[v]) * fps}
         rows.append(row)
@@ -33,10 +34,11 @@ def offset_table(outcome: Outcome) -> str:
         (k, w) for k, w in (("before", 9), ("after", 9), ("sigma", 8), ("true", 9), ("error", 8)) if k in rows[0]
     ]
     width = max(5, *(len(row["video"]) for row in rows))
-    lines = [f"{'video':{width}} " + "".join(f" {k:>{w}}" for k, w in columns) + "   (frames of the reference)"]
+    lines = [f"{'video':{width}} " + "".join(f" {k:>{w}}" for k, w in columns) + "  status   (frames of the reference)"]
     for row in rows:
         cells = [f"{row[k]:{w}.3f}" if np.isfinite(row[k]) else "–".rjust(w) for k, w in columns]
-        lines.append(f"{row['video']:{width}}  {' '.join(cells)}" + ("  reference" if row["reference"] else ""))
+        status = "reference" if row["reference"] else row["status"]
+        lines.append(f"{row['video']:{width}}  {' '.join(cells)}  {status}")
     return "\n".join(lines)
 
 

@@ -63,13 +63,21 @@ def unsettled(history: np.ndarray, reference: int) -> np.ndarray:
     """[V] how far each offset, relative to the reference's, still moved in the last third of a fit.
 
     Args:
-        history: (R,1+V) rows of (step, offsets in seconds), the last one at the end; nan where it has fewer than two.
+        history: (R,1+V) rows of (step, offsets in seconds) in order, the first one at the start, the last at the end.
     """
-    if len(history) < 2:
-        return np.full(history.shape[1] - 1, np.nan)
     relative = history[:, 1:] - history[:, 1 + reference, None]
-    late = relative[history[:, 0] >= 2 / 3 * history[-1, 0]]
-    return np.abs(late - relative[-1]).max(0)
+    early = np.flatnonzero(history[:, 0] <= 2 / 3 * history[-1, 0])  # the start is always among them
+    return np.abs(relative[early[-1] :] - relative[-1]).max(0)
+
+
+def relative_sigma(sigma: np.ndarray, reference: int) -> np.ndarray:
+    """[V] sigma of offsets against the reference of a fit, which need not be the one that they were measured against.
+
+    Where it is not, the reference's own error counts; errors are taken as independent.
+    """
+    relative = np.hypot(sigma, sigma[reference])
+    relative[reference] = 0.0
+    return relative
 
 
 def reconciled(
@@ -83,6 +91,7 @@ def reconciled(
 
     Args:
         start, fitted: seconds relative to the reference's, whose entries are returned as they are.
+        start_sigma, fitted_sigma: one standard deviation of each, in seconds.
     """
     known = np.isfinite(start_sigma) & (start_sigma > 0) & np.isfinite(fitted_sigma)
     known[reference] = False

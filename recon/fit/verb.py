@@ -31,7 +31,7 @@ from recon.fit.checkpoint import Checkpoint
 from recon.fit.options import FitOptions
 from recon.fit.problem import Problem, assemble, check_groups
 from recon.fit.run import Diverged, Run
-from recon.fit.uncertainty import reconciled, unsettled
+from recon.fit.uncertainty import reconciled, relative_sigma, unsettled
 from recon.fit.undisturbed import one_thread_each, uninterrupted
 from recon.footage.footage import Footage
 from recon.observe.effects import initial_parameters
@@ -200,9 +200,10 @@ def _finish(run: Run, seconds: float) -> Reconstruction:
     refined, sigma = refined - drift, p.offsets.sigma[p.index]
     flags = list(p.offsets.flags)
     if "offsets" in run.adam.groups:
-        moving = unsettled(np.vstack([run.rows[:, [0, *range(4, run.rows.shape[1])]], _last_row(run)]), p.reference)
-        fitted = np.hypot(run.sigma(values), np.nan_to_num(moving))
-        refined, sigma, contradicted = reconciled(p.start, sigma, refined, fitted, p.reference)
+        moving = unsettled(_offsets_by_step(run, values["offsets"].cpu().numpy()), p.reference)
+        fitted = np.hypot(run.sigma(values), moving)
+        before = relative_sigma(sigma, p.reference)
+        refined, sigma, contradicted = reconciled(p.start, before, refined, fitted, p.reference)
         for v in np.flatnonzero(contradicted):
             flags[p.index[v]] = in_order((*flags[p.index[v]], Status.CONTRADICTED))
     clocks = torch.as_tensor(refined).to(values["offsets"])
@@ -228,9 +229,10 @@ def _finish(run: Run, seconds: float) -> Reconstruction:
     return Reconstruction(scene, offsets, learned, history, stats)
 
 
-def _last_row(run: Run) -> np.ndarray:
-    """[1,1+V] the step that was reached, and the offsets there."""
-    return np.array([[run.step, *run.values()["offsets"].detach().cpu().numpy()]])
+def _offsets_by_step(run: Run, reached: np.ndarray) -> np.ndarray:
+    """[R,1+V] (step, offsets): where they began, the rows of the history, and what was reached."""
+    recorded = np.delete(run.rows, [1, 2, 3], axis=1)
+    return np.vstack([[0, *run.problem.start], recorded, [run.step, *reached]])
 
 
 def _put(array: np.ndarray, index: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -16,8 +16,11 @@ from .case import FLAGGED, RIGHT, SOUND, Case
 LATE = (0.0, 0.4, -0.3)
 """Seconds that the videos start later than the first."""
 
-FRAME, TURN = 1 / 30, 6.0
-"""Seconds and degrees (or four sigmas, where more) beyond which an answer without a flag is wrong."""
+FRAME, TURN, SCALE = 1 / 30, 6.0, 0.09
+"""Seconds, degrees and share of the scale (or four sigmas, where more) beyond which a trusted answer is wrong."""
+
+LARGER = 1000.0
+"""How many times as large as in metres a video in millimetres is."""
 
 Given = tuple[list[TrackSet], None]
 
@@ -39,12 +42,13 @@ def seen(*, of: Callable[[TrackSet], TrackSet] = lambda t: t, both: bool = False
     return made
 
 
-def right(**how: Any) -> Callable[[Offsets], np.ndarray]:
-    """Which videos have their offset and their rotation."""
+def right(larger: float = 1.0, **how: Any) -> Callable[[Offsets], np.ndarray]:
+    """Which videos have their offset, their rotation and their scale; the last video is so many times as large."""
 
     def check(found: Offsets) -> np.ndarray:
         truth = world(**how)[1]
         ok = []
+        size = np.r_[np.ones(len(found) - 1), larger]
         for v, S in enumerate(found.transforms):
             true: Similarity = truth.transform(found.reference, v)
             late = LATE[v] - LATE[found.reference]
@@ -52,6 +56,7 @@ def right(**how: Any) -> Callable[[Offsets], np.ndarray]:
                 S is not None
                 and abs(found.seconds[v] - late) <= FRAME
                 and S.degrees_from(true) <= max(TURN, 4 * S.rotation_sigma)
+                and abs(np.log(S.scale * size[v] / size[found.reference] / true.scale)) <= max(SCALE, 4 * S.scale_sigma)
             )
         return np.array(ok)
 
@@ -64,7 +69,7 @@ def noisy_features(t: TrackSet) -> TrackSet:
 
 
 def enlarged(t: TrackSet) -> TrackSet:
-    return replace(t, xyz=1000 * t.positions())
+    return replace(t, xyz=LARGER * t.positions())
 
 
 def mirrored(t: TrackSet) -> TrackSet:
@@ -136,7 +141,7 @@ CASES: tuple[Case, ...] = (
         "scale is found, not assumed",
         seen(of=enlarged),
         (RIGHT,),
-        check=right(),
+        check=right(larger=LARGER),
     ),
     Case(
         "noisy tracks of one preset harder",

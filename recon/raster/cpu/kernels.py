@@ -256,9 +256,10 @@ def forward(first, last, tile_lists, features, n_channels, depth_mode, tiling, o
                             j = i + (c + 1) * PLANE
                             simd.store(planes, j, simd.load(planes, j) + weight * features[rank * n_channels + c])
                     x += LANES
-        for chunk in range(CHUNKS):
-            _add_channels(planes, features, n_channels, weights, waiting, chunk, counts[chunk])
-            counts[chunk] = 0
+        if queued:
+            for chunk in range(CHUNKS):
+                _add_channels(planes, features, n_channels, weights, waiting, chunk, counts[chunk])
+                counts[chunk] = 0
         _store_tile(planes, drawn_last, pixel, wide, tall, tiling[0], n_channels, depth_mode, outputs)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from recon.fit.uncertainty import newton_sigma, reconciled, sandwich, unsettled
+from recon.fit.uncertainty import newton_sigma, reconciled, relative_sigma, sandwich, unsettled
 
 
 def test_sandwich_is_the_variance_of_the_weighted_step():
@@ -111,5 +111,12 @@ def test_witnesses_cover_the_truth_as_often_as_they_say():
 
 def test_what_still_moved_is_told():
     history = np.array([[0, 0, 0], [60, 0.0, 0.5], [70, 0.1, 0.9], [100, 0.1, 1.0]])
-    assert unsettled(history, 0) == pytest.approx([0, 0.1])
-    assert np.isnan(unsettled(history[:1], 0)).all()
+    assert unsettled(history, 0) == pytest.approx([0, 0.5])  # since the last row of the first two thirds
+    assert unsettled(history[[0, -1]], 0) == pytest.approx([0, 0.9])  # nothing between is known: all the way counts
+
+
+def test_a_start_relative_to_another_video_brings_the_references_error():
+    sigma = np.array([0.03, 0.0, 0.04])
+    assert relative_sigma(sigma, 1).tolist() == sigma.tolist()
+    assert relative_sigma(sigma, 0) == pytest.approx([0, 0.03, 0.05])
+    assert np.isnan(relative_sigma(np.array([np.nan, 0.1]), 1)[0])
