@@ -11,6 +11,7 @@ import warnings
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from ..compute.indices import evenly
 from ..costs.linear import cosine_distance, unit_features
@@ -41,9 +42,18 @@ more (24 pairs; 10 each of the others)."""
 
 AS_LITTLE_LEFT, LITTLE = 1.3, 0.02
 """Times as much of the motion may be left unexplained at another time as at the answer, and a share beside it, if it is
-to suit as well. Left at the answer and at the best of the near times: carousels .00 and .01, exact loops .02 and .02 to
-.06 and .06, belts .00 and .02; noisy tracks that are near by chance .03 and .39 (mid), .07 and .14 (hard), .24 and 1.2
-(brutal). Seeds below 10."""
+to suit as well, unless the tracks are sure (:data:`SURE`) that it does not. Left at the answer and at the best of the
+near times: carousels .00 and .01, exact loops .02 and .02 to .06 and .06, belts .00 and .02; noisy tracks that are near
+by chance .03 and .39 (mid), .07 and .14 (hard), .24 and 1.2 (brutal). Seeds below 10."""
+
+SURE = 3.5
+"""Standard errors of the mean logarithm, over the tracks, of what is left there over what is left here, from which the
+other time suits worse, however little: noisy tracks leave much at any time. Carousels, exact loops and belts, where
+more than :data:`LITTLE` is added (mid to brutal, 60 worlds): at most 3.0, and one of 5.6 that other flags refuse;
+brutal tracks 1.5 to 33 (28 worlds below 600)."""
+
+RESTING = 0.25
+"""Share of the matched tracks that move least: these suit any time, and are not asked what is left."""
 
 MOST_TRIED = 8
 """Times whose motion is looked at, the nearest ones."""
@@ -72,12 +82,8 @@ def rival(a: TrackSet, b: TrackSet, matches: Matches, offset: float) -> Rival:
     Distances are those of the nearest :data:`NEAREST` of the tracks: others may show what the other video does not see.
     Positions are in one declared world frame; both sets have features.
     """
-    some = np.unique(matches.best(max((len(matches) + 1) // 2, FEWEST)).pairs[:, 0])
-    with np.errstate(invalid="ignore"), warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # of tracks that are never seen
-        moved = np.nan_to_num(np.nanstd(a.positions()[some], 1).sum(1))
-    some = some[moved >= np.median(moved)]  # what rests is as near at any time
-    some = some[evenly(len(some), TRACKS)]
+    best = np.unique(matches.best(max((len(matches) + 1) // 2, FEWEST)).pairs[:, 0])
+    some = _moving(a, best, 0.5)  # what rests is as near at any time
     assert a.features is not None and b.features is not None
     fa, fb = unit_features(a.features, center=True), unit_features(b.features, center=True)
     likely = np.argsort(cosine_distance(fa[some], fb), 1, kind="stable")[:, :PARTNERS]
@@ -90,10 +96,19 @@ def rival(a: TrackSet, b: TrackSet, matches: Matches, offset: float) -> Rival:
         return Rival(math.inf, False)
     ratio = apart / here
     near = [at for at, r in sorted(zip(others, ratio, strict=True), key=lambda x: x[1]) if r < AS_GOOD][:MOST_TRIED]
-    allowed = AS_LITTLE_LEFT * _left(xa, xb, a.times, b.times, offset) + LITTLE if near else 0.0
-    # a share that nobody can tell (nan) speaks for nobody: the time counts as good
-    as_good = any(not _left(xa, xb, a.times, b.times, at) > allowed for at in near)
+    asked = a.positions()[_moving(a, np.unique(matches.pairs[:, 0]), RESTING)] if near else xa
+    left = Left.at(asked, xb, a.times, b.times, offset)
+    as_good = any(not Left.at(asked, xb, a.times, b.times, at).worse_than(left) for at in near)
     return Rival(float(np.nanmin(ratio)), as_good)
+
+
+def _moving(a: TrackSet, index: Int[np.ndarray, " M"], resting: float) -> Int[np.ndarray, " N"]:
+    """Of the tracks of ``index``, up to :data:`TRACKS` of those that move more than a share ``resting`` of them."""
+    with np.errstate(invalid="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # of tracks that are never seen
+        moved = np.nan_to_num(np.nanstd(a.positions()[index], 1).sum(1))
+    index = index[moved >= np.quantile(moved, resting)]
+    return index[evenly(len(index), TRACKS)]
 
 
 def _common_moments(ta: np.ndarray, tb: np.ndarray, offset: float) -> tuple[np.ndarray, np.ndarray] | None:
@@ -128,32 +143,60 @@ def _mean_square(x: np.ndarray, axis: int = 2) -> np.ndarray:
     return np.where(count >= LEAST_SEEN, np.where(seen, square, 0.0).sum(axis) / np.maximum(count, 1), np.inf)
 
 
-def _left(xa: np.ndarray, xb: np.ndarray, ta: np.ndarray, tb: np.ndarray, offset: float) -> float:
-    """Share of the motion of a's tracks and of their nearest partners that the two do not have in common; nan where too
-    little is common. All tracks may be partners: features that are noise leave out the right ones.
+@dataclass(frozen=True, eq=False)
+class Left:
+    """Of the motion of tracks and of their nearest partners at some time: all of it, and what the two do not have in
+    common; variances of every track, nan where too little of it is seen.
+
+    All tracks may be partners: features that are noise leave out the right ones.
     """
-    common = _common_moments(ta, tb, offset)
-    if common is None:
-        return math.nan
-    at, with_b = common
-    a, b = xa[:, at], xb[:, with_b]
-    rows = max(1, AT_ONCE // max(b.shape[0] * b.shape[1], 1))
-    parts = [_mean_square(a[i : i + rows, None] - b) for i in range(0, len(a), rows)]
-    apart = np.concatenate(parts)
-    partner = apart.argmin(1)
-    known = np.isfinite(apart[np.arange(len(a)), partner])
-    if known.sum() < LEAST_SEEN:
-        return math.nan
-    u, v = a[known], b[partner[known]]
-    seen = np.isfinite(u[..., 0]) & np.isfinite(v[..., 0])
-    power, left = (float(_variance(x, seen)) for x in (np.concatenate([u, v], -1), u - v))
-    return left / power if power > 0 else math.nan
+
+    power: Float[np.ndarray, " N"]
+    left: Float[np.ndarray, " N"]
+
+    @classmethod
+    def at(cls, xa: np.ndarray, xb: np.ndarray, ta: np.ndarray, tb: np.ndarray, offset: float) -> Left:
+        """At an offset between the videos."""
+        unknown = np.full(len(xa), np.nan)
+        common = _common_moments(ta, tb, offset)
+        if common is None:
+            return cls(unknown, unknown)
+        at, with_b = common
+        a, b = xa[:, at], xb[:, with_b]
+        rows = max(1, AT_ONCE // max(b.shape[0] * b.shape[1], 1))
+        apart = np.concatenate([_mean_square(a[i : i + rows, None] - b) for i in range(0, len(a), rows)])
+        partner = apart.argmin(1)
+        known = np.isfinite(apart[np.arange(len(a)), partner])
+        u, v = a, b[partner]
+        seen = np.isfinite(u[..., 0]) & np.isfinite(v[..., 0])
+        power = _variance(u, seen) + _variance(v, seen)
+        return cls(np.where(known, power, np.nan), np.where(known, _variance(u - v, seen), np.nan))
+
+    def worse_than(self, other: Left) -> bool:
+        """Whether more is left than at another time, by much or for sure. What nobody can tell is not worse."""
+        both = np.isfinite(self.power) & np.isfinite(other.power)
+        if both.sum() < LEAST_SEEN:
+            return False
+        mine, others = self._share(both), other._share(both)
+        if not mine > others + LITTLE:
+            return False
+        if mine > AS_LITTLE_LEFT * others + LITTLE:
+            return True
+        with np.errstate(invalid="ignore", divide="ignore"):
+            more = np.log(self.left[both] / self.power[both]) - np.log(other.left[both] / other.power[both])
+        more = more[np.isfinite(more)]
+        return len(more) >= LEAST_SEEN and float(more.mean()) > SURE * float(more.std(ddof=1)) / math.sqrt(len(more))
+
+    def _share(self, tracks: np.ndarray) -> float:
+        """Of the motion of some tracks, taken together; nan where none moves."""
+        power = float(self.power[tracks].sum())
+        return float(self.left[tracks].sum()) / power if power > 0 else math.nan
 
 
-def _variance(x: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Of every track over the moments that are seen, summed over coordinates and tracks."""
+def _variance(x: Float[np.ndarray, "N S 3"], seen: np.ndarray) -> Float[np.ndarray, " N"]:
+    """Of every track over the moments that are seen, summed over coordinates."""
     count = np.maximum(seen.sum(1), 1)
     filled = np.where(seen[..., None], x, 0.0)
     mean = filled.sum(1) / count[:, None]
     apart = np.where(seen[..., None], x - mean[:, None], 0.0)
-    return np.asarray(((apart**2).sum((1, 2)) / count).sum())
+    return np.asarray((apart**2).sum((1, 2)) / count)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from otsync import match, synchronize
-from otsync.align.rivals import rival
+from otsync.align.rivals import Left, rival
 from otsync.simulate import PRESETS, simulate
 from otsync.simulate.effects import SharedDrift, Transient
 from otsync.types import Status
@@ -39,3 +40,22 @@ def test_noisy_tracks_that_are_near_by_chance_at_another_time_are_no_rival(prese
     (a, b), truth = simulate("juggle", preset=preset, videos=2, offsets=[0.0, 0.4], seed=seed)
     found = rival(a, b, match(a, b, throw=False), float(truth.offsets[1]))
     assert found.ratio < 1 and not found.as_good
+
+
+def test_a_little_more_that_all_tracks_say_is_worse_and_a_little_more_that_some_say_is_not():
+    rng = np.random.default_rng(0)
+    power, here = np.ones(80), rng.uniform(0.1, 0.3, 80)
+    everywhere = here * rng.normal(1.2, 0.1, 80)
+    for_some = here * np.where(np.arange(80) < 40, 1.9, 0.5)
+    assert Left(power, everywhere).worse_than(Left(power, here))
+    assert not Left(power, for_some).worse_than(Left(power, here))
+    assert not Left(power, here).worse_than(Left(power, everywhere))
+    assert Left(power, 2 * for_some).worse_than(Left(power, here))  # by much: nobody needs to be asked one by one
+
+
+def test_what_nobody_can_tell_is_not_worse():
+    known = Left(np.ones(20), np.full(20, 0.1))
+    unknown = Left(np.full(20, np.nan), np.full(20, np.nan))
+    assert not unknown.worse_than(known) and not known.worse_than(unknown)
+    still = Left(np.zeros(20), np.zeros(20))
+    assert not still.worse_than(known)

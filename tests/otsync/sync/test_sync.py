@@ -197,7 +197,7 @@ def test_rates_of_long_clips_are_fitted_over_the_graph():
     np.testing.assert_allclose(found.rates, [1, 1.001, 1], atol=1.5e-4)
     assert found.rates[2] == 1.0
     np.testing.assert_allclose(found.seconds, truth.offsets, atol=0.1 / 30)
-    fixed = synchronize(tracks, matches=given)
+    fixed = synchronize(tracks, matches=given, rate="fixed")
     assert Status.RATE_MISMATCH in fixed.flags[1]
     # whichever video is chosen, the world's clock is its own
     chosen = synchronize(tracks, matches={p: m for p, m in given.items() if 1 in p}, rate="fit", reference="auto")
