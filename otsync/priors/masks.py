@@ -137,7 +137,7 @@ def typical_area(changed: Sequence[np.ndarray] | np.ndarray, unit: float, closin
     ``changed``: (h,w) a frame. Specks are removed first; ``closing``: holes are closed, too.
     """
     areas = [
-        np.sort(components(tidy(changed[int(k)], unit, 0, CLOSING if closing else 0))[:, 2])
+        np.sort(components(cleaned(changed[int(k)], unit, CLOSING if closing else 0))[:, 2])
         for k in evenly(len(changed), LOOKS)
     ]
     area = np.sort(np.concatenate([*areas, np.zeros(0)]))
@@ -159,12 +159,18 @@ def tidy(changed: Bool[np.ndarray, "h w"], unit: float, min_area: float, closing
     """
     import cv2
 
+    _, component, stats, _ = cv2.connectedComponentsWithStats(cleaned(changed, unit, closing).view(np.uint8))
+    large = stats[:, cv2.CC_STAT_AREA] > min_area * unit**2
+    large[0] = False
+    return large[component]
+
+
+def cleaned(changed: Bool[np.ndarray, "h w"], unit: float, closing: float) -> Bool[np.ndarray, "h w"]:
+    """Specks removed and holes closed, as :func:`tidy` does."""
+    import cv2
+
     def square(pixels: float) -> np.ndarray:
         return np.ones((max(1, round(pixels * unit)),) * 2, np.uint8)
 
     mask = cv2.morphologyEx(changed.astype(np.uint8), cv2.MORPH_OPEN, square(3))
-    mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, square(closing))
-    _, component, stats, _ = cv2.connectedComponentsWithStats(mask)
-    large = stats[:, cv2.CC_STAT_AREA] > min_area * unit**2
-    large[0] = False
-    return large[component]
+    return cv2.morphologyEx(mask, cv2.MORPH_CLOSE, square(closing)).view(bool)

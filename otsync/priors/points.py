@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .flow import DISFlow
+from .regions import flow_where
 from .slots import Flow, cache_key
 from .working import WorkingFrames, bilinear
 
@@ -91,7 +92,7 @@ class ChainedFlow:
             steps.append((t, ids, x))
             if t + 1 < T:
                 after = seen(t + 1)
-                there, back = self.flow.pair(now, after)
+                there, back = flow_where(self.flow, now, after, masks[t] | masks[t + 1], frames.unit)
                 size = flows.shape[3], flows.shape[2]
                 flows[t, 0] = cv2.resize(there, size, interpolation=cv2.INTER_AREA)
                 flows[t, 1] = cv2.resize(back, size, interpolation=cv2.INTER_AREA)

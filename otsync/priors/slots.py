@@ -38,7 +38,8 @@ class Tracker(Protocol):
 class Flow(Protocol):
     """The ``flow`` slot: optical flow between two frames, there and back.
 
-    One that declares ``colour = True`` gets (H,W,3) instead of grey.
+    One that declares ``colour = True`` gets (H,W,3) instead of grey; one that declares ``whole = True`` is given whole
+    images, others boxes around what moves.
     """
 
     def pair(
