@@ -15,7 +15,7 @@ from .digest import content_key
 
 log = logging.getLogger("otsync")
 
-VERSION = 1
+VERSION = 2
 """Part of every key: raise it when a prior computes something else with the same parameters."""
 
 

@@ -37,7 +37,8 @@ class MedianBackground:
         background = np.median(np.stack([frames[int(k)] for k in picks]), 0).astype(np.uint8)
         out = np.zeros((len(frames), frames.size[1], frames.size[0]), bool)
         for k in range(len(frames)):
-            out[k] = cv2.absdiff(frames[k], background).max(2) > self.threshold
+            near = cv2.inRange(cv2.absdiff(frames[k], background), (0,) * 3, (self.threshold,) * 3)
+            out[k] = near == 0  # in any channel
         return tidied(out, frames.unit, self.min_area)
 
 

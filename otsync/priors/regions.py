@@ -7,9 +7,10 @@ from jaxtyping import Bool, Float, Int
 
 from .slots import Flow
 
-MARGIN, LEAST_SIDE = 32, 160
+MARGIN, LEAST_SIDE = 16, 96
 """Pixels at 640 of width: what a box shows around what moves, and its shortest side; coarse levels of the flow need
-both. On basketball tracks lie within .05 px (median) of those in flow of the whole image."""
+both. On basketball the flow of what moves differs by .05 px (median) from that of the whole image, which is as far from
+its own way back (.14 px), and as many points go on (.95); it takes a third of the time."""
 
 COARSE = 4
 """Pixels of the cells that components are found in: a box may be so much wider."""
@@ -48,10 +49,11 @@ def boxes(moves: Bool[np.ndarray, "H W"], margin: int, least: int) -> Int[np.nda
 
     height, width = moves.shape
     coarse = np.pad(moves, [(0, -height % COARSE), (0, -width % COARSE)])
-    coarse = coarse.reshape(len(coarse) // COARSE, COARSE, -1, COARSE).any((1, 3))
+    rows = np.bitwise_or.reduce(coarse.reshape(-1, COARSE, coarse.shape[1]), 1)
+    coarse = rows.view(np.uint32) != 0  # of COARSE bytes each
     _, _, stats, _ = cv2.connectedComponentsWithStats(coarse.view(np.uint8))
     parts = COARSE * stats[1:, :4].astype(int)
-    found = [_widened(*map(int, part), margin, least, width, height) for part in parts]
+    found = [_widened(int(x), int(y), int(w), int(h), margin, least, width, height) for x, y, w, h in parts]
     joined: list[tuple[int, int, int, int]] = []
     while found:  # two that meet become one, which may meet others
         one = found.pop()
