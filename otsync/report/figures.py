@@ -29,6 +29,9 @@ MAP_PIXELS = 100
 WIDE, HIGH = 4.2, 2.4
 """Inches of a figure: at the width of a phone its letters can still be read, and two fit side by side elsewhere."""
 
+LEFT, BELOW, BESIDE, ABOVE = 0.64, 0.46, 0.08, 0.24
+"""Inches around the axes of a pair's figures: four digits of a tick and a label, a legend of one line above."""
+
 IN_SPACE = 30
 """Matches that are drawn in space: each takes half a kilobyte."""
 
@@ -45,6 +48,16 @@ def axes_of(width: float = WIDE, height: float = HIGH, columns: int = 1):
     for ax in np.ravel(axes):
         ax.spines[["top", "right"]].set_visible(False)
     return figure, axes
+
+
+def framed() -> Any:
+    """A figure and its axes with room for what stands around those of a pair: to measure it takes as long as to draw."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(WIDE, HIGH))
+    ax = figure.add_axes((LEFT / WIDE, BELOW / HIGH, 1 - (LEFT + BESIDE) / WIDE, 1 - (BELOW + ABOVE) / HIGH))
+    ax.spines[["top", "right"]].set_visible(False)
+    return figure, ax
 
 
 def svg(figure, label: str) -> str:
@@ -73,7 +86,7 @@ def score_figure(pair: Alignment, path: np.ndarray | None, origin: float, truth:
     scored = pair.curve is not None and len(pair.curve)
     if not scored and (path is None or not len(path)):
         return ""
-    figure, ax = axes_of()
+    figure, ax = framed()
     if scored:
         draw_score(ax, pair)
     elif path is not None:
@@ -86,7 +99,7 @@ def score_figure(pair: Alignment, path: np.ndarray | None, origin: float, truth:
 
 def cost_figure(pair: Alignment, cost: np.ndarray, path: np.ndarray | None, origin: float, truth: float | None) -> str:
     """The frame-to-frame cost with the chosen offset, and the warping path where the pair has one."""
-    figure, ax = axes_of()
+    figure, ax = framed()
     step = max(1, -(-max(cost.shape) // MAP_PIXELS))
     extent = (-0.5, cost.shape[1] - 0.5, cost.shape[0] - 0.5, -0.5)
     known = cost[np.isfinite(cost)]
@@ -115,8 +128,8 @@ def in_space(a: Float[np.ndarray, "M 3"], b: Float[np.ndarray, "M 3"], first: st
     some = np.flatnonzero(known)
     some = some[:: -(-len(some) // IN_SPACE)]
     a, b = a[some], b[some]
-    figure = Figure(figsize=(WIDE, HIGH + 0.5), layout="constrained")
-    ax: Any = figure.add_subplot(projection="3d")
+    figure = Figure(figsize=(WIDE, HIGH + 0.5))
+    ax: Any = figure.add_axes((0.02, 0.06, 0.9, 0.94), projection="3d")
     draw_matches_in_space(ax, a, b, first, second)
     return svg(figure, f"matches of {first} and {second} in space")
 

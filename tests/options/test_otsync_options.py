@@ -207,11 +207,11 @@ def pair(tmp_path_factory) -> list[str]:
 
 @pytest.fixture(scope="module")
 def films(tmp_path_factory) -> list[str]:
-    """Five videos of 100 frames, as files."""
+    """Five videos of 100 frames and 64 tracks, as files."""
     folder = tmp_path_factory.mktemp("films")
     tracks, _ = simulate("softball", preset="clean", videos=5, frames=100, seed=3, max_offset=10)
     for n, t in enumerate(tracks):
-        last, some = 100 if n < 4 else 60, slice(0, len(t), 2)  # the last one is short
+        last, some = 100 if n < 4 else 60, slice(0, len(t), 3)  # the last one is short
         film = TrackSet(
             t.xyz[some, :last], t.seen[some, :last], t.features[some], fps=t.fps, name=t.name, frame=t.frame
         )
@@ -362,7 +362,7 @@ def test_what_decides_where_some_pairs_do_not_vouch_for_themselves(option, films
 def test_frames_of_their_own(tmp_path):
     """--frames own finds transforms, heeds matcher and graph, and refuses what needs a common frame."""
     tracks, _ = simulate(
-        "basketball", preset="clean", videos=3, own_frames=True, frames=75, tracks=50, seed=5, max_offset=8
+        "softball", preset="clean", videos=3, own_frames=True, frames=60, tracks=40, seed=5, max_offset=8
     )
     for t in tracks:
         t.save(tmp_path / f"{t.name}.npz")
