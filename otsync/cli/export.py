@@ -33,9 +33,10 @@ class Export:
     """Folder for mosaic.mp4, clips/, frames.csv, timeline.otio, timeline.fcpxml, and folders of datasets."""
     what: tuple[Literal[tuple(e.name for e in EXPORTS)], ...] = tuple(e.name for e in EXPORTS if e.default)
     """mosaic: one video of all, as filmed beside synchronised. clips: every video, cut to what all show, with its
-    sound. frames: a table of the frames that belong together. timeline: OpenTimelineIO, for editors. fcpxml: the
-    same for Final Cut Pro and DaVinci Resolve, in whole frames. nerfstudio, dynamic3dgs, colmap: images, cameras and
-    times in the layouts that other reconstructions read."""
+    sound. copies: the same from a key frame on, nothing encoded anew. frames: a table of the frames that belong
+    together. timeline: OpenTimelineIO, for editors. fcpxml: the same for Final Cut Pro and DaVinci Resolve, in whole
+    frames. nerfstudio, dynamic3dgs, colmap: images, cameras and times in the layouts that other reconstructions
+    read."""
     cameras: tuple[str, ...] = ()
     """Names of the videos to write; default: all that have an offset."""
     width: int | None = None

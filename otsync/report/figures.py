@@ -51,7 +51,7 @@ def axes_of(width: float = WIDE, height: float = HIGH, columns: int = 1):
 
 
 def framed() -> Any:
-    """A figure and its axes with room for what stands around those of a pair: to measure it takes as long as to draw."""
+    """A figure of a pair and its axes, with room around them: to measure what stands there takes as long as to draw."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(WIDE, HIGH))

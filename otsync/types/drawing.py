@@ -175,7 +175,7 @@ def clips_of(sources: Sequence[Any] | None, count: int) -> list[tuple[float, flo
 
 def draw_matches_in_space(ax: Any, a: Any, b: Any, first: str, second: str) -> None:
     """Matched points of two videos, (M,3) each, on three-dimensional axes, a line between the two of each match."""
-    from mpl_toolkits.mplot3d.art3d import Line3DCollection
+    from mpl_toolkits.mplot3d.art3d import Line3DCollection  # type: ignore[import-untyped]
 
     ax.add_collection3d(Line3DCollection(np.stack([a, b], 1), colors=GREY, linewidths=0.7))
     ax.scatter(*a.T, s=7, color=CHOSEN, label=short(first)[1:-1], depthshade=False)

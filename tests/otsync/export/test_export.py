@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
+import io
 import json
 from fractions import Fraction
 from pathlib import Path
@@ -138,6 +140,68 @@ def test_a_flash_appears_in_all_clips_at_the_same_second(exported):
         bright = [k for k in range(len(clip)) if clip[k][48].mean() > 128]
         first = world(v)[world(v) >= FLASH][0] - START
         assert clip.timestamps[bright[0]] == pytest.approx(first, abs=2e-5)
+
+
+@pytest.fixture(scope="module")
+def copied(recording) -> tuple[Path, str, float]:
+    """The folder of the copies, what was said of them, and the world second of the first of their key frames."""
+    err = io.StringIO()
+    with contextlib.redirect_stderr(err):
+        where = [str(recording), "--offsets", str(recording / "offsets.json"), "--out", str(recording / "raw")]
+        assert main(["export", *where, "--what", "copies"]) == 0
+    keys = []
+    for v in range(3):
+        with av.open(str(recording / f"{v}.mp4")) as container:
+            at = np.array([float(p.pts * p.time_base) for p in container.demux(video=0) if p.is_keyframe and p.size])
+        begun = RATES[v] * at + OFFSETS[v]
+        keys.append(begun[begun <= START + 1e-6].max())
+    return recording / "raw" / "copies", err.getvalue(), min(keys)
+
+
+@pytest.mark.parametrize("v", range(3))
+def test_copies_hold_the_files_own_frames_at_their_world_seconds(copied, recording, v):
+    folder, told, begin = copied
+    out = folder / file_names(NAMES, ".mp4")[v]
+    source, copy = VideoFrames(recording / f"{v}.mp4"), VideoFrames(out)
+    shown = np.flatnonzero((world(v) >= START - 1e-9) & (world(v) <= STOP + 1e-9))
+    at = np.array([np.abs(copy.timestamps - (world(v)[k] - begin)).argmin() for k in shown])
+    np.testing.assert_allclose(copy.timestamps[at], world(v)[shown] - begin, atol=2e-5)
+    for k, n in zip(shown, at, strict=True):
+        np.testing.assert_array_equal(copy[int(n)], source[int(k)])
+    assert copy.timestamps[0] >= 0 and copy.timestamps[-1] <= STOP - begin + 4 / FPS
+    assert f"all videos are there from second {START - begin:.3f} on" in told
+
+
+@pytest.mark.parametrize("v", range(2))
+def test_the_sound_of_copies_is_aligned_within_two_milliseconds(copied, v):
+    with av.open(str(copied[0] / file_names(NAMES, ".mp4")[v])) as container:
+        pieces = [(f.time, f.to_ndarray()[0]) for f in container.decode(audio=0)]
+    seconds = np.concatenate([t + np.arange(len(x)) / RATE for t, x in pieces])
+    loud = np.abs(np.concatenate([x for _, x in pieces]))
+    middle = (seconds * loud**2).sum() / (loud**2).sum()
+    assert middle == pytest.approx(CLICK - copied[2], abs=0.002)
+
+
+def test_sound_that_would_change_its_pitch_is_left_out_of_copies_and_said(recording, tmp_path, capsys):
+    offsets = tmp_path / "o.json"
+    Offsets.known(NAMES, OFFSETS, FPS, np.array([1.0, 1.0, 1.01])).save(offsets)
+    args = ["export", str(recording), "--offsets", str(offsets), "--out", str(tmp_path), "--what", "copies"]
+    assert main(args) == 0
+    assert "=late: its rate of 1.0100 would need other samples" in capsys.readouterr().err
+    with av.open(str(tmp_path / "copies" / file_names(NAMES, ".mp4")[2])) as container:
+        assert not container.streams.audio
+
+
+def test_images_are_not_copied_and_clips_are_named(tmp_path, capsys):
+    from tests.recording_world import write_recording
+
+    write_recording(tmp_path, [0.0, 2.0], frames=8)
+    names = [video["name"] for video in json.loads((tmp_path / "scene.json").read_text())["videos"]]
+    Offsets.known(names, np.zeros(2), 30).save(tmp_path / "o.json")
+    args = ["export", str(tmp_path), "--offsets", str(tmp_path / "o.json"), "--out", str(tmp_path / "x")]
+    assert main([*args, "--what", "copies"]) == 0
+    err = capsys.readouterr().err
+    assert f"{names[0]}: it is images, so it is not copied; --what clips" in err
 
 
 def test_the_table_names_the_nearest_frames(exported):

@@ -87,3 +87,28 @@ def test_a_network_that_wants_context_gets_the_whole_image(colour):
     nothing = Whole(False)
     flow_where(nothing, before, after, np.zeros_like(mask), 0.5)
     assert nothing.sizes == []
+
+
+def test_tracks_in_boxes_go_where_those_of_the_whole_image_go():
+    import cv2
+
+    from otsync.priors.points import ChainedFlow
+    from otsync.priors.working import WorkingFrames
+
+    rng = np.random.default_rng(0)
+    ground, thing = (
+        cv2.GaussianBlur(rng.uniform(0, 255, s).astype(np.float32), (0, 0), 2) for s in ((240, 320), (60, 60))
+    )
+    images, masks = [], []
+    for k in range(12):
+        x, y = 40 + 4 * k, 90 + 2 * k
+        image, mask = 0.3 * ground, np.zeros((240, 320), bool)
+        image[y : y + 60, x : x + 60] = 80 + thing
+        mask[y : y + 60, x : x + 60] = True
+        images.append(np.repeat(np.clip(image, 0, 255).astype(np.uint8)[..., None], 3, 2))
+        masks.append(mask)
+    for boxes in (False, True):
+        uv = ChainedFlow(boxes=boxes)(WorkingFrames(images, (320, 240)), masks, 30.0)
+        whole = uv[np.isfinite(uv[..., 0]).all(1)]
+        assert len(whole) > 20, boxes
+        assert np.median(np.abs((whole[:, -1] - whole[:, 0]) - [44, 22])) < 0.5, boxes

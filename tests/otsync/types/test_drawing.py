@@ -126,7 +126,9 @@ def test_matches_are_drawn_where_they_are_seen():
     matches = Matches([[0, 0], [1, 1], [3, 2]], [3, 2, 1])
     ax = matches.plot(a, b, offset=0.3)
     (lines,) = (c for c in ax.collections if hasattr(c, "_segments3d"))
-    np.testing.assert_allclose([end[1] - end[0] for end in lines._segments3d], [[0, 0, 0], [0, 0, 0], [-1, -1, -1]], atol=1e-9)
+    np.testing.assert_allclose(
+        [end[1] - end[0] for end in lines._segments3d], [[0, 0, 0], [0, 0, 0], [-1, -1, -1]], atol=1e-9
+    )
     assert not any(text.get_parse_math() for text in ax.get_legend().get_texts())
     flat = matches.plot(replace(a, xyz=None), replace(b, xyz=None), offset=0.3, most=2)
     assert len(flat.lines) == 2 + 2 and flat.yaxis_inverted()
