@@ -107,8 +107,8 @@ def test_tracks_in_boxes_go_where_those_of_the_whole_image_go():
         mask[y : y + 60, x : x + 60] = True
         images.append(np.repeat(np.clip(image, 0, 255).astype(np.uint8)[..., None], 3, 2))
         masks.append(mask)
-    for boxes in (False, True):
-        uv = ChainedFlow(boxes=boxes)(WorkingFrames(images, (320, 240)), masks, 30.0)
+    for part in (False, True):
+        uv = ChainedFlow(boxes=part)(WorkingFrames(images, (320, 240)), masks, 30.0)
         whole = uv[np.isfinite(uv[..., 0]).all(1)]
-        assert len(whole) > 20, boxes
-        assert np.median(np.abs((whole[:, -1] - whole[:, 0]) - [44, 22])) < 0.5, boxes
+        assert len(whole) > 20, part
+        assert np.median(np.abs((whole[:, -1] - whole[:, 0]) - [44, 22])) < 0.5, part
