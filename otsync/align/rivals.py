@@ -96,9 +96,15 @@ def rival(a: TrackSet, b: TrackSet, matches: Matches, offset: float) -> Rival:
         return Rival(math.inf, False)
     ratio = apart / here
     near = [at for at, r in sorted(zip(others, ratio, strict=True), key=lambda x: x[1]) if r < AS_GOOD][:MOST_TRIED]
-    asked = a.positions()[_moving(a, np.unique(matches.pairs[:, 0]), RESTING)] if near else xa
-    left = Left.at(asked, xb, a.times, b.times, offset)
-    as_good = any(not Left.at(asked, xb, a.times, b.times, at).worse_than(left) for at in near)
+    every = a.positions()[_moving(a, np.unique(matches.pairs[:, 0]), RESTING)] if near else xa
+    left, left_of_all = (Left.at(x, xb, a.times, b.times, offset) for x in (xa, every))
+    as_good = any(
+        not (
+            Left.at(xa, xb, a.times, b.times, at).much_worse_than(left)
+            or Left.at(every, xb, a.times, b.times, at).surely_worse_than(left_of_all)
+        )
+        for at in near
+    )
     return Rival(float(np.nanmin(ratio)), as_good)
 
 
@@ -172,20 +178,27 @@ class Left:
         power = _variance(u, seen) + _variance(v, seen)
         return cls(np.where(known, power, np.nan), np.where(known, _variance(u - v, seen), np.nan))
 
-    def worse_than(self, other: Left) -> bool:
-        """Whether more is left than at another time, by much or for sure. What nobody can tell is not worse."""
-        both = np.isfinite(self.power) & np.isfinite(other.power)
-        if both.sum() < LEAST_SEEN:
-            return False
-        mine, others = self._share(both), other._share(both)
+    def much_worse_than(self, other: Left) -> bool:
+        """Whether much more is left than at another time. What nobody can tell is not worse."""
+        mine, others = self._shares(other)
+        return mine > AS_LITTLE_LEFT * others + LITTLE
+
+    def surely_worse_than(self, other: Left) -> bool:
+        """Whether more is left than at another time, however little, and the tracks are sure of it."""
+        mine, others = self._shares(other)
         if not mine > others + LITTLE:
             return False
-        if mine > AS_LITTLE_LEFT * others + LITTLE:
-            return True
         with np.errstate(invalid="ignore", divide="ignore"):
-            more = np.log(self.left[both] / self.power[both]) - np.log(other.left[both] / other.power[both])
+            more = np.log(self.left / self.power) - np.log(other.left / other.power)
         more = more[np.isfinite(more)]
         return len(more) >= LEAST_SEEN and float(more.mean()) > SURE * float(more.std(ddof=1)) / math.sqrt(len(more))
+
+    def _shares(self, other: Left) -> tuple[float, float]:
+        """What is left at both times as a share of the motion of the tracks that both know; nan where they are few."""
+        both = np.isfinite(self.power) & np.isfinite(other.power)
+        if both.sum() < LEAST_SEEN:
+            return math.nan, math.nan
+        return self._share(both), other._share(both)
 
     def _share(self, tracks: np.ndarray) -> float:
         """Of the motion of some tracks, taken together; nan where none moves."""

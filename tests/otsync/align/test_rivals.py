@@ -47,15 +47,17 @@ def test_a_little_more_that_all_tracks_say_is_worse_and_a_little_more_that_some_
     power, here = np.ones(80), rng.uniform(0.1, 0.3, 80)
     everywhere = here * rng.normal(1.2, 0.1, 80)
     for_some = here * np.where(np.arange(80) < 40, 1.9, 0.5)
-    assert Left(power, everywhere).worse_than(Left(power, here))
-    assert not Left(power, for_some).worse_than(Left(power, here))
-    assert not Left(power, here).worse_than(Left(power, everywhere))
-    assert Left(power, 2 * for_some).worse_than(Left(power, here))  # by much: nobody needs to be asked one by one
+    assert Left(power, everywhere).surely_worse_than(Left(power, here))
+    assert not Left(power, everywhere).much_worse_than(Left(power, here))
+    assert not Left(power, for_some).surely_worse_than(Left(power, here))
+    assert not Left(power, here).surely_worse_than(Left(power, everywhere))
+    assert Left(power, 2 * for_some).much_worse_than(Left(power, here))  # nobody needs to be asked one by one
 
 
 def test_what_nobody_can_tell_is_not_worse():
     known = Left(np.ones(20), np.full(20, 0.1))
     unknown = Left(np.full(20, np.nan), np.full(20, np.nan))
-    assert not unknown.worse_than(known) and not known.worse_than(unknown)
     still = Left(np.zeros(20), np.zeros(20))
-    assert not still.worse_than(known)
+    for odd in (unknown, still):
+        assert not odd.surely_worse_than(known) and not odd.much_worse_than(known)
+        assert not known.surely_worse_than(odd) and not known.much_worse_than(odd)
