@@ -88,7 +88,10 @@ class Streams:
         first = clip.index[min(int(np.searchsorted(clip.world, start - 1e-9)), len(clip.index) - 1)]
         streams = cls(clip, inside, float(inside[first]), math.nan)
         with streams._opened() as source:
-            key = next(p for p in source.demux(source.streams.video[0]) if p.is_keyframe and p.pts is not None)
+            packets = source.demux(source.streams.video[0])
+            key = next((p for p in packets if p.is_keyframe and p.pts is not None), None)
+            if key is None:
+                raise ValueError(f"{clip.file}: expected a key frame; found none. Write it with --what clips.")
             return replace(streams, begin=streams.world(float(key.pts * key.time_base)))
 
     @contextlib.contextmanager
