@@ -40,6 +40,11 @@ AS_GOOD = 1.05
 1.06, exact loops .9 to 1; presets mid 2 and more, hard 1.22, like people 1.29, brutal 1 to 1.22, real cameras 1.14 and
 more (24 pairs; 10 each of the others)."""
 
+NEARLY, NOTHING = 1.6, 0.03
+"""The same where next to nothing of the motion is left unexplained, and the share that is: like things on one path stay
+somewhat apart. Carousels (seeds 520-527, 22007) have 1.12 to 1.4 and .003 to .01 where 1.05 trusted two wrong answers;
+what else moves has either 2 and more, or leaves .07 and more."""
+
 AS_LITTLE_LEFT, LITTLE = 1.3, 0.02
 """Times as much of the motion may be left unexplained at another time as at the answer, and a share beside it, if it is
 to suit as well, unless the tracks are sure (:data:`SURE`) that it does not. Left at the answer and at the best of the
@@ -95,16 +100,20 @@ def rival(a: TrackSet, b: TrackSet, matches: Matches, offset: float) -> Rival:
     if not np.isfinite(apart).any() or not here > 0:
         return Rival(math.inf, False)
     ratio = apart / here
-    near = [at for at, r in sorted(zip(others, ratio, strict=True), key=lambda x: x[1]) if r < AS_GOOD][:MOST_TRIED]
-    every = a.positions()[_moving(a, np.unique(matches.pairs[:, 0]), RESTING)] if near else xa
+    ranked = [at for at, r in sorted(zip(others, ratio, strict=True), key=lambda x: x[1]) if r < NEARLY][:MOST_TRIED]
+    every = a.positions()[_moving(a, np.unique(matches.pairs[:, 0]), RESTING)] if ranked else xa
     left, left_of_all = (Left.at(x, xb, a.times, b.times, offset) for x in (xa, every))
-    as_good = any(
-        not (
-            Left.at(xa, xb, a.times, b.times, at).much_worse_than(left)
-            or Left.at(every, xb, a.times, b.times, at).surely_worse_than(left_of_all)
-        )
-        for at in near
-    )
+
+    def suits(at: float) -> bool:
+        there = Left.at(xa, xb, a.times, b.times, at)
+        if there.share <= NOTHING:
+            return not there.much_worse_than(left)
+        if ratio[others == at] >= AS_GOOD:
+            return False
+        there_of_all = Left.at(every, xb, a.times, b.times, at)
+        return not (there.much_worse_than(left) or there_of_all.surely_worse_than(left_of_all))
+
+    as_good = any(suits(at) for at in ranked)
     return Rival(float(np.nanmin(ratio)), as_good)
 
 
@@ -199,6 +208,12 @@ class Left:
         if both.sum() < LEAST_SEEN:
             return math.nan, math.nan
         return self._share(both), other._share(both)
+
+    @property
+    def share(self) -> float:
+        """Of the motion of all tracks that are known; nan where these are few."""
+        known = np.isfinite(self.power)
+        return self._share(known) if known.sum() >= LEAST_SEEN else math.nan
 
     def _share(self, tracks: np.ndarray) -> float:
         """Of the motion of some tracks, taken together; nan where none moves."""
