@@ -7,6 +7,7 @@ import pytest
 
 from otsync import match, synchronize
 from otsync.align.rivals import Left, rival
+from otsync.bench.trust.worlds import drawn
 from otsync.simulate import PRESETS, simulate
 from otsync.simulate.effects import SharedDrift, Transient
 from otsync.types import Status
@@ -61,3 +62,10 @@ def test_what_nobody_can_tell_is_not_worse():
     for odd in (unknown, still):
         assert not odd.surely_worse_than(known) and not odd.much_worse_than(known)
         assert not known.surely_worse_than(odd) and not known.much_worse_than(odd)
+
+
+@pytest.mark.parametrize("seed", [526, 22007])
+def test_like_things_that_stay_somewhat_apart_at_another_time_are_rivals_too(seed):
+    """Trusted and 27 frames off where only what is as near was taken for a rival."""
+    tracks, _ = drawn(seed, motion="carousel", alike=True)
+    assert Status.AMBIGUOUS in synchronize(list(tracks)).flags[1]
