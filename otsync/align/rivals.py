@@ -100,21 +100,23 @@ def rival(a: TrackSet, b: TrackSet, matches: Matches, offset: float) -> Rival:
     if not np.isfinite(apart).any() or not here > 0:
         return Rival(math.inf, False)
     ratio = apart / here
-    ranked = [at for at, r in sorted(zip(others, ratio, strict=True), key=lambda x: x[1]) if r < NEARLY][:MOST_TRIED]
-    every = a.positions()[_moving(a, np.unique(matches.pairs[:, 0]), RESTING)] if ranked else xa
+    least = float(np.nanmin(ratio))
+    if least >= NEARLY:
+        return Rival(least, False)
+    every = a.positions()[_moving(a, np.unique(matches.pairs[:, 0]), RESTING)]
     left, left_of_all = (Left.at(x, xb, a.times, b.times, offset) for x in (xa, every))
 
-    def suits(at: float) -> bool:
+    def suits(at: float, ratio: float) -> bool:
         there = Left.at(xa, xb, a.times, b.times, at)
         if there.share <= NOTHING:
             return not there.much_worse_than(left)
-        if ratio[others == at] >= AS_GOOD:
+        if ratio >= AS_GOOD:
             return False
         there_of_all = Left.at(every, xb, a.times, b.times, at)
         return not (there.much_worse_than(left) or there_of_all.surely_worse_than(left_of_all))
 
-    as_good = any(suits(at) for at in ranked)
-    return Rival(float(np.nanmin(ratio)), as_good)
+    nearest = [i for i in np.argsort(ratio, kind="stable")[:MOST_TRIED] if ratio[i] < NEARLY]
+    return Rival(least, any(suits(float(others[i]), float(ratio[i])) for i in nearest))
 
 
 def _moving(a: TrackSet, index: Int[np.ndarray, " M"], resting: float) -> Int[np.ndarray, " N"]:

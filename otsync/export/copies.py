@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -16,7 +15,7 @@ from jaxtyping import Float
 
 from ..io.frames import CONTAINERS
 from ..progress import counted
-from .encode import TICKS
+from .encode import TICKS, whole_file
 from .slot import Aligned, Clip, Export, file_names
 from .sound import container_seconds
 
@@ -50,7 +49,10 @@ class Copies(Export):
                 notes.append(f"{clip.name}: {why}, so it is not copied; --what clips encodes it anew")
             else:
                 copies.append((Streams.of(clip, start), out))
-        begin = min((streams.begin for streams, _ in copies), default=start)
+        if not copies:
+            none = "--what copies: expected a video that can be copied; found none."
+            raise ValueError(f"{none} {'. '.join(notes)}.")
+        begin = min(streams.begin for streams, _ in copies)
         for streams, out in counted(copies, "copying", "video", len(copies)):
             silent = streams.write(out, begin, stop)
             notes += [silent] if silent else []
@@ -119,35 +121,26 @@ class Streams:
         """
         import av
 
-        out.parent.mkdir(parents=True, exist_ok=True)
-        part = out.with_name(f".{out.name}.{os.getpid()}.part")
         silent = ""
-        try:
-            with (
-                self._opened() as source,
-                av.open(str(part), "w", format="mp4", options={"movie_timescale": str(TICKS)}) as target,
-            ):
-                kept = {source.streams.video[0].index: _copied(target, source.streams.video[0])}
-                if source.streams.audio and abs(self.clip.clock.rate - 1) <= SAME_PITCH:
-                    kept[source.streams.audio[0].index] = _copied(target, source.streams.audio[0])
-                elif source.streams.audio:
-                    silent = (
-                        f"{self.clip.name}: its rate of {self.clip.clock.rate:.4f} would need other samples, so its "
-                        "sound is left out of the copy"
-                    )
-                for packet in source.demux([source.streams[n] for n in kept]):
-                    if packet.pts is None or not packet.size or not self._wanted(packet, stop):
-                        continue
-                    self._place(packet, begin)
-                    packet.stream = kept[packet.stream.index]
-                    target.mux(packet)
-            os.replace(part, out)
-        except BaseException as error:
-            part.unlink(missing_ok=True)
-            if isinstance(error, OSError) and error.errno is not None:  # FFmpeg's own, which name the temporary file
-                said = f"cannot be written ({os.strerror(error.errno)}); nothing is half written"
-                raise OSError(error.errno, said, str(out)) from None
-            raise
+        with (
+            whole_file(out) as part,
+            self._opened() as source,
+            av.open(str(part), "w", format="mp4", options={"movie_timescale": str(TICKS)}) as target,
+        ):
+            kept = {source.streams.video[0].index: _copied(target, source.streams.video[0])}
+            if source.streams.audio and abs(self.clip.clock.rate - 1) <= SAME_PITCH:
+                kept[source.streams.audio[0].index] = _copied(target, source.streams.audio[0])
+            elif source.streams.audio:
+                silent = (
+                    f"{self.clip.name}: its rate of {self.clip.clock.rate:.4f} would need other samples, so its "
+                    "sound is left out of the copy"
+                )
+            for packet in source.demux([source.streams[n] for n in kept]):
+                if packet.pts is None or not packet.size or not self._wanted(packet, stop):
+                    continue
+                self._place(packet, begin)
+                packet.stream = kept[packet.stream.index]
+                target.mux(packet)
         return silent
 
     def _wanted(self, packet: Any, stop: float) -> bool:

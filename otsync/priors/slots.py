@@ -38,8 +38,9 @@ class Tracker(Protocol):
 class Flow(Protocol):
     """The ``flow`` slot: optical flow between two frames, there and back.
 
-    One that declares ``colour = True`` gets (H,W,3) instead of grey; one that declares ``whole = True`` is given whole
-    images, others boxes around what moves.
+    One that declares ``colour = True`` gets (H,W,3) instead of grey. One that declares ``whole = True`` is
+    always given whole images; others are given boxes around what moves where the tracker asks for that
+    (``ChainedFlow(boxes=True)``).
     """
 
     def pair(

@@ -199,9 +199,11 @@ def test_images_are_not_copied_and_clips_are_named(tmp_path, capsys):
     names = [video["name"] for video in json.loads((tmp_path / "scene.json").read_text())["videos"]]
     Offsets.known(names, np.zeros(2), 30).save(tmp_path / "o.json")
     args = ["export", str(tmp_path), "--offsets", str(tmp_path / "o.json"), "--out", str(tmp_path / "x")]
-    assert main([*args, "--what", "copies"]) == 0
+    assert main([*args, "--what", "copies"]) != 0
     err = capsys.readouterr().err
+    assert "expected a video that can be copied" in err
     assert f"{names[0]}: it is images, so it is not copied; --what clips" in err
+    assert not list((tmp_path / "x").rglob("*.mp4"))
 
 
 def test_the_table_names_the_nearest_frames(exported):
