@@ -19,6 +19,9 @@ from recon.cli.common import opened, print_json
 from recon.cli.tables import view_table
 from recon.result import EXPORTERS
 
+CAMERA = "{camera}"
+"""In a path: the name of a camera."""
+
 
 @dataclass
 class Render:
@@ -31,12 +34,17 @@ class Render:
     A frozen moment from all sides: recon render result --path orbit --times 1.25 --frames 90 --out frozen.mp4
 
     Single images: recon render result --camera 5 --times 0.5 0.52 --out images
+
+    What all cameras would have filmed at the same moments: recon render result --every-camera --out synced/{camera}.mp4
     """
 
     result: tyro.conf.Positional[Path]
     """Folder that recon fit or otsync run wrote."""
     camera: str | None = None
     """Name of a video: from its place, with its colours."""
+    every_camera: bool = False
+    """From the places of all videos, one after the other, all at the same moments of the world's clock, between the
+    frames of their files: {camera} in --out stands for the name of each."""
     path: Literal["orbit"] | None = None
     """A camera that moves: around the scene, or to and fro where the scene was filmed from one side."""
     times: tuple[float, ...] = ()
@@ -53,19 +61,25 @@ class Render:
     """A video (.mp4, .mov, .mkv), or a folder for PNG frames."""
 
     def run(self) -> int:
+        from otsync.export.slot import file_names
         from recon.result.export import MAX_FRAMES, check_times, frame_times
         from recon.result.folder import load_result
         from recon.result.images import rendered, stretched
         from recon.result.video import check_target, refuse_longer, write_images
 
-        if (self.camera is None) == (self.path is None):
-            raise ValueError("--camera, --path: expected one of them: the name of a video, or orbit.")
+        if (self.camera is not None) + (self.path is not None) + self.every_camera != 1:
+            raise ValueError(
+                "--camera, --every-camera, --path: expected one of them: a video's name, all, or an orbit."
+            )
+        if self.every_camera != (CAMERA in str(self.out)):
+            raise ValueError(f"--out: expected {CAMERA} in it with --every-camera, and only then; found {self.out}.")
         if self.frames is not None and (self.path is None or len(self.times) > 1):
             raise ValueError("--frames: expected with --path, and with at most one moment in --times.")
         if self.frames is not None and not 1 <= self.frames <= MAX_FRAMES:
             raise ValueError(f"--frames: expected 1 to {MAX_FRAMES}; found {self.frames}.")
         if self.turns is not None and self.path is None:
-            raise ValueError("--turns: expected with --path; found --camera.")
+            found = "--camera" if self.camera is not None else "--every-camera"
+            raise ValueError(f"--turns: expected with --path; found {found}.")
         if self.fps is not None and not self.out.suffix and (self.times or self.frames is not None):
             raise ValueError(
                 "--fps: expected with a video in --out, or to choose the times of images; found a folder of images "
@@ -74,7 +88,6 @@ class Render:
         if self.fps is not None and not 0 < self.fps <= 1000:
             raise ValueError(f"--fps: expected frames per second above 0, at most 1000; found {self.fps:g}.")
         check_target(self.out)
-        refuse_parts_of_a_result(self.out)
         result = load_result(self.result)
         fps = 1.0 / result.scene.frame_step if self.fps is None else self.fps
         times = list(self.times) or frame_times(result.scene, fps).tolist()
@@ -82,11 +95,17 @@ class Render:
             times = times * self.frames if len(self.times) == 1 else stretched(result.scene.span, self.frames)
         check_times(result.scene, times)
         turns = 1.0 if self.turns is None else self.turns
-        images = rendered(result, times, self.camera, turns=turns, width=self.width)
-        with nullcontext() if self.out.suffix else claimed(self.out, "recon render", keep=False):
-            refuse_longer(self.out, len(times))
-            count = write_images(counted(images, "rendering", "image", len(times)), self.out, fps)
-        print(f"wrote {count} images to {self.out}")
+        cameras = [v.name for v in result.videos] if self.every_camera else [self.camera]
+        files = file_names([c or "" for c in cameras], "") if self.every_camera else [""]
+        targets = [Path(str(self.out).replace(CAMERA, name)) for name in files]
+        for out in targets:
+            refuse_parts_of_a_result(out)
+            refuse_longer(out, len(times))
+        for camera, out in zip(cameras, targets, strict=True):
+            images = rendered(result, times, camera, turns=turns, width=self.width)
+            with nullcontext() if out.suffix else claimed(out, "recon render", keep=False):
+                count = write_images(counted(images, "rendering", "image", len(times)), out, fps)
+            print(f"wrote {count} images to {out}")
         return 0
 
 

@@ -96,6 +96,27 @@ def test_a_camera_is_rendered_to_images_and_to_a_video(result, tmp_path):
     assert len(frames) == int((high - low) * 30 + 1e-6) + 1 >= FRAMES and frames[0].shape == (32, 48, 3)
 
 
+def test_every_camera_is_rendered_at_the_same_moments_between_frames(result, tmp_path, capsys):
+    moments = ["--times", "0.1167", "0.2833"]  # half a frame beside those that were filmed
+    args = ["render", str(result), "--every-camera", *moments, "--out", str(tmp_path / "s" / "{camera}")]
+    assert main(args) == 0
+    names = [v.name for v in load_result(result).videos]
+    assert sorted(p.name for p in (tmp_path / "s").iterdir()) == sorted(names)
+    for name in names:
+        alone = tmp_path / f"{name} alone"
+        assert main(["render", str(result), "--camera", name, *moments, "--out", str(alone)]) == 0
+        for file in ("00000.png", "00001.png"):
+            assert (alone / file).read_bytes() == (tmp_path / "s" / name / file).read_bytes()
+    whole = ["render", str(result), "--every-camera", "--fps", "60", "--width", "48"]
+    assert main([*whole, "--out", str(tmp_path / "v {camera}.mp4")]) == 0
+    counts = set()
+    for name in names:
+        with av.open(str(tmp_path / f"v {name}.mp4")) as video:
+            counts.add(sum(1 for _ in video.decode(video=0)))
+    low, high = load_result(result).scene.span
+    assert counts == {int((high - low) * 60 + 1e-6) + 1}
+
+
 def test_a_path_goes_around_a_frozen_moment(result, tmp_path):
     args = ["render", str(result), "--path", "orbit", "--times", "0.2", "--frames", "5", "--out", str(tmp_path / "o")]
     assert main(args) == 0
@@ -131,7 +152,10 @@ def test_eval_repeats_the_figures_of_the_run(world, result, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("args", "says"),
     [
-        (["render", "RESULT", "--out", "x.mp4"], "--camera, --path: expected one of them"),
+        (["render", "RESULT", "--out", "x.mp4"], "--camera, --every-camera, --path: expected one of them"),
+        (["render", "RESULT", "--camera", "cam0", "--every-camera"], "--every-camera, --path: expected one of them"),
+        (["render", "RESULT", "--every-camera", "--out", "x.mp4"], "--out: expected {camera} in it"),
+        (["render", "RESULT", "--camera", "cam0", "--out", "{camera}.mp4"], "--out: expected {camera} in it"),
         (["render", "RESULT", "--camera", "cam9"], "expected one of cam0"),
         (["render", "RESULT", "--camera", "cam0", "--times", "99"], "which the videos cover"),
         (["render", "RESULT", "--camera", "cam0", "--out", "x.gif"], "expected .mp4"),
