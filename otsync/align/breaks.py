@@ -22,10 +22,17 @@ to 7, freezes of 15 frames and ten lost frames 10 to 25."""
 LOW_PRICE, LOW_SHARE = 3.5, 0.05
 """The same where part of the overlap is not explained by the best offset."""
 
-UNEXPLAINED, UNEXPLAINED_LONG = 0.5, 0.4
-"""Share of its motion that a window of 20 frames, and two in a row, must have in common at the best offset, for the
-best quarter of the matches. The least window of clean pairs has .73 and more (mid), .49 (hard, like people .67); of
-freezes and a missing second .43 and less; of ten lost frames .06 to .9."""
+UNEXPLAINED = 0.5
+"""Share of its motion that a window of 20 frames must have in common at the best offset, for the best quarter of the
+matches. The least window of clean pairs has .73 and more (mid), .49 (hard, like people .67); of freezes and a missing
+second .43 and less; of ten lost frames .06 to .9."""
+
+PREFERS, OF_USUAL, SEEN = 0.6, 0.22, 0.5
+"""Nats a match, and share of what two windows in a row usually have, by which any other offset may suit two of them
+better than the best offset does, where at least a share of the usual samples is seen: noise leaves much of the motion
+unexplained at every offset, a break does so at one alone. In units of this limit clean pairs (270, seeds 600-699: mid
+to brutal, few tracks, like people) have .91 at most but for one of 1.25; trusted answers that were wrong at one end
+(frames lost, frozen pictures under hard and brutal noise) .62 to 1.8, five of seven more than 1."""
 
 ODD, UNUSUAL, LEAST_MISSING = 3.0, 4.5, 0.15
 """How many times more than usual may be missing in two windows in a row: clean pairs 1.5 (mid), 4.3 (hard), 4.2
@@ -122,9 +129,10 @@ def find_breaks(
     curves = local_curves(pair, lags, floor, weight)
     best = int(np.argmax(curves.sum(0)))
     straight = float(curves[:, best].sum())
+    doubtful = prefers_another(curves, best, seen_share(pair, int(lags[best]), step))
     curves = without_chance(curves, best, pair, int(lags[best]), step)
-    least, least_long, ratio = explained(pair, int(lags[best]), floor, step)
-    doubtful = least_long < UNEXPLAINED_LONG or ratio > UNUSUAL
+    least, ratio = explained(pair, int(lags[best]), floor, step)
+    doubtful |= ratio > UNUSUAL
     prices = [max(PRICE, SHARE * straight)]
     if least < UNEXPLAINED or ratio > ODD:
         prices.append(max(LOW_PRICE, LOW_SHARE * straight))
@@ -148,10 +156,34 @@ def find_breaks(
     return np.stack([begin, offsets], 1), gain, False
 
 
-def explained(pair: CommonClock, lag: int, floor: float, step: int) -> tuple[float, float, float]:
-    """How much of the motion within a window both videos have in common at a lag, in the least window and the least two
-    in a row: 1 - Var(a - b) / (Var a + Var b) of the best quarter of the matches that move there; 1 where none does.
-    And what is missing to 1 in the least two in a row, as a multiple of what is usually missing.
+def seen_share(pair: CommonClock, lag: int, step: int) -> Float[np.ndarray, " W"]:
+    """Of the samples in every window of :func:`local_curves`, the share that both videos see at a lag."""
+    T = pair.a.shape[1]
+    share = np.zeros(-(-T // step) + 1)
+    first, end = max(0, lag), min(T, pair.b.shape[1] + lag)
+    if end > first:
+        both = np.isfinite(pair.a[:, first:end, 0]) & np.isfinite(pair.b[:, first - lag : end - lag, 0])
+        total = np.concatenate([[0.0], np.cumsum(both.mean(0))])
+        low, high = (np.clip((np.arange(len(share)) + k) * step - first, 0, end - first) for k in (-1, 1))
+        share = (total[high] - total[low]) / (2 * step)
+    return share
+
+
+def prefers_another(curves: Float[np.ndarray, "W K"], best: int, seen: Float[np.ndarray, " W"]) -> bool:
+    """Whether two windows in a row, in which enough is seen, clearly suit an offset other than the best one."""
+    usual = float(np.median(seen[seen > 0])) if (seen > 0).any() else 0.0
+    told = np.flatnonzero(np.minimum(seen[:-1], seen[1:]) >= SEEN * usual) if usual > 0 else []
+    if not len(told):
+        return False
+    two = curves[told] + curves[told + 1]
+    gain = float((two.max(1) - two[:, best]).max())
+    return gain > PREFERS + OF_USUAL * max(float(np.median(two[:, best])), 0.0)
+
+
+def explained(pair: CommonClock, lag: int, floor: float, step: int) -> tuple[float, float]:
+    """How much of the motion within a window both videos have in common at a lag, in the least window: 1 - Var(a - b) /
+    (Var a + Var b) of the best quarter of the matches that move there; 1 where none does. And what is missing to 1 in
+    the least two in a row, as a multiple of what is usually missing.
     """
     first, end = max(0, lag), min(pair.a.shape[1], pair.b.shape[1] + lag)
     shares = []
@@ -170,11 +202,11 @@ def explained(pair: CommonClock, lag: int, floor: float, step: int) -> tuple[flo
         else:
             shares.append(1.0)
     if not shares:
-        return 1.0, 1.0, 1.0
+        return 1.0, 1.0
     pairs = np.maximum(shares[:-1], shares[1:]) if len(shares) > 1 else np.array(shares)
     missing = 1 - float(pairs.min())
     ratio = missing / max(1 - float(np.median(shares)), 1e-3) if missing > LEAST_MISSING else 1.0
-    return min(shares), float(pairs.min()), ratio
+    return min(shares), ratio
 
 
 def agreement(pair: CommonClock, span: Int[np.ndarray, " P"], lag: int, floor: float, step: int) -> float:

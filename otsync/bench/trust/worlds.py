@@ -168,10 +168,10 @@ def takes(seed: int, freedom: float = 0.03) -> World:
     return untrue(seed, first=(In(1, ClockDrift(0.1, correlation=1.0)), In(1, LimbDrift(freedom, correlation=0.8))))
 
 
-def strangers(seed: int) -> World:
+def strangers(seed: int, **options: Any) -> World:
     """Two scenes that have nothing in common."""
-    (a, _), _ = drawn(seed)
-    (_, b), _ = drawn(seed + 100_003)
+    (a, _), _ = drawn(seed, **options)
+    (_, b), _ = drawn(seed + 100_003, **options)
     return World((a, b), None)
 
 
@@ -190,6 +190,7 @@ CLASSES: dict[str, Callable[[int], World]] = {
     "unison, one each": partial(performers, motion="unison", sees=((0,), (1,))),
     "two takes": takes,
     "two scenes": strangers,
+    "two scenes, hard": partial(strangers, preset="hard"),
     "static": partial(untrue, motion="static"),
     "static, trackers settle": partial(untrue, motion="static", last=(Transient(0.2),)),
     "static, one drift for all": partial(untrue, motion="static", last=(SharedDrift(0.2, seed=5),)),
@@ -200,6 +201,9 @@ CLASSES: dict[str, Callable[[int], World]] = {
     "freeze that catches up": partial(plain, first=(In(1, Freeze(30, catches_up=True)),)),
     "freeze of the first": partial(plain, first=(In(0, Freeze(20)),)),
     "ten frames dropped": partial(plain, first=(In(1, Drop(10 / 30)),)),
+    "ten frames dropped, hard": partial(plain, preset="hard", first=(In(1, Drop(10 / 30)),)),
+    "freeze of 15, hard": partial(plain, preset="hard", first=(In(1, Freeze(15)),)),
+    "freeze of 15, brutal": partial(plain, preset="brutal", first=(In(1, Freeze(15)),)),
     "a second missing": partial(plain, first=(In(1, Drop(1.0)),), within=15),
     "halves exchanged": partial(plain, first=(In(1, Cut()),), within=15),
     "24 as 30": partial(plain, first=(In(1, Repeats(24.0)),)),

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from otsync import synchronize
+from otsync.bench.trust.worlds import CLASSES
 from otsync.simulate import simulate
 from otsync.simulate.effects import Drop, Freeze, In, SlowMotion
 from otsync.sync.breaks import mended
@@ -73,6 +74,23 @@ def test_a_wrong_rate_is_fitted_and_told():
     assert any("rate" in note for note in offsets.clock_notes())
     held = synchronize(tracks, rate="fixed")
     assert Status.RATE_MISMATCH in held.flags[1]
+
+
+@pytest.mark.parametrize("seed", [602, 604])
+def test_a_freeze_under_much_noise_is_never_trusted_and_wrong(seed):
+    """Both were trusted once, fifteen frames off at one end."""
+    world = CLASSES["freeze of 15, brutal"](seed)
+    offsets = synchronize(world.tracks)
+    ends, _ = world.errors(offsets)
+    assert not offsets.status[1].ok or ends[0] < 1
+
+
+@pytest.mark.parametrize("seed", [515, 546, 564, 614])
+def test_noise_that_leaves_much_unexplained_everywhere_is_no_break(seed):
+    """Motion of which every second leaves most unexplained, at every offset alike."""
+    world = CLASSES["hard"](seed)
+    offsets = synchronize(world.tracks)
+    assert offsets.status[1].ok and world.errors(offsets)[0][0] < 0.4
 
 
 def test_breaks_survive_the_file(tmp_path):
