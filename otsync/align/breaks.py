@@ -172,8 +172,8 @@ def seen_share(pair: CommonClock, lag: int, step: int) -> Float[np.ndarray, " W"
 def prefers_another(curves: Float[np.ndarray, "W K"], best: int, seen: Float[np.ndarray, " W"]) -> bool:
     """Whether two windows in a row, in which enough is seen, clearly suit an offset other than the best one."""
     usual = float(np.median(seen[seen > 0])) if (seen > 0).any() else 0.0
-    told = np.flatnonzero(np.minimum(seen[:-1], seen[1:]) >= SEEN * usual) if usual > 0 else []
-    if not len(told):
+    told = np.flatnonzero(np.minimum(seen[:-1], seen[1:]) >= SEEN * usual)
+    if usual == 0 or not len(told):
         return False
     two = curves[told] + curves[told + 1]
     gain = float((two.max(1) - two[:, best]).max())

@@ -40,6 +40,10 @@ LEAST_WANDER = 0.1 / 30
 LEAST_DRIFT = 0.1 / 30
 """Seconds by which a rate must move the ends of the overlap to be worth telling."""
 
+UNSETTLED = 1.0, 2.0
+"""Sigmas of a rate that is not kept, from which on it may be real, and from which on sigma covers it: rates of .1 %
+over 20 s, 2.4 to 3.2 sigma, were left out and the ends were off by .3 frame at sigma .07."""
+
 MOST_RATE = 0.03
 """Relative difference of rates beyond which a fit from one offset is not to be believed."""
 
@@ -98,7 +102,7 @@ class SplineRefine(Refiner):
         spread = max((self._apart(o, fit, curves) for o in others), default=0.0)
         fps = min(nominal_fps(a), nominal_fps(b))
         shared = spread**2 / 2 + (fit.blur**2 / COMMON_ERRORS) ** 2 + LEAST_SIGMA**2
-        ends = self._ends(curves, fit, free, shared)
+        ends = self._ends(curves, fit, free, shared, unsettled_rate(rate_stats, fit.clock.rate))
         stats = (
             alignment.stats
             | rate_stats
@@ -174,9 +178,11 @@ class SplineRefine(Refiner):
         return free, free, (), stats
 
     def _ends(
-        self, curves: tuple[TrackSplines, TrackSplines], fit: Fit, free: Fit | None, shared: float
+        self, curves: tuple[TrackSplines, TrackSplines], fit: Fit, free: Fit | None, shared: float, unsettled: float
     ) -> tuple[float, float]:
-        """One sigma at the beginning and at the end of the overlap; shared: variance of errors that both have."""
+        """One sigma at the beginning and at the end of the overlap; shared: variance of errors that both have;
+        unsettled: of the rate.
+        """
         a, b = curves
         own = fit.clock.own(a.times[[0, -1]])
         begin, end = max(float(own[0]), float(b.times[0])), min(float(own[1]), float(b.times[-1]))
@@ -186,7 +192,7 @@ class SplineRefine(Refiner):
             C = free.covariance
             variance = [float(C[0, 0] + 2 * t * C[0, 1] + t * t * C[1, 1]) for t in (begin, end)]
         else:
-            drift = DECLARED * (end - begin) / 2
+            drift = math.hypot(DECLARED, unsettled) * (end - begin) / 2
             variance = [float(fit.covariance[0, 0]) + drift**2] * 2
         return math.sqrt(max(variance[0], 0) + shared), math.sqrt(max(variance[1], 0) + shared)
 
@@ -202,3 +208,12 @@ class SplineRefine(Refiner):
             Status.POOR_FIT: stats["correlation"] < t.correlation,
         }
         return tuple(flag for flag, raised in found.items() if raised)
+
+
+def unsettled_rate(stats: dict[str, float], kept: float) -> float:
+    """By how much the rate that is kept may be off, where a free one differs from it by more than its noise."""
+    if "rate_sigma" not in stats:
+        return 0.0
+    off = abs(stats["fitted_rate"] - kept)
+    low, high = UNSETTLED
+    return off * float(np.clip((off / stats["rate_sigma"] - low) / (high - low), 0.0, 1.0))

@@ -113,13 +113,12 @@ def _adjacency(n: int, edges: Sequence[Edge] | Sequence[Pair], weight: Any = Non
     return coo_array((values, (ends[:, 0], ends[:, 1])), shape=(n, n)).tocsr()
 
 
-def solve(
-    n: int, edges: Sequence[Edge], anchor: int, start: np.ndarray | None = None, inflation: float = 1.0
-) -> Solution:
+def solve(n: int, edges: Sequence[Edge], anchor: int, start: np.ndarray | None = None, shared: float = 0.0) -> Solution:
     """Robust synchronisation: weighted L1 by reweighting, then Cauchy from there (from ``start`` when given).
 
-    Videos that no edge links to ``anchor`` stay at nan. ``inflation`` multiplies the sigmas, which take edges as
-    independent although they share tracks.
+    Videos that no edge links to ``anchor`` stay at nan. ``shared``: of an edge's variance, the share that is its two
+    videos' own, each half of it: what is wrong with a video's tracks is in all its edges alike, fits into every cycle,
+    and no number of edges averages it out.
     """
     near = components(n, edges) if edges else np.arange(n)
     inside = near == near[anchor]
@@ -142,8 +141,21 @@ def solve(
     first = y if y is not None else np.asarray(start)[free] - np.asarray(start)[anchor]
     y, normal = _reweighted(A, d, s, first, _cauchy)
     x[free] = y
-    sigma[free] = inflation * np.sqrt(np.diag(np.linalg.inv(normal)))
+    variance = (1 - shared) * np.diag(np.linalg.inv(normal))
+    if shared:
+        own = _own_variance(n, used)
+        variance = variance + shared * (own[free] + own[anchor])
+    sigma[free] = np.sqrt(variance)
     return Solution(x, sigma, np.array([x[e.b] - x[e.a] - e.offset for e in edges]))
+
+
+def _own_variance(n: int, edges: Sequence[Edge]) -> Float[np.ndarray, " V"]:
+    """Half of the median variance of every video's edges; 0 without one."""
+    around: list[list[float]] = [[] for _ in range(n)]
+    for e in edges:
+        for v in (e.a, e.b):
+            around[v].append(e.sigma**2 / 2)
+    return np.array([np.median(v) if v else 0.0 for v in around])
 
 
 def _l1(r: np.ndarray) -> np.ndarray:

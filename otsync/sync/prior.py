@@ -10,7 +10,7 @@ import numpy as np
 
 from ..types import Offsets, Status, in_order
 from .graph import Edge, components, solve
-from .verdict import FLAGGED, INFLATION, UNKNOWN_SIGMA
+from .verdict import FLAGGED, SHARED, UNKNOWN_SIGMA
 
 SIGMAS = 3.0
 """Standard deviations apart at which two answers contradict each other."""
@@ -111,7 +111,7 @@ def _solved(
 ) -> tuple[Offsets, list[Contradiction]]:
     n = len(names)
     reference = 0 if before is None else before.reference
-    answer = solve(n, edges, reference, inflation=INFLATION)
+    answer = solve(n, edges, reference, shared=SHARED)
     group = components(n, edges) if edges else np.arange(n)
     inside = group == group[reference]
     component = np.where(inside, reference, np.arange(n) if before is None else before.component)

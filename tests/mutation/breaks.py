@@ -545,10 +545,10 @@ BREAKS = (
         "pairs weigh by one over sigma, not by its square",
     ),
     Break(
-        "graph-inflation-dropped",
+        "graph-shared-dropped",
         "otsync/sync/graph.py",
-        "sigma[free] = inflation * np.sqrt(",
-        "sigma[free] = np.sqrt(",
+        "variance = variance + shared * (own[free] + own[anchor])",
+        "variance = variance + 0.0 * (own[free] + own[anchor])",
         SYNC,
         "sigma of the solution takes pairs as independent",
     ),

@@ -142,12 +142,28 @@ def test_cycles_close_or_do_not():
     assert len(cycle_errors(edges_of(np.zeros(4), all_pairs(4)))) == 4
 
 
-def test_inflation_multiplies_the_sigmas_and_nothing_else():
+@pytest.mark.parametrize("shared", [0.0, 0.5, 1.0])
+def test_sigma_is_that_of_errors_which_pairs_of_a_video_share(shared):
+    """Drawn from the model: half of the shared variance from either video, the rest from the pair."""
+    rng, n, sigma = np.random.default_rng(3), 6, 0.01
+    pairs, z = all_pairs(n), []
+    for _ in range(300):
+        own = rng.normal(size=n) * sigma * np.sqrt(shared / 2)
+        each = rng.normal(size=len(pairs)) * sigma * np.sqrt(1 - shared)
+        noise = [own[b] - own[a] + e for (a, b), e in zip(pairs, each, strict=True)]
+        solved = solve(n, edges_of(np.zeros(n), pairs, sigma, noise), 0, shared=shared)
+        z += (solved.x[1:] / solved.sigma[1:]).tolist()
+    assert np.sqrt(np.mean(np.square(z))) == pytest.approx(1.0, abs=0.12)
+
+
+def test_shared_errors_change_sigma_and_nothing_else_and_nothing_of_a_single_pair():
     rng = np.random.default_rng(3)
     edges = edges_of(rng.normal(size=5), all_pairs(5), 0.01, 0.01 * rng.normal(size=10))
-    plain, wide = solve(5, edges, 0), solve(5, edges, 0, inflation=1.5)
+    plain, wide = solve(5, edges, 0), solve(5, edges, 0, shared=0.5)
     np.testing.assert_array_equal(wide.x, plain.x)
-    np.testing.assert_allclose(wide.sigma, 1.5 * plain.sigma)
+    assert (wide.sigma[1:] > plain.sigma[1:]).all() and wide.sigma[0] == 0
+    one = edges_of(np.array([0.0, 0.3]), [(0, 1)], 0.02)
+    assert solve(2, one, 0, shared=0.5).sigma[1] == pytest.approx(0.02)
 
 
 def test_lags_without_overlap_say_nothing():
