@@ -440,6 +440,11 @@ def _row(
     def at(x: np.ndarray, q: float) -> float | None:
         return round(float(np.quantile(x, q)), 4) if x.size else None
 
+    def held(lines: list[dict[str, Any]]) -> list[float | None]:
+        """Shares of the trusted answers within one sigma and within two."""
+        z = np.array([error_of(d) / d["sigma"] for d in lines if not d["flags"] and d["sigma"]])
+        return [mean(z <= k) for k in (1, 2)]
+
     long = errors(details, "band")
     below = errors([d for d in details if d["kind"].startswith("band") and d["angle"] < 95])
     return {
@@ -457,6 +462,8 @@ def _row(
         "graph_max": at(errors(graph), 1.0),
         "all_cameras_mean": mean(errors(whole)),
         "all_cameras_max": at(errors(whole), 1.0),
+        "pairs_in_sigma": held(details),
+        "graph_in_sigma": held([*graph, *whole]),
         "missing": int(sum(d["error"] is None for d in (*details, *graph, *whole))),
         "trusted_wrong": sum(not d["flags"] and error_of(d) > 1 for d in (*details, *graph, *whole)),
         "flagged": round(float(np.mean([bool(d["flags"]) for d in details if d["kind"].startswith("band")])), 4),

@@ -10,7 +10,7 @@ import pytest
 from otsync import Alignment, Matches, Refused, SplineRefine, Status, TrackSet, Unrefined, align, refine
 from otsync.clocks.splines import TrackSplines
 from otsync.refine.gauss_newton import Side, _linearise, fit_clock, neighbours, wider
-from otsync.refine.splines import COMMON_ERRORS, LEAST_SIGMA
+from otsync.refine.splines import COMMON_ERRORS, LEAST_SIGMA, unsettled_rate
 from otsync.simulate import simulate
 from otsync.types import Clock
 
@@ -201,6 +201,15 @@ def test_a_fitted_rate_is_kept_only_when_significant():
             assert found.offset == pytest.approx(0.3, abs=0.1 / 30)
             fixed = refine(*tracks, m, align(*tracks, m), throw=False)
             assert fixed.rate == 1.0 and Status.RATE_MISMATCH in fixed.flags
+
+
+def test_a_rate_that_is_not_kept_counts_where_it_may_be_real():
+    told = {"fitted_rate": 1.001, "rate_sigma": 0.0004}  # 2.5 sigma
+    assert unsettled_rate(told, 1.0) == pytest.approx(0.001)
+    assert unsettled_rate(told, 1.001) == 0.0  # it is kept
+    assert unsettled_rate(told | {"rate_sigma": 0.001}, 1.0) == 0.0  # as much as noise makes
+    assert 0 < unsettled_rate(told | {"rate_sigma": 0.0007}, 1.0) < 0.001
+    assert unsettled_rate({}, 1.0) == 0.0  # too short to tell
 
 
 def test_flags_of_the_alignment_stay():
