@@ -14,7 +14,7 @@ import numpy as np
 
 from otsync.report.clock import inline_image, measured, stills, timeline
 from otsync.report.figures import CHOSEN, GREY, axes_of, effort, svg
-from otsync.report.page import cards, extent, footer, number, remedies, stage_bars, status_words, write_page
+from otsync.report.page import cards, extent, footer, number, remedies, stage_bars, status_words, verdict, write_page
 from otsync.types import Offsets, Video
 from recon.evaluate.views import ViewScore
 from recon.fit.verb import History, Reconstruction
@@ -62,8 +62,8 @@ def write_reconstruction_report(
     figure = effort(seconds, _answers(reconstruction, coarse, seconds), truth)
     parts = [
         "<p class=kind>Reconstruction of a recording</p>",
-        f"<h1>{_verdict(reconstruction)}</h1>",
-        f"<p class=lead>{extent(offsets, own) if filmed else ''} {_worth(views)}</p>",
+        f"<h1>{verdict(offsets)}</h1>",
+        f"<p class=lead>{extent(offsets, own) if filmed else ''} {_size(reconstruction)} {_worth(views)}</p>",
         _links(scene_page, sync_page),
         "".join(f"<p class=note><i>⚠</i> {escape(note)}</p>" for note in notes),
         *([stills(offsets, filmed), "<h2>On the common clock</h2>", timeline(offsets, own, filmed)] if filmed else []),
@@ -71,7 +71,7 @@ def write_reconstruction_report(
         _offset_rows(reconstruction, coarse, truth),
         "<p class=s>In frames of the reference. Before: what the fit began with. Moved: without the common shift "
         "of all videos, which images cannot tell. t<sub>world</sub> = rate · t<sub>video</sub> + offset. ± is one "
-        "standard deviation; the fit's own is a lower bound.</p>",
+        "standard deviation; after the fit, of what tracks and pictures say together.</p>",
         remedies(offsets),
         "<h2>What accuracy cost</h2>",
         f"<div class=figs><div>{stage_bars(seconds)}</div><div>{figure}</div></div>",
@@ -104,10 +104,11 @@ def _answers(reconstruction: Reconstruction, coarse: Offsets, seconds: Mapping[s
     return {last: coarse, "fit": reconstruction.offsets}
 
 
-def _verdict(reconstruction: Reconstruction) -> str:
+def _size(reconstruction: Reconstruction) -> str:
+    """Of the scene, in words."""
     moving, static = len(reconstruction.scene), reconstruction.scene.static
-    text = f"{len(reconstruction.offsets)} videos, {moving:,} moving Gaussians"
-    return text if static is None else f"{text}, {len(static):,} static"
+    still = "" if static is None else f" and {len(static):,} that stand still"
+    return f"The scene has {moving:,} moving Gaussians{still}."
 
 
 def _worth(views: Sequence[ViewScore]) -> str:
@@ -126,7 +127,7 @@ def _worth(views: Sequence[ViewScore]) -> str:
 
 def _offset_rows(reconstruction: Reconstruction, coarse: Offsets, truth: np.ndarray | None) -> str:
     offsets = reconstruction.offsets
-    head = [("video", False), ("status before the fit", True), ("before", False), ("after", False), ("moved", False)]
+    head = [("video", False), ("status", True), ("before", False), ("after", False), ("moved", False)]
     head += [("true", False), ("error", False)] if truth is not None else []
     rows = []
     for v, name in enumerate(offsets.names):

@@ -79,6 +79,20 @@ def test_fit_writes_offsets_scene_metrics_and_report(world, result, tmp_path, ca
     assert run["options"]["width"] == SIZE[0] and {"reading", "footage", "fit", "views"} <= run["seconds"].keys()
 
 
+def test_a_fit_is_shown_as_it_goes_on_and_ends_the_same(world, result, tmp_path, capsys, monkeypatch):
+    pytest.importorskip("viser", reason="no viser: pip install 'otsync[view]'")
+    from recon.view.window import Window
+
+    shown, show = [], Window.show
+    monkeypatch.setattr(Window, "show", lambda window, *a: (shown.append((window.address, a[-1])), show(window, *a)))
+    assert fit(world, tmp_path / "v", "--held-out", "held0", "--truth", str(world / "truth.json"), "--view") == 0
+    addresses, words = {a for a, _ in shown}, [w for _, w in shown]
+    assert len(addresses) == 1 and addresses.pop() in capsys.readouterr().err
+    assert len(words) >= 2 and len(set(words)) == len(words)
+    for name in ("offsets.json", "scene.npz"):  # to look at it changes nothing
+        assert (tmp_path / "v" / name).read_bytes() == (result / name).read_bytes()
+
+
 def test_a_camera_is_rendered_to_images_and_to_a_video(result, tmp_path):
     assert (
         main(["render", str(result), "--camera", "held0", "--times", "0.1", "0.3", "--out", str(tmp_path / "im")]) == 0
