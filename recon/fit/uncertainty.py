@@ -106,6 +106,19 @@ def reconciled(
     return offset, np.where(known, np.sqrt(variance), fitted_sigma), contradicted
 
 
+def repeated(
+    start: np.ndarray, start_sigma: np.ndarray, fitted: np.ndarray, fitted_sigma: np.ndarray, reference: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """:func:`reconciled` where the start is an earlier fit's: the same pictures are no second witness.
+
+    The fit's answer stands, with the larger one of both sigmas.
+    """
+    _, _, contradicted = reconciled(start, start_sigma, fitted, fitted_sigma, reference)
+    sigma = np.fmax(start_sigma, fitted_sigma)
+    sigma[reference] = fitted_sigma[reference]
+    return fitted, np.where(contradicted, np.hypot(sigma, fitted - start), sigma), contradicted
+
+
 def sandwich(g: np.ndarray, h: np.ndarray) -> float:
     """Variance of -sum(g)/sum(h) about zero, with the terms taken as independent; nan when h vanishes."""
     total = h.sum()

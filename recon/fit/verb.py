@@ -31,7 +31,7 @@ from recon.fit.checkpoint import Checkpoint
 from recon.fit.options import FitOptions
 from recon.fit.problem import Problem, assemble, check_groups
 from recon.fit.run import Diverged, Run
-from recon.fit.uncertainty import reconciled, relative_sigma, unsettled
+from recon.fit.uncertainty import reconciled, relative_sigma, repeated, unsettled
 from recon.fit.undisturbed import one_thread_each, uninterrupted
 from recon.footage.footage import Footage
 from recon.observe.effects import initial_parameters
@@ -84,6 +84,9 @@ class Reconstruction:
     history: History
     stats: dict[str, float] = field(default_factory=dict)
 
+
+PHOTOMETRIC = "photometric"
+"""In the stats of offsets: that these clocks are what a fit to pictures made of them."""
 
 Watch = Callable[[Gaussians4D, str], None]
 """Is shown a fit as it goes on: the scene, and where it stands in words."""
@@ -203,7 +206,8 @@ def _finish(run: Run, seconds: float) -> Reconstruction:
         moving = unsettled(_offsets_by_step(run, values["offsets"].cpu().numpy()), p.reference)
         fitted = np.hypot(run.sigma(values), moving)
         before = relative_sigma(sigma, p.reference)
-        refined, sigma, contradicted = reconciled(p.start, before, refined, fitted, p.reference)
+        together = repeated if p.offsets.stats.get(PHOTOMETRIC) else reconciled
+        refined, sigma, contradicted = together(p.start, before, refined, fitted, p.reference)
         for v in np.flatnonzero(contradicted):
             flags[p.index[v]] = in_order((*flags[p.index[v]], Status.CONTRADICTED))
     clocks = torch.as_tensor(refined).to(values["offsets"])
@@ -214,6 +218,7 @@ def _finish(run: Run, seconds: float) -> Reconstruction:
         sigma=_put(p.offsets.sigma, p.index, sigma),
         flags=tuple(flags),
         rates=_put(p.offsets.rates, p.index, values["clock_rates"].cpu().numpy()),
+        stats=dict(p.offsets.stats) | ({PHOTOMETRIC: 1.0} if "offsets" in run.adam.groups else {}),
     )
     history = History.of(run.rows)
     stats = {

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from recon.fit.uncertainty import newton_sigma, reconciled, relative_sigma, sandwich, unsettled
+from recon.fit.uncertainty import newton_sigma, reconciled, relative_sigma, repeated, sandwich, unsettled
 
 
 def test_sandwich_is_the_variance_of_the_weighted_step():
@@ -120,3 +120,12 @@ def test_a_start_relative_to_another_video_brings_the_references_error():
     assert relative_sigma(sigma, 1).tolist() == sigma.tolist()
     assert relative_sigma(sigma, 0) == pytest.approx([0, 0.03, 0.05])
     assert np.isnan(relative_sigma(np.array([np.nan, 0.1]), 1)[0])
+
+
+def test_a_fit_of_a_fit_does_not_count_its_pictures_twice():
+    start, fitted = np.array([0.0, 0.010, 0.010]), np.array([0.0, 0.012, 0.110])
+    before, after = np.array([0.0, 0.004, 0.004]), np.array([0.0, 0.003, 0.003])
+    offset, sigma, contradicted = repeated(start, before, fitted, after, 0)
+    assert offset.tolist() == fitted.tolist()
+    assert sigma[0] == 0.0 and sigma[1] == 0.004  # averaged it would be .0024
+    assert contradicted.tolist() == [False, False, True] and sigma[2] >= 0.1
