@@ -129,7 +129,9 @@ def find_breaks(
     curves = local_curves(pair, lags, floor, weight)
     best = int(np.argmax(curves.sum(0)))
     straight = float(curves[:, best].sum())
-    doubtful = prefers_another(curves, best, seen_share(pair, int(lags[best]), step))
+    rate_gain, even = _as_a_rate(curves, straight)
+    line = even if rate_gain > AS_A_RATE else np.full(windows, best)
+    doubtful = prefers_another(curves, line, seen_share(pair, int(lags[best]), step))
     curves = without_chance(curves, best, pair, int(lags[best]), step)
     least, ratio = explained(pair, int(lags[best]), floor, step)
     doubtful |= ratio > UNUSUAL
@@ -143,7 +145,7 @@ def find_breaks(
             break
     else:
         return NONE, max(gain, 0.0), doubtful
-    if gain <= _rate_gain(curves, straight) + AS_A_RATE:
+    if gain <= _as_a_rate(curves, straight)[0] + AS_A_RATE:
         return NONE, gain, doubtful  # a rate explains it as well, with one number
     spans = np.split(np.arange(windows), edges)
     tops = [int(np.argmax(curves[p].sum(0))) for p in spans]
@@ -169,15 +171,17 @@ def seen_share(pair: CommonClock, lag: int, step: int) -> Float[np.ndarray, " W"
     return share
 
 
-def prefers_another(curves: Float[np.ndarray, "W K"], best: int, seen: Float[np.ndarray, " W"]) -> bool:
-    """Whether two windows in a row, in which enough is seen, clearly suit an offset other than the best one."""
+def prefers_another(
+    curves: Float[np.ndarray, "W K"], line: Int[np.ndarray, " W"], seen: Float[np.ndarray, " W"]
+) -> bool:
+    """Whether two windows in a row, in which enough is seen, clearly suit an offset beside ``line``, that of each."""
     usual = float(np.median(seen[seen > 0])) if (seen > 0).any() else 0.0
     told = np.flatnonzero(np.minimum(seen[:-1], seen[1:]) >= SEEN * usual)
     if usual == 0 or not len(told):
         return False
-    two = curves[told] + curves[told + 1]
-    gain = float((two.max(1) - two[:, best]).max())
-    return gain > PREFERS + OF_USUAL * max(float(np.median(two[:, best])), 0.0)
+    here = curves[told, line[told]] + curves[told + 1, line[told + 1]]
+    gain = float(((curves[told] + curves[told + 1]).max(1) - here).max())
+    return gain > PREFERS + OF_USUAL * max(float(np.median(here)), 0.0)
 
 
 def explained(pair: CommonClock, lag: int, floor: float, step: int) -> tuple[float, float]:
@@ -261,12 +265,15 @@ def _parts(
     return path, float(curves[np.arange(len(path)), path].sum() - straight)
 
 
-def _rate_gain(curves: Float[np.ndarray, "W K"], straight: float) -> float:
-    """Evidence that a lag which changes evenly adds to the best constant one; changes of at least a frame are tried."""
+def _as_a_rate(curves: Float[np.ndarray, "W K"], straight: float) -> tuple[float, Int[np.ndarray, " W"]]:
+    """Evidence that a lag which changes evenly adds to the best constant one, and that lag's index in every window.
+
+    Changes of at least a frame are tried; where none can be, nothing is added, and the index is 0.
+    """
     W, K = curves.shape
     position = np.arange(W) - (W - 1) / 2
     most = min(K // 2, int(np.ceil(SLOPES * W * 10)))
-    best = 0.0
+    gain, line = 0.0, np.zeros(W, np.int64)
     for ends in range(-most, most + 1):
         shift = np.rint(ends * position / max(W - 1, 1)).astype(np.int64)
         reach = int(np.abs(shift).max(initial=0))
@@ -274,8 +281,10 @@ def _rate_gain(curves: Float[np.ndarray, "W K"], straight: float) -> float:
             continue
         middle = np.arange(reach, K - reach)
         total = sum(curves[w, middle + shift[w]] for w in range(W))
-        best = max(best, float(np.max(total)) - straight)
-    return best
+        top = int(np.argmax(total))
+        if total[top] - straight > gain:
+            gain, line = float(total[top] - straight), middle[top] + shift
+    return gain, line
 
 
 def without_steps(

@@ -91,7 +91,7 @@ def animation(browser: Any, page: Path, camera: str | None) -> tuple[list[Any], 
     shown.open(page)
     low, high = (float(shown.page.get_attribute("#time", end) or 0) for end in ("min", "max"))
     times = np.linspace(low + 0.25 * (high - low), low + 0.75 * (high - low), STEPS)
-    last = camera or shown.page.locator("#camera option").nth(2).get_attribute("value")
+    last = camera or shown.page.locator("#camera option").nth(2).inner_text()
     for clocks, through in (("filmed", ""), ("synchronised", ""), ("synchronised", last)):
         for n, t in enumerate(times):
             asked = {"time": f"{t:.3f}"} | ({"camera": through} if through else {})

@@ -93,6 +93,18 @@ def test_noise_that_leaves_much_unexplained_everywhere_is_no_break(seed):
     assert offsets.status[1].ok and world.errors(offsets)[0][0] < 0.4
 
 
+def test_a_rate_is_no_break():
+    world = CLASSES["rate 1 %, 20 s"](501)
+    offsets = synchronize(world.tracks)
+    assert offsets.status[1].ok and abs(offsets.rates[1] - 1) > 0.009 and world.errors(offsets)[0][0] < 0.1
+
+
+@pytest.mark.parametrize("seed", [24006, 24011])
+def test_two_takes_whose_seconds_hardly_disagree_are_flagged(seed):
+    """Both were trusted once: their seconds differ by a fifth and a quarter of a frame."""
+    assert not synchronize(CLASSES["two takes"](seed).tracks).status[1].ok
+
+
 def test_breaks_survive_the_file(tmp_path):
     known = Offsets.known(("a", "b"), np.array([0.0, 0.5]), 30)
     import dataclasses
