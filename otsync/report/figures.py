@@ -183,9 +183,9 @@ def effort(
     for name, x, y in zip(names, at, sigma, strict=True):
         late = x > 0.55 * total  # words that would leave the figure stand on the other side
         ax.annotate(
-            f"{name.rpartition(': ')[2] or 'given'}, {x:.3g} s",
+            f"after {name.rpartition(': ')[2]}, {x:.3g} s" if name else "given",
             (x, y),
-            xytext=(-4 if late else 4, 6),
+            xytext=(-6, -11) if late else (4, 6),
             textcoords="offset points",
             fontsize=7,
             ha="right" if late else "left",
@@ -193,7 +193,12 @@ def effort(
     for name, end in ends.items():
         if name and seconds[name] > 0.03 * total:
             ax.axvline(end, color=GREY, lw=0.5, zorder=0)
-    ax.set(xlabel="wall seconds since the start", ylabel="frames", yscale="log", xlim=(-0.02 * total, 1.05 * total))
+    ax.set(
+        xlabel="wall seconds since the start (lines: a stage ends)",
+        ylabel="frames",
+        yscale="log",
+        xlim=(-0.02 * total, 1.05 * total),
+    )
     ax.margins(y=0.3)
     ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     ax.yaxis.set_major_formatter("{x:g}")

@@ -215,9 +215,10 @@ def _graph(offsets: Offsets) -> str:
 def stage_bars(seconds: Mapping[str, float]) -> str:
     """Wall time of every stage, as HTML."""
     longest = max(seconds.values(), default=0.0) or 1.0
+    words = [stage.replace("synchronise: synchronise", "synchronise: offsets") for stage in seconds]
     rows = "".join(
         f'<li><span>{escape(stage)}</span><i style="width:{100 * s / longest:.1f}%"></i><span>{s:.1f} s</span>'
-        for stage, s in seconds.items()
+        for stage, s in zip(words, seconds.values(), strict=True)
     )
     return f"<ul class=steps>{rows}</ul>" if rows else ""
 

@@ -46,6 +46,9 @@ PAGE = (
 PER_ROW = 1024
 """Gaussians in a row of the page's textures. What stands still begins with a row of its own."""
 
+EVEN = 5e-4
+"""Seconds that a video's frames may lie beside an even grid to be told by its step alone."""
+
 FINEST = 0.25
 """Largest step of a position, in working pixels at the depth of what moves."""
 
@@ -220,10 +223,20 @@ def _camera(
         "rate": video.clock.rate,
         "first": float(video.times[0]),
         "last": float(video.times[-1]),
+        "shots": _shots(video.times),
         "gain": [float(g) for g in video.gain],
         "held_out": video.held_out,
         **_trust(video, result),
     }
+
+
+def _shots(times: np.ndarray) -> dict[str, Any]:
+    """When a video has frames: the seconds between them where these are even, else all times."""
+    step = (times[-1] - times[0]) / max(len(times) - 1, 1)
+    even = times[0] + step * np.arange(len(times))
+    if step > 0 and np.abs(times - even).max() < EVEN:
+        return {"step": float(step)}
+    return {"times": [round(float(t), 5) for t in times]}
 
 
 def _trust(video: FilmedBy, result: SavedReconstruction | None) -> dict[str, Any]:

@@ -69,9 +69,9 @@ def write_reconstruction_report(
         *([stills(offsets, filmed), "<h2>On the common clock</h2>", timeline(offsets, own, filmed)] if filmed else []),
         "<h2>How sure</h2>",
         _offset_rows(reconstruction, coarse, truth),
-        "<p class=s>In frames of the reference. Before: what the fit began with. Moved: without the common shift "
-        "of all videos, which images cannot tell. t<sub>world</sub> = rate · t<sub>video</sub> + offset. ± is one "
-        "standard deviation; after the fit, of what tracks and pictures say together.</p>",
+        "<p class=s>Frames are those of the reference. A positive offset means that the video's clock started later: "
+        "t<sub>world</sub> = rate · t<sub>video</sub> + offset. ± is one standard deviation; after the fit, of what "
+        "tracks and pictures say together: it grows where the two disagree.</p>",
         remedies(offsets),
         "<h2>What accuracy cost</h2>",
         f"<div class=figs><div>{stage_bars(seconds)}</div><div>{figure}</div></div>",
@@ -127,8 +127,9 @@ def _worth(views: Sequence[ViewScore]) -> str:
 
 def _offset_rows(reconstruction: Reconstruction, coarse: Offsets, truth: np.ndarray | None) -> str:
     offsets = reconstruction.offsets
-    head = [("video", False), ("status", True), ("before", False), ("after", False), ("moved", False)]
-    head += [("true", False), ("error", False)] if truth is not None else []
+    titles = ["before the fit, frames", "after, frames", "moved, frames"]
+    titles += ["true, frames", "error, frames"] if truth is not None else []
+    head = [("video", False), ("status", True), *((title, False) for title in titles)]
     rows = []
     for v, name in enumerate(offsets.names):
         fps = float(offsets.fps[offsets.component[v]])
@@ -177,7 +178,10 @@ def _pace(reconstruction: Reconstruction) -> str:
     # a continued fit has a time for each of its sessions: the longest is about what it took
     seconds = max([reconstruction.stats.get("seconds", 0.0), *reconstruction.history.seconds.tolist()])
     text = f"{reconstruction.stats.get('steps', 0.0):.0f} steps" + (f", {seconds:.1f} s" if seconds >= 0.1 else "")
-    return text + ". Left: relative to the reference. Right: mean over the images since the last point."
+    return text + (
+        ". Left: the fit's own path, relative to the reference; the answer above weighs the clocks of the tracks, too. "
+        "Right: mean over the images since the last point."
+    )
 
 
 def offset_curves(
@@ -221,14 +225,14 @@ def _view_rows(views: Sequence[ViewScore], lpips_reason: str) -> str:
 
 
 def views_over_time(views: Sequence[ViewScore]) -> str:
-    """PSNR of every compared frame: the whole image, and where things move (dashed)."""
+    """PSNR of every compared frame: the whole image, and where things move (dashed); held-out cameras in bold."""
     figure, ax = axes_of()
     for n, v in enumerate(views):
-        color = f"C{n % 10}" if v.held_out else GREY
+        color, width = f"C{n % 10}", 1.8 if v.held_out else 1.0
         for key, style in (("psnr", "-"), ("mask_psnr", "--")):
             values = np.array([frame[key] for frame in v.frames])
             if np.isfinite(values).any():
-                ax.plot(v.times, values, style, lw=1, color=color, label=v.name if style == "-" else None)
+                ax.plot(v.times, values, style, lw=width, color=color, label=v.name if style == "-" else None)
     ax.set(xlabel="world seconds (dashed: what moves)", ylabel="PSNR, dB")
     if len(views) <= 10:
         legend_above(ax)

@@ -57,3 +57,25 @@ class Clocks {
     return camera.rate * this.own(camera, t) + camera.offset;
   }
 }
+
+const FILMED = 0.0005; // seconds beside a frame within which the instant is that frame's
+
+/** Seconds between a second of a video's own clock and its nearest frame; none where it does not film. */
+function besideFrame({ first, last, shots }, own) {
+  const apart = ({ times, step }) => {
+    if (!times) return Math.abs(own - first - Math.round((own - first) / step) * step);
+    return times.reduce((least, t) => Math.min(least, Math.abs(own - t)), Infinity);
+  };
+  return own < first - FILMED || own > last + FILMED ? Infinity : apart(shots);
+}
+
+/** In words, whether any video filmed this instant: what is shown is rendered, on frames and between them alike. */
+function filmedWords(cameras, clocks, seconds) {
+  if (!cameras.length) return '';
+  if (!clocks.synchronised) return 'rendered; videos as if all had begun together';
+  const beside = cameras.map((camera) => camera.rate * besideFrame(camera, clocks.own(camera, seconds)));
+  const nearest = beside.indexOf(Math.min(...beside));
+  if (beside[nearest] === Infinity) return 'rendered; no video filmed then';
+  if (beside[nearest] <= FILMED) return `rendered; a frame of ${cameras[nearest].name} is of this instant`;
+  return `rendered between frames; the nearest is ${(1000 * beside[nearest]).toFixed(1)} ms away, of ${cameras[nearest].name}`;
+}

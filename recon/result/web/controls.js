@@ -116,7 +116,7 @@ function videoTiles(list, { cameras, step }, chosen) {
     button.addEventListener('click', () => chosen(v));
     item.append(button);
     list.append(item);
-    return { button, picture };
+    return { button, picture, offset };
   });
 }
 

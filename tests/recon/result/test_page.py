@@ -21,7 +21,7 @@ from recon.result import Page
 from recon.result.export import export_result
 from recon.result.images import rendered
 from recon.result.packing import Packing
-from recon.result.page import ENGINE, PAGE, write_page
+from recon.result.page import ENGINE, PAGE, _shots, write_page
 from recon.result.strips import read_strips, strips_of, write_strips
 from tests.browser import Opened, chromium, psnr
 from tests.recon.result.filmed import FAR, MOTIONS, SIZE, footage_like, reconstruction, scene_of
@@ -321,6 +321,35 @@ def test_clocks_as_filmed_and_synchronised(opened, scene_page):
     }"""
     shown = opened.page.evaluate(own, [2, 0.5])
     assert shown == pytest.approx([(0.5 - 0.16) / 1.02, 0.5, 0.5])
+
+
+def test_it_says_whether_a_frame_is_of_this_instant(opened, scene_page):
+    cameras = about_of(scene_page)["cameras"]
+    frames = [
+        camera["rate"] * (camera["first"] + camera["shots"]["step"] * np.arange(60)) + camera["offset"]
+        for camera in cameras
+    ]
+    apart = [[np.abs(f - t).min() for f in frames] for t in np.linspace(0.4, 0.7, 200)]
+    between = float(np.linspace(0.4, 0.7, 200)[int(np.argmax(np.min(apart, 1)))])
+    asked = np.array([np.abs(f - between).min() for f in frames])
+    said = opened.open(scene_page, time=f"{between:.4f}").page.inner_text("#between")
+    assert said == (
+        f"rendered between frames; the nearest is {1000 * asked.min():.1f} ms away, of "
+        f"{cameras[int(asked.argmin())]['name']}"
+    )
+    on_a_frame = frames[0][np.abs(frames[0] - 0.5).argmin()]
+    said = opened.open(scene_page, time=f"{on_a_frame:.5f}").page.inner_text("#between")
+    assert said == f"rendered; a frame of {cameras[0]['name']} is of this instant"
+    opened.press("c")
+    assert opened.rested().page.inner_text("#between") == "rendered; videos as if all had begun together"
+    assert opened.page.inner_text("#videos li:nth-child(3) small") == "taken as not late"
+
+
+def test_frames_that_come_unevenly_are_told_one_by_one():
+    even, uneven = np.arange(30) / 30, np.array([0.0, 0.03, 0.07, 0.08])
+    assert _shots(even) == {"step": pytest.approx(1 / 30)}
+    assert _shots(uneven) == {"times": uneven.tolist()}
+    assert _shots(np.array([0.5])) == {"times": [0.5]}
 
 
 def test_layers_and_the_video_over_the_rendering(opened, scene_page):
