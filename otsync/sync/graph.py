@@ -141,11 +141,10 @@ def solve(n: int, edges: Sequence[Edge], anchor: int, start: np.ndarray | None =
     first = y if y is not None else np.asarray(start)[free] - np.asarray(start)[anchor]
     y, normal = _reweighted(A, d, s, first, _cauchy)
     x[free] = y
-    variance = (1 - shared) * np.diag(np.linalg.inv(normal))
-    if shared:
-        own = _own_variance(n, used)
-        variance = variance + shared * (own[free] + own[anchor])
-    sigma[free] = np.sqrt(variance)
+    alone = np.diag(np.linalg.inv(normal))  # as if no two edges had anything in common
+    own = _own_variance(n, used)
+    together = (1 - shared) * alone + shared * (own[free] + own[anchor])
+    sigma[free] = np.sqrt(np.maximum(alone, together))
     return Solution(x, sigma, np.array([x[e.b] - x[e.a] - e.offset for e in edges]))
 
 

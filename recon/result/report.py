@@ -14,7 +14,18 @@ import numpy as np
 
 from otsync.report.clock import inline_image, measured, stills, timeline
 from otsync.report.figures import CHOSEN, GREY, axes_of, effort, svg
-from otsync.report.page import cards, extent, footer, number, remedies, stage_bars, status_words, verdict, write_page
+from otsync.report.page import (
+    TRUSTED,
+    cards,
+    extent,
+    footer,
+    number,
+    remedies,
+    stage_bars,
+    status_words,
+    verdict,
+    write_page,
+)
 from otsync.types import Offsets, Video
 from recon.evaluate.views import ViewScore
 from recon.fit.verb import History, Reconstruction
@@ -71,7 +82,7 @@ def write_reconstruction_report(
         _offset_rows(reconstruction, coarse, truth),
         "<p class=s>Frames are those of the reference. A positive offset means that the video's clock started later: "
         "t<sub>world</sub> = rate · t<sub>video</sub> + offset. ± is one standard deviation; after the fit, of what "
-        "tracks and pictures say together: it grows where the two disagree.</p>",
+        f"tracks and pictures say together: it grows where the two disagree. {TRUSTED}</p>",
         remedies(offsets),
         "<h2>What accuracy cost</h2>",
         f"<div class=figs><div>{stage_bars(seconds)}</div><div>{figure}</div></div>",

@@ -547,8 +547,8 @@ BREAKS = (
     Break(
         "graph-shared-dropped",
         "otsync/sync/graph.py",
-        "variance = variance + shared * (own[free] + own[anchor])",
-        "variance = variance + 0.0 * (own[free] + own[anchor])",
+        "together = (1 - shared) * alone + shared * (own[free] + own[anchor])",
+        "together = (1 - shared) * alone",
         SYNC,
         "sigma of the solution takes pairs as independent",
     ),

@@ -741,7 +741,11 @@ def test_options_of_render(result, fitted, home):
     assert path != images(*orbit, "--turns", "0.5")
     done(recon.cli.main, ["render", str(result), *camera, "--out", str(home / "seen.mp4"), "--times", "0.1"])
     assert (home / "seen.mp4").stat().st_size > 100
-    refused(recon.cli.main, ["render", str(result)], "--camera, --path")
+    refused(recon.cli.main, ["render", str(result)], "--camera, --every-camera, --path")
+    refused(recon.cli.main, ["render", str(result), "--every-camera"], "{camera}")
+    every = ["--every-camera", "--times", "0.1", "--out", str(home / "every {camera}")]
+    done(recon.cli.main, ["render", str(result), *every])
+    assert len(list(home.glob("every *"))) > 1
     refused(recon.cli.main, ["render", str(result), *camera, "--turns", "2"], "--turns")
     refused(recon.cli.main, ["render", str(result), *camera, "--frames", "2"], "--frames")
 
@@ -895,7 +899,7 @@ def rows() -> set[str]:
         "protocol.cameras protocol.amplitudes protocol.seeds protocol.lengths protocol.held_out_tracks",
         "lifting": "scene out cache json allow_outside lifting.cameras lifting.steps lifting.seed lifting.width "
         "lifting.frames lifting.held_out lifting.channels",
-        "render": "result camera path times frames turns fps width out",
+        "render": "result camera every_camera path times frames turns fps width out",
         "eval": "result scene held_out offsets truth views lpips_weights out json allow_outside",
         "export": "result format at fps out",
         "demo": "out seed steps",

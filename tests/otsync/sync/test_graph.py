@@ -164,6 +164,8 @@ def test_shared_errors_change_sigma_and_nothing_else_and_nothing_of_a_single_pai
     assert (wide.sigma[1:] > plain.sigma[1:]).all() and wide.sigma[0] == 0
     one = edges_of(np.array([0.0, 0.3]), [(0, 1)], 0.02)
     assert solve(2, one, 0, shared=0.5).sigma[1] == pytest.approx(0.02)
+    hanging = [*edges_of(np.zeros(4), all_pairs(3), 0.01), Edge(0, 3, 0.0, 0.2, True)]
+    assert solve(4, hanging, 0, shared=0.5).sigma[3] == pytest.approx(0.2)  # no less than its only edge says
 
 
 def test_lags_without_overlap_say_nothing():

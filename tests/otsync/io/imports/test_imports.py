@@ -69,7 +69,7 @@ def test_timecodes_of_the_files_themselves(tmp_path):
     assert main(["import-offsets", str(tmp_path), str(tmp_path), "--out", str(tmp_path / "out")]) == 0
     offsets = Offsets.load(tmp_path / "out/offsets.json")
     np.testing.assert_allclose(offsets.seconds, [0, 1.5])
-    assert offsets.sigma[1] == pytest.approx(1.5 * np.sqrt(2 / 12) / 30)
+    assert offsets.sigma[1] == pytest.approx(np.sqrt(2 / 12) / 30)
 
 
 def test_polysyncs_sidecars_and_pose2sims_log(tmp_path):
