@@ -22,7 +22,6 @@ from recon.raster.rendering import Settings, Splats
 
 # fixed, so that sums over parts do not depend on the threads; fewer are done sooner than another thread is woken
 GAUSSIANS_PER_PART = 2048
-COPIED_PER_PART = 8192  # the same where hardly anything is computed
 logger = logging.getLogger("recon.raster")
 
 DEPTH_MODES = {None: kernels.NO_DEPTH, "accumulated": kernels.ACCUMULATED, "expected": kernels.EXPECTED}
@@ -211,7 +210,7 @@ class _Rasterize(torch.autograd.Function):
             outgoing[2][:] = 0
         for_each(
             kernels.reduce,
-            ranges(n, COPIED_PER_PART),
+            ranges(n, GAUSSIANS_PER_PART),
             *(n_cameras, len(ctx.features_shape) == 2, with_depth),
             *((tiles.rank_of_splat, tiles.slot_starts, tiles.records), gradients, row),
             tuple(a.reshape(-1) for a in outgoing),
@@ -226,7 +225,7 @@ def _in_rank_order(features: np.ndarray, depths: np.ndarray, order: np.ndarray, 
     channels = np.empty((len(order), d + with_depth), np.float32)
     for_each(
         kernels.gather_channels,
-        ranges(len(order), COPIED_PER_PART),
+        ranges(len(order), GAUSSIANS_PER_PART),
         *(order, features.reshape(-1, d), n if features.ndim == 2 else 0, depths, channels),
     )
     return channels.reshape(-1)

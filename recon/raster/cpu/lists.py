@@ -19,7 +19,7 @@ from recon.raster.rendering import ALPHA_MIN
 TILE_WIDTH, TILE_HEIGHT = 64, 16  # pixels: wide, because most of the work is per row of a splat in a tile
 RECORD = 11  # floats of a packed splat; the last three are the residuals of float32
 MEAN_X, MEAN_Y, VAR_X, SLOPE, PER_VAR_Y, OPACITY, REACH2, HALF_Y, REST_X, REST_Y, REST_SLOPE = range(RECORD)
-LEAST_PART, MOST_PARTS = 8192, 16  # splats of one part at the least; parts, each with a counter per tile
+LEAST_PART, MOST_PARTS = 2048, 16  # splats of one part at the least; parts, each with a counter per tile
 
 F32 = np.float32
 MARGIN = F32(0.01)  # pixels added to every extent: a splat at the rounding edge of a row is tested, not lost
