@@ -18,6 +18,9 @@ from .clock import began, measured, stills, timeline
 from .pairs import pair_section
 from .style import STYLE
 
+NEARLY_ZERO = 0.0005
+"""Seconds."""
+
 SECOND = np.array([0.0, 1.0])
 """Of a video whose length nobody told: its bar is a second long."""
 
@@ -64,6 +67,7 @@ def write_report(
         _offset_table(offsets, truth),
         "<p class=s>A positive offset means that the video's clock started later than the reference's: "
         f"t<sub>world</sub> = rate · t<sub>video</sub> + offset. ± is one standard deviation. {TRUSTED}</p>",
+        late_starts(offsets, own),
         remedies(offsets),
         _frames_table(offsets),
         _graph(offsets),
@@ -117,6 +121,18 @@ def extent(offsets: Offsets, own: Sequence[np.ndarray]) -> str:
         f"({apart * fps:.1f} frames of the reference) after <b>{escape(offsets.names[early])}</b>. "
         f"The clock is that of <b>{escape(offsets.names[offsets.reference])}</b>."
     )
+
+
+def late_starts(offsets: Offsets, own: Sequence[np.ndarray]) -> str:
+    """Which files' own clocks do not begin at 0, so that when they began is not their offset; as HTML, often empty."""
+    told = [
+        f"{escape(name)}'s first frame is at {t[0]:.3f} s of its file's own clock"
+        for name, t in zip(offsets.names, own, strict=True)
+        if len(t) and abs(t[0]) > NEARLY_ZERO
+    ]
+    if not told:
+        return ""
+    return f"<p class=s>Offsets are between clocks, bars show when videos began: {'; '.join(told)}.</p>"
 
 
 def cards(head: Sequence[tuple[str, bool]], rows: Sequence[Sequence[str]]) -> str:

@@ -19,6 +19,7 @@ from otsync.report.page import (
     cards,
     extent,
     footer,
+    late_starts,
     number,
     remedies,
     stage_bars,
@@ -83,6 +84,7 @@ def write_reconstruction_report(
         "<p class=s>Frames are those of the reference. A positive offset means that the video's clock started later: "
         "t<sub>world</sub> = rate · t<sub>video</sub> + offset. ± is one standard deviation; after the fit, of what "
         f"tracks and pictures say together: it grows where the two disagree. {TRUSTED}</p>",
+        late_starts(offsets, own) if filmed else "",
         remedies(offsets),
         "<h2>What accuracy cost</h2>",
         f"<div class=figs><div>{stage_bars(seconds)}</div><div>{figure}</div></div>",

@@ -76,6 +76,6 @@ function filmedWords(cameras, clocks, seconds) {
   const beside = cameras.map((camera) => camera.rate * besideFrame(camera, clocks.own(camera, seconds)));
   const nearest = beside.indexOf(Math.min(...beside));
   if (beside[nearest] === Infinity) return 'rendered; no video filmed then';
-  if (beside[nearest] <= FILMED) return `rendered; a frame of ${cameras[nearest].name} is of this instant`;
-  return `rendered between frames; the nearest is ${(1000 * beside[nearest]).toFixed(1)} ms away, of ${cameras[nearest].name}`;
+  if (beside[nearest] <= FILMED) return `rendered; video ${cameras[nearest].name} has a frame of this instant`;
+  return `rendered between frames; the nearest is ${(1000 * beside[nearest]).toFixed(1)} ms away, in video ${cameras[nearest].name}`;
 }

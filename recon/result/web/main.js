@@ -133,12 +133,12 @@ class Page {
     part('time').value = seconds;
     const frame = (seconds - about.start) / about.step;
     part('time').setAttribute('aria-valuetext', `${seconds.toFixed(3)} seconds`);
-    part('now').textContent = `${seconds.toFixed(3)} s · frame ${frame.toFixed(2)}`;
+    part('now').textContent = `${seconds.toFixed(3)} s · frame ${frame.toFixed(2)} of the reference`;
     part('between').textContent = filmedWords(about.cameras, this.clocks, seconds);
     this.timeline.draw(seconds);
     about.cameras.forEach((camera, v) => {
       this.tiles[v].button.setAttribute('aria-pressed', String(this.view.camera === v));
-      this.tiles[v].offset.textContent = this.clocks.synchronised ? offsetWords(camera) : 'taken as not late';
+      this.tiles[v].offset.textContent = this.clocks.synchronised ? offsetWords(camera) : 'offset not applied';
       this.#showTile(v, this.clocks.own(camera, seconds));
     });
     part('tour').setAttribute('aria-pressed', String(this.view.mode === 'tour'));

@@ -11,6 +11,7 @@ import pytest
 
 from otsync import DTW, ConstantShift, Matches, Offsets, Status, synchronize
 from otsync.report import write_report
+from otsync.report.page import late_starts
 from tests.otsync.align.test_align import films
 
 
@@ -34,6 +35,16 @@ class Outline(HTMLParser):
     def handle_starttag(self, tag, attrs):
         self.tags.append(tag)
         self.links += [v for k, v in attrs if k in ("src", "href", "xlink:href") and v]
+
+
+def test_a_file_whose_clock_begins_late_is_told(answer):
+    _, offsets = answer
+    own = [np.arange(5) / 30 for _ in offsets.names]
+    assert late_starts(offsets, own) == ""
+    own[0] = own[0] + 0.5
+    own[1] = own[1] + 0.25
+    told = late_starts(offsets, own)
+    assert "left's first frame is at 0.500 s" in told and "0.250 s" in told and "<script" not in told
 
 
 def test_page_is_self_contained_small_and_deterministic(tmp_path, answer):

@@ -334,15 +334,15 @@ def test_it_says_whether_a_frame_is_of_this_instant(opened, scene_page):
     asked = np.array([np.abs(f - between).min() for f in frames])
     said = opened.open(scene_page, time=f"{between:.4f}").page.inner_text("#between")
     assert said == (
-        f"rendered between frames; the nearest is {1000 * asked.min():.1f} ms away, of "
+        f"rendered between frames; the nearest is {1000 * asked.min():.1f} ms away, in video "
         f"{cameras[int(asked.argmin())]['name']}"
     )
     on_a_frame = frames[0][np.abs(frames[0] - 0.5).argmin()]
     said = opened.open(scene_page, time=f"{on_a_frame:.5f}").page.inner_text("#between")
-    assert said == f"rendered; a frame of {cameras[0]['name']} is of this instant"
+    assert said == f"rendered; video {cameras[0]['name']} has a frame of this instant"
     opened.press("c")
     assert opened.rested().page.inner_text("#between") == "rendered; videos as if all had begun together"
-    assert opened.page.inner_text("#videos li:nth-child(3) small") == "taken as not late"
+    assert opened.page.inner_text("#videos li:nth-child(3) small") == "offset not applied"
 
 
 def test_frames_that_come_unevenly_are_told_one_by_one():
