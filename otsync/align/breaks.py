@@ -32,7 +32,7 @@ PREFERS, OF_USUAL, SEEN = 0.6, 0.22, 0.5
 better than the best offset does, where at least a share of the usual samples is seen: noise leaves much of the motion
 unexplained at every offset, a break does so at one alone. In units of this limit clean pairs (270, seeds 600-699: mid
 to brutal, few tracks, like people) have .91 at most but for one of 1.25; trusted answers that were wrong at one end
-(frames lost, frozen pictures under hard and brutal noise) .62 to 1.8, five of seven more than 1."""
+(frames lost, frozen pictures under hard and brutal noise, two takes) .5 to 1.8, five of seven more than 1."""
 
 ODD, UNUSUAL, LEAST_MISSING = 3.0, 4.5, 0.15
 """How many times more than usual may be missing in two windows in a row: clean pairs 1.5 (mid), 4.3 (hard), 4.2
