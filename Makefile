@@ -8,17 +8,19 @@ WORKERS ?= 2
 .PHONY: demo pictures test test-all test-floors bench schemas docs stability lint format clean
 .DELETE_ON_ERROR:
 
-$(VENV)/.core: pyproject.toml constraints.txt
-	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	rm -rf otsync.egg-info  # a stale one hides new entry points
-	$(PIP) -e .
-	touch $@
+NEEDED := pyproject.toml constraints.txt
 
-$(VENV)/.test: $(VENV)/.core
+$(BIN)/python:
+	$(PYTHON) -m venv $(VENV)
+
+# one installation for each, not one upon the other
+$(VENV)/.test: $(NEEDED) | $(BIN)/python
+	rm -rf otsync.egg-info  # a stale one hides new entry points
 	$(PIP) -e '.[recon,test]'
 	touch $@
 
-$(VENV)/.demo: $(VENV)/.core
+$(VENV)/.demo: $(NEEDED) | $(BIN)/python
+	rm -rf otsync.egg-info
 	$(PIP) -e '.[recon,video]'
 	touch $@
 
@@ -42,7 +44,8 @@ lint: $(VENV)/.test
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-$(VENV)/.docs: $(VENV)/.core
+$(VENV)/.docs: $(NEEDED) | $(BIN)/python
+	rm -rf otsync.egg-info
 	$(PIP) -e '.[docs,video]'
 	touch $@
 
