@@ -12,9 +12,8 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor
-from contextlib import contextmanager
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -151,7 +150,7 @@ def run(
     if done:
         say(f"{len(done)} cases are kept from an earlier run; {len(left)} are to be measured")
     if left:
-        with workers(cases) as pool:
+        with workers(cases, only) as pool:
             for found in counted(pool.map(partial(measure, only=only), left), "chains", "case", len(left)):
                 rows += found
                 write_rows(out, "chain_answers", rows, about)  # a run that is stopped continues here
@@ -173,25 +172,20 @@ def continued(out: Path, about: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 _cases: list[tuple[str, Callable[[], Case]]] = []
-"""What the workers choose from: forked with it, since a recording's tracks are too large to send for every pair."""
+"""What a worker chooses from: sent to it once, since a recording's tracks are too large to send for every pair."""
 
 
-@contextmanager
-def workers(cases: list[tuple[str, Callable[[], Case]]]) -> Iterator[Executor]:
-    """One process a core, each with the cases."""
+def workers(cases: list[tuple[str, Callable[[], Case]]], only: tuple[str, ...]) -> Executor:
+    """One process a core, each with the cases; begun anew, since a fork beside threads may wait for one forever."""
+    cores = len(os.sched_getaffinity(0))
+    return ProcessPoolExecutor(cores, mp_context=get_context("spawn"), initializer=begin, initargs=(cases, only))
+
+
+def begin(cases: list[tuple[str, Callable[[], Case]]], only: tuple[str, ...]) -> None:
+    """A worker takes the cases. Imports and compiled loops are no method's time."""
     _cases[:] = cases
-    try:
-        cores = len(os.sched_getaffinity(0))
-        with ProcessPoolExecutor(cores, mp_context=get_context("fork"), initializer=warm) as pool:
-            yield pool
-    finally:
-        _cases.clear()
-
-
-def warm() -> None:
-    """Imports and compiled loops are no method's time."""
     for case in (SITUATIONS["mid"](0), SITUATIONS["no depth"](0)):
-        for method in contenders(case.a.xyz is None).values():
+        for method in contenders(case.a.xyz is None, only).values():
             synchronize([case.a, case.b], method=method)
 
 
