@@ -173,6 +173,7 @@ def measure(size: tuple[int, int, int], channels: int, repeats: int, names: Sequ
     for _ in range(repeats):
         for name, case in cases.items():
             time.sleep(SETTLE)
+            case.both()  # not counted: threads sleep after a rest, and in a fit one rendering follows the other
             times[name].append(case.both())
     truth = cases["torch"].forward()
     pairs = splats_per_pixel(tensors, width, height) * width * height
