@@ -103,7 +103,8 @@ def read_footage(scene: Scene, width: int, cache: Any, map: MapLike, progress: P
     measured = [v.name for v, m in zip(scene.videos, scene.masks, strict=True) if m is None]
     if measured:
         progress.note(
-            f"no masks given for {', '.join(measured)}: what differs from the median over time counts as moving"
+            f"no masks given for {', '.join(measured)}: what differs from the median over time counts as moving, "
+            "so shadows do, and what stands still for half of the clip does not. Masks of your own mend that"
         )
 
     def one(item: tuple[Video, Any]) -> Footage:

@@ -152,12 +152,17 @@ def _offset_rows(reconstruction: Reconstruction, coarse: Offsets, truth: np.ndar
             "reference" if v == offsets.reference else status_words(offsets.status[v], offsets.flags[v]),
             measured(float(coarse.frames[v]), float(coarse.sigma[v]) * fps),
             measured(after, float(offsets.sigma[v]) * fps),
-            number(after - float(coarse.frames[v]), 3),
+            _moved(after - float(coarse.frames[v]), v == offsets.reference),
         ]
         if truth is not None:
             cells += [number(float(truth[v]) * fps, 3), number(after - float(truth[v]) * fps, 3)]
         rows.append(cells)
     return cards(head, rows)
+
+
+def _moved(frames: float, reference: bool) -> str:
+    """How far a fit moved a clock, in words where it did not."""
+    return "reference" if reference else "held" if frames == 0 else number(frames, 3)
 
 
 def convergence(

@@ -37,6 +37,7 @@ function steer(canvas, view, stage, changed, chosen) {
     } else {
       view.orbit(dx * TURN, dy * TURN);
     }
+    part('hint').classList.add('known'); // whoever has turned the scene needs no hint
     changed();
   });
   const lift = (event) => {

@@ -4,7 +4,7 @@
 'use strict';
 
 const FLY_SECONDS = 1.1; // from one view to another
-const HOME = { orbit: [0.3, 0.2], zoom: 1.5 }; // from the reference's camera to the view that the page opens with
+const HOME = { right: 0.3, up: 0.2, zoom: 1.5 }; // from the reference's camera to the view that the page opens with
 const LEG_SECONDS = 3; // from camera to camera on the tour
 
 /** One image to draw: pose, lens and size in pixels of the canvas. */
@@ -139,12 +139,24 @@ class View {
     return [...row, ...row.slice(1, -1).reverse()];
   }
 
-  /** Back to the view that the page opens with: from behind the reference's camera, which is seen with the others. */
+  /**
+   * Back to the view that the page opens with: from behind the reference's camera, which is seen with the others, and
+   * on the side where these stand: what lies on the other side nobody may have filmed.
+   */
   home() {
-    const camera = this.about.cameras[this.about.reference];
+    const { cameras, reference } = this.about;
+    const camera = cameras[reference];
     this.free(camera ? camera.poses[0] : lookAt(this.about.eye, this.about.focus, this.about.up));
     if (!camera) return;
-    this.orbit(...HOME.orbit);
+    const start = { pose: this.pose, focus: this.focus };
+    const among = times(cameras.reduce((sum, { poses }) => add(sum, poses[0].eye), [0, 0, 0]), 1 / cameras.length);
+    const beside = [1, -1].map((side) => {
+      Object.assign(this, start);
+      this.orbit(side * HOME.right, HOME.up);
+      return { pose: this.pose, focus: this.focus };
+    });
+    const [right, left] = beside.map(({ pose }) => length(subtract(pose.eye, among)));
+    Object.assign(this, beside[left < right ? 1 : 0]);
     this.zoom(HOME.zoom);
   }
 

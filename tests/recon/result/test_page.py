@@ -276,6 +276,8 @@ def test_cameras_are_chosen_by_key_list_and_picture(opened, scene_page):
 
 def test_the_view_is_turned_moved_and_brought_closer(opened, scene_page):
     opened.open(scene_page)
+    assert opened.page.locator("#hint").evaluate("hint => getComputedStyle(hint).opacity") == "1"
+    opened.page.evaluate("document.getElementById('hint').hidden = true")  # it goes while the view is turned
     before = [opened.picture("#view")]
 
     def changed() -> None:
@@ -301,6 +303,7 @@ def test_the_view_is_turned_moved_and_brought_closer(opened, scene_page):
     opened.page.evaluate("document.activeElement.blur()")  # the ring around what has the focus
     opened.press("h")
     assert psnr(opened.picture("#view"), before[0]) > 40
+    assert "known" in (opened.page.get_attribute("#hint", "class") or "")  # whoever has turned the scene needs no hint
 
 
 def test_clocks_as_filmed_and_synchronised(opened, scene_page):
