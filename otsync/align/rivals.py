@@ -97,6 +97,7 @@ def rival(a: TrackSet, b: TrackSet, matches: Matches, offset: float) -> Rival:
     steps = np.arange(math.ceil(NEAR / STEP), round(REACH / STEP) + 1)
     others = offset + STEP * np.concatenate([-steps, steps])
     apart = np.array([_distance(xa, xb, a.times, b.times, likely, at) for at in others])
+    apart = np.concatenate([_beyond_the_valley(apart[: len(steps)]), _beyond_the_valley(apart[len(steps) :])])
     if not np.isfinite(apart).any() or not here > 0:
         return Rival(math.inf, False)
     ratio = apart / here
@@ -117,6 +118,16 @@ def rival(a: TrackSet, b: TrackSet, matches: Matches, offset: float) -> Rival:
 
     nearest = [i for i in np.argsort(ratio, kind="stable")[:MOST_TRIED] if ratio[i] < NEARLY]
     return Rival(least, any(suits(float(others[i]), float(ratio[i])) for i in nearest))
+
+
+def _beyond_the_valley(apart: Float[np.ndarray, " K"]) -> Float[np.ndarray, " K"]:
+    """Distances further and further from the answer, nan as long as they only grow: these are shoulders of the answer's
+    own valley, which is wide where things move slowly, and no other times.
+    """
+    known = np.flatnonzero(np.isfinite(apart))
+    falls = np.flatnonzero(np.diff(apart[known]) < 0)
+    first = known[falls[0] + 1] if len(falls) else len(apart)
+    return np.where(np.arange(len(apart)) >= first, apart, np.nan)
 
 
 def _moving(a: TrackSet, index: Int[np.ndarray, " M"], resting: float) -> Int[np.ndarray, " N"]:

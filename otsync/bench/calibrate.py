@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from ..calibrate import CalibrateOptions, Calibration, calibrate
 from ..calibrate.clips import Clip, Lens
@@ -20,6 +22,7 @@ from ..calibrate.document import calibrated_document
 from ..calibrate.verb import calibrate_clips
 from ..calibrate.world import centres, degrees, laid_over
 from ..files.cache import Cache
+from ..geometry import common_target, undistort
 from ..io import open_scene
 from ..io.readers import describe_folder
 from ..io.scene import Scene, scene_from_document
@@ -34,6 +37,9 @@ RIGHT_TURN, RIGHT_PLACE = 2.0, 0.2
 
 DISTANCE = 2.5
 """Metres from a simulated phone to where it looks: places are told as shares of it too."""
+
+POINTS = 150
+"""Of the scene, by which the cameras' residual is measured."""
 
 NEIGHBOURS = 8
 """Cameras of a rig that are calibrated together."""
@@ -95,6 +101,53 @@ def errors(
     return worst, {c.name: abs(float(c.K[0, 0] / truth[c.name].K[0, 0] - 1)) for c in cameras}
 
 
+def residual(found: Calibration, truth: dict[str, Camera], right: Collection[str], seed: int = 0) -> float | None:
+    """Pixels at 640 of width that points of the scene miss, as the median over cameras that are right: points between
+    the cameras are seen through the true ones, triangulated with those that were found, and projected again.
+
+    None for fewer than two cameras. Needs no frame in common, and tells what a reconstruction suffers.
+    """
+    named = [camera for camera in found.found if camera.name in right]
+    if len(named) < 2:
+        return None
+    first = {c.name: (truth[c.name], Camera(c.K, _first(c.w2c), c.width, c.height, c.distortion)) for c in named}
+    true, mine = zip(*first.values(), strict=True)
+    middle = common_target(list(truth.values()))
+    reach = 0.5 * float(np.median([np.linalg.norm(np.atleast_2d(c.center)[0] - middle) for c in truth.values()]))
+    xyz = middle + np.random.default_rng(seed).uniform(-reach, reach, (POINTS, 3))
+    seen = [replace(c, w2c=_first(c.w2c)).project(xyz[:, None])[:, 0] for c in true]
+    inside = [((uv > 0) & (uv < [c.width, c.height])).all(1) for uv, c in zip(seen, true, strict=True)]
+    off = []
+    for p in np.flatnonzero(np.sum(inside, 0) >= 2):
+        views = [v for v in range(len(mine)) if inside[v][p]]
+        rays = [(mine[v], seen[v][p]) for v in views]
+        again = np.array([camera.project(_triangulated(rays)[None, None])[0, 0] for camera, _ in rays])
+        wide = np.array([640 / camera.width for camera, _ in rays])
+        off += (np.linalg.norm(again - [uv for _, uv in rays], axis=1) * wide).tolist()
+    return round(float(np.median(off)), 3) if off else None
+
+
+def _first(w2c: np.ndarray | None) -> np.ndarray:
+    """The pose at the beginning."""
+    assert w2c is not None
+    return w2c.reshape(-1, 4, 4)[0]
+
+
+def _triangulated(rays: Sequence[tuple[Camera, np.ndarray]]) -> np.ndarray:
+    """The point whose pixels are nearest to those given, by least squares from the linear answer."""
+    rows = []
+    for camera, uv in rays:
+        P = camera.K @ camera.w2c[:3]
+        x = undistort(camera, uv[None])[0]
+        rows += [x[0] * P[2] - P[0], x[1] * P[2] - P[1]]
+    start = np.linalg.svd(np.array(rows))[2][-1]
+
+    def off(xyz: np.ndarray) -> np.ndarray:
+        return np.concatenate([camera.project(xyz[None, None])[0, 0] - uv for camera, uv in rays])
+
+    return np.asarray(least_squares(off, start[:3] / start[3], max_nfev=20).x)
+
+
 def row(what: str, seed: int, found: Calibration, truth: dict[str, Camera], seconds: float) -> dict[str, Any]:
     """One line of the table."""
     worst, focal = errors(found, truth)
@@ -115,6 +168,7 @@ def row(what: str, seed: int, found: Calibration, truth: dict[str, Camera], seco
         "degrees_max": most([worst[name][0] for name in right]),
         "metres_max": most([worst[name][1] for name in right]),
         "focal_max": most([focal[name] for name in right]),
+        "residual_px": residual(found, truth, right),
         "cpu_seconds": round(seconds),
     }
 

@@ -1,6 +1,6 @@
 """The pose of every frame of a moving camera: points of the model followed from key frames, then PnP by poselib.
 
-A leaf: nothing else imports poselib.
+A leaf: nothing but it and :mod:`otsync.calibrate.left_out` imports poselib.
 """
 
 from __future__ import annotations
@@ -91,23 +91,24 @@ def _followed(
         yield k, here.reshape(-1, 2).astype(float) + 0.5, xyz
 
 
+def poselib_camera(lens: Lens) -> dict[str, Any]:
+    """A lens as poselib takes it."""
+    name, parameters = colmap_camera(lens)
+    values = [float(x) for x in parameters.split(",")]
+    if name == "SIMPLE_RADIAL" and lens.distortion is not None:
+        values[3] = float(lens.distortion[0])
+    width, height = (max(1, round(2 * float(c))) for c in lens.K[:2, 2])  # poselib does not read them
+    return {"model": name, "width": width, "height": height, "params": values}
+
+
 def _pnp(
     uv: Float[np.ndarray, "N 2"], xyz: Float[np.ndarray, "N 3"], lens: Lens, frames: WorkingFrames
 ) -> Float[np.ndarray, "4 4"] | None:
     """The pose on which at least ``LEAST`` points, and a third of all, agree; None where none do."""
     import poselib
 
-    name, parameters = colmap_camera(lens)
-    camera: dict[str, Any] = {
-        "model": name,
-        "width": frames.size[0],
-        "height": frames.size[1],
-        "params": [float(x) for x in parameters.split(",")],
-    }
-    if name == "SIMPLE_RADIAL" and lens.distortion is not None:
-        camera["params"][3] = float(lens.distortion[0])
     options = {"max_reproj_error": ERROR * max(frames.unit, 0.3), "seed": 0}
-    pose, info = poselib.estimate_absolute_pose(uv, xyz, camera, options, {})
+    pose, info = poselib.estimate_absolute_pose(uv, xyz, poselib_camera(lens), options, {})
     if info["num_inliers"] < max(LEAST, len(uv) / 3):
         return None
     w2c = np.eye(4)

@@ -14,6 +14,7 @@ from ..progress import Progress, Tell
 from .boards import Board, with_boards
 from .clips import Clip, Lens, read_clips
 from .found import Calibration, FoundCamera
+from .left_out import with_left_out
 from .mapping import Mapper, Model, Pictures, lenses_found, map_pictures
 from .poses import every_pose, key_pictures
 from .stills import (
@@ -146,9 +147,10 @@ def calibrate_clips(
         helped = any(clip.kind == "walk" for clip in clips)
         lost = [judged(_camera(each, each.clip.lens), helped=helped) for each in filmed]
         return _split(lost, clips, method, "arbitrary", progress)
-    with progress.stage("poses"):
-        cameras, world = _placed(filmed, mapped, model, options, cache)
     agreed = agreement(model, other, mapped.of, len(filmed))
+    with progress.stage("poses"):
+        model = with_left_out(model, matches, mapped)
+        cameras, world = _placed(filmed, mapped, model, options, cache)
     backed = support(model, matches, mapped.of, mapped.lenses)
     helped = any(clip.kind == "walk" for clip in clips)
     seen = mapped.of[model.pictures[model.seen[:, 0]]]

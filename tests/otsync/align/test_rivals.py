@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from otsync import match, synchronize
-from otsync.align.rivals import Left, rival
+from otsync.align.rivals import Left, _beyond_the_valley, rival
 from otsync.bench.trust.worlds import drawn
 from otsync.simulate import PRESETS, simulate
 from otsync.simulate.effects import SharedDrift, Transient
@@ -69,3 +69,20 @@ def test_like_things_that_stay_somewhat_apart_at_another_time_are_rivals_too(see
     """Trusted and 27 frames off where only what is as near was taken for a rival."""
     tracks, _ = drawn(seed, motion="carousel", alike=True)
     assert Status.AMBIGUOUS in synchronize(list(tracks)).flags[1]
+
+
+def test_shoulders_of_the_answers_own_valley_are_no_other_times():
+    nan = np.nan
+    for apart, kept in (
+        ([1.0, 1.1, 1.4, 1.2, 1.5], [nan, nan, nan, 1.2, 1.5]),
+        ([1.0, nan, 1.1, 1.1, 1.2], [nan] * 5),
+        ([1.3, 0.9, nan, 1.0], [nan, 0.9, nan, 1.0]),
+        ([nan, nan], [nan, nan]),
+    ):
+        np.testing.assert_array_equal(_beyond_the_valley(np.array(apart)), kept)
+
+
+def test_slow_things_have_no_rival_beside_the_answer():
+    """Eight frames beside the answer the tracks are nearly as near still (1.05); at other times they are not."""
+    (a, b), truth = drawn(508, preset="brutal")
+    assert rival(a, b, match(a, b, throw=False), float(truth.offsets[1])).ratio > 1.3
