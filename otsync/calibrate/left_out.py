@@ -6,7 +6,7 @@ A leaf with :mod:`otsync.calibrate.poses`: it needs poselib.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -42,17 +42,49 @@ def with_left_out(model: Model, matches: Matches, pictures: Pictures) -> Model:
     """
     lenses = lenses_found(model, pictures.lenses)
     have = {int(pictures.of[p]) for p in model.pictures}
-    lost = [p for p, v in enumerate(map(int, pictures.of)) if v not in have and not pictures.moving[v]]
-    for p in lost:
-        v = int(pictures.of[p])
-        if not lenses[v].known:
-            continue
-        seen = [(n, _from(matches, int(q), p)) for n, q in enumerate(model.pictures)]
-        seen = [(n, uv) for n, uv in seen if len(uv)]
-        others = [lenses[int(pictures.of[model.pictures[n]])] for n, _ in seen]
-        unit = max(pictures.pictures[p].image.shape[:2]) / 640
-        model = _placed(model, p, seen, [*others, lenses[v]], ERROR * max(unit, 0.5))
+    videos = [(p, int(v)) for p, v in enumerate(pictures.of)]
+    lost = [p for p, v in videos if v not in have and not pictures.moving[v] and lenses[v].known]
+    while lost:
+        # the surest first: the others' matches with it are heard, too
+        tried = {p: _found(model, p, matches, pictures, lenses) for p in lost}
+        known = {p: one for p, one in tried.items() if one is not None}
+        if not known:
+            break
+        surest = max(known, key=lambda p: known[p].share)
+        model = _placed(model, surest, known[surest])
+        lost.remove(surest)
     return model
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """The pose of a picture that was left out, by all its matches and by either half of those that agree; and which
+    share of its matches agree.
+    """
+
+    w2c: Float[np.ndarray, "4 4"]
+    halves: Float[np.ndarray, "H 4 4"]
+    share: float
+
+
+def _found(model: Model, p: int, matches: Matches, pictures: Pictures, lenses: Sequence[Lens]) -> Found | None:
+    """Where a picture was taken; None where too few of its matches agree."""
+    seen = [(n, _from(matches, int(q), p)) for n, q in enumerate(model.pictures)]
+    seen = [(n, uv) for n, uv in seen if len(uv)]
+    total = sum(len(uv) for _, uv in seen)
+    if total < LEAST:
+        return None
+    of = [*(int(model.pictures[n]) for n, _ in seen), p]
+    each = [lenses[int(pictures.of[q])] for q in of]
+    error = ERROR * max(max(pictures.pictures[p].image.shape[:2]) / 640, 0.5)
+    w2c, agree = rig_pose(model.w2c, seen, each, error)
+    count = int(sum(map(np.count_nonzero, agree)))
+    if count < max(LEAST, SHARE * total):
+        return None
+    kept = [(n, uv[good]) for (n, uv), good in zip(seen, agree, strict=True)]
+    parts = [rig_pose(model.w2c, [(n, uv[k::2]) for n, uv in kept], each, error) for k in (0, 1)]
+    halves = [pose for pose, good in parts if sum(map(np.count_nonzero, good)) >= OF_A_HALF]
+    return Found(w2c, np.array(halves).reshape(-1, 4, 4), count / total)
 
 
 def _from(matches: Matches, other: int, p: int) -> Float[np.ndarray, "N 4"]:
@@ -61,29 +93,16 @@ def _from(matches: Matches, other: int, p: int) -> Float[np.ndarray, "N 4"]:
     return uv if other < p else uv[:, [2, 3, 0, 1]]
 
 
-def _placed(
-    model: Model, p: int, seen: Sequence[tuple[int, np.ndarray]], lenses: Sequence[Lens], error: float
-) -> Model:
-    """The model with one more picture, where its matches agree on a pose; else as it was."""
-    total = sum(len(uv) for _, uv in seen)
-    if total < LEAST:
-        return model
-    w2c, agree = rig_pose(model.w2c, seen, lenses, error)
-    if sum(map(np.count_nonzero, agree)) < max(LEAST, SHARE * total):
-        return model
-    at, halves = int(np.searchsorted(model.pictures, p)), model.halves
-    if len(halves) == 2:
-        kept = [(n, uv[good]) for (n, uv), good in zip(seen, agree, strict=True)]
-        parts = [rig_pose(model.w2c, [(n, uv[k::2]) for n, uv in kept], lenses, error) for k in (0, 1)]
-        enough = all(sum(map(np.count_nonzero, good)) >= OF_A_HALF for _, good in parts)
-        halves = np.insert(halves, at, np.stack([pose for pose, _ in parts]), 1) if enough else halves[:0]
-    moved = model.seen + np.stack([model.seen[:, 0] >= at, np.zeros(len(model.seen), bool)], 1)
+def _placed(model: Model, p: int, found: Found) -> Model:
+    """The model with one more picture."""
+    at = int(np.searchsorted(model.pictures, p))
+    both = len(model.halves) == len(found.halves) == 2
     return replace(
         model,
         pictures=np.insert(model.pictures, at, p),
-        w2c=np.insert(model.w2c, at, w2c, 0),
-        seen=moved,
-        halves=halves,
+        w2c=np.insert(model.w2c, at, found.w2c, 0),
+        seen=model.seen + np.stack([model.seen[:, 0] >= at, np.zeros(len(model.seen), bool)], 1),
+        halves=np.insert(model.halves, at, found.halves, 1) if both else model.halves[:0],
     )
 
 

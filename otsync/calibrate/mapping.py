@@ -262,7 +262,7 @@ def map_pictures(pictures: Pictures, mapper: Mapper, *, least: int, refine: bool
             return None
         for camera in held & set(best.cameras):  # the global mapper refines all lenses or none
             best.cameras[camera].params = given[camera]
-        _adjust(pycolmap, best, held)
+        adjust(pycolmap, best, held)
         return replace(_model(best, pictures, folders), halves=_halves(pycolmap, best, held, Path(work)))
 
 
@@ -312,7 +312,7 @@ def _global(
     return pycolmap.global_mapping(path, work, work, options)
 
 
-def _adjust(pycolmap: Any, model: Any, held: set[int]) -> None:
+def adjust(pycolmap: Any, model: Any, held: set[int]) -> None:
     """Bundle adjustment of all of a model, robust against what still moves in it; lenses in ``held`` stay."""
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
@@ -340,7 +340,7 @@ def _halves(pycolmap: Any, model: Any, held: set[int], work: Path) -> Float[np.n
         part = pycolmap.Reconstruction(kept)
         for point in sorted(part.points3D)[half::2]:
             part.delete_point3D(point)
-        _adjust(pycolmap, part, held)
+        adjust(pycolmap, part, held)
         images = sorted((image.name, image) for image in part.images.values() if image.has_pose)
         if any(sum(p.has_point3D() for p in image.points2D) < LEAST_OF_A_HALF for _, image in images):
             return np.zeros((0, 0, 4, 4))

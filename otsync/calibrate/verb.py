@@ -11,6 +11,7 @@ import numpy as np
 
 from ..files.cache import Cache
 from ..progress import Progress, Tell
+from .adjusted import adjusted
 from .boards import Board, with_boards
 from .clips import Clip, Lens, read_clips
 from .found import Calibration, FoundCamera
@@ -150,6 +151,8 @@ def calibrate_clips(
     agreed = agreement(model, other, mapped.of, len(filmed))
     with progress.stage("poses"):
         model = with_left_out(model, matches, mapped)
+        if mapped.kind == "stills":
+            model = adjusted(model, matches, mapped)
         cameras, world = _placed(filmed, mapped, model, options, cache)
     backed = support(model, matches, mapped.of, mapped.lenses)
     helped = any(clip.kind == "walk" for clip in clips)

@@ -1,4 +1,4 @@
-"""Static cameras that a mapper leaves out."""
+"""Static cameras that a mapper leaves out, and the adjustment to every match that obeys."""
 
 from __future__ import annotations
 
@@ -81,3 +81,50 @@ def test_noise_few_matches_and_unknown_lenses_place_nothing():
 
     for model, matches, pictures, _ in (rig(1, 60, 0.0), rig(1, 5, 1.0), rig(1, 40, 0.6, known=False)):
         assert with_left_out(model, matches, pictures).pictures.tolist() == [0, 1, 3, 4]
+
+
+def all_pairs(seed: int, right: float = 0.8, points: int = 80):
+    """The same cameras, all placed; every pair sees the same points, and a share of each pair's matches is right."""
+    rng = np.random.default_rng(seed)
+    model, _, pictures, poses = rig(seed, 1, 1.0)
+    xyz = rng.uniform(-1, 1, (points, 3))
+    q = np.einsum("kij,nj->kni", poses[:, :3, :3], xyz) + poses[:, None, :3, 3]
+    uv = q[..., :2] / q[..., 2:] * 520 + [320, 180] + 0.2 * rng.normal(size=(5, points, 2))
+    matches = {}
+    for a in range(5):
+        for b in range(a + 1, 5):
+            there = uv[b].copy()
+            wrong = rng.random(points) > right
+            there[wrong] = rng.uniform([0, 0], [640, 360], (int(wrong.sum()), 2))
+            matches[a, b] = np.concatenate([uv[a], there], 1)
+    return replace(model, pictures=np.arange(5), w2c=poses.copy(), halves=model.halves[:0]), matches, pictures, poses
+
+
+def test_adjustment_to_all_matches_brings_cameras_nearer_and_leaves_out_wrong_matches():
+    pytest.importorskip("pycolmap", reason="needs the extra calibrate")
+    from otsync.calibrate.adjusted import adjusted
+    from otsync.calibrate.world import laid_over
+
+    model, matches, pictures, poses = all_pairs(3)
+    model.w2c[:, :3, 3] += 0.004 * np.random.default_rng(0).normal(size=(5, 3))
+
+    def off(w2c):
+        moved = laid_over(w2c, poses).camera(w2c)
+        return np.linalg.norm(centres(moved) - centres(poses), axis=1).max()
+
+    found = adjusted(model, matches, pictures)
+    assert off(found.w2c) < 0.5 * off(model.w2c)
+    assert found.error < 0.5 and found.halves.shape == (2, 5, 4, 4)
+    assert 70 < len(found.points) < 110  # 80, and some of the wrong ones lie on epipolar lines
+    np.testing.assert_array_equal(found.w2c, adjusted(model, matches, pictures).w2c)
+
+
+def test_a_picture_in_which_too_few_matches_obey_stays_where_it_is():
+    pytest.importorskip("pycolmap", reason="needs the extra calibrate")
+    from otsync.calibrate.adjusted import adjusted
+
+    model, matches, pictures, _ = all_pairs(4, 1.0)
+    model.w2c[4, :3, 3] += 1.0  # its matches obey no more
+    found = adjusted(model, matches, pictures)
+    np.testing.assert_array_equal(found.w2c[4], model.w2c[4])
+    assert 4 not in found.seen[:, 0] and len(found.points) >= 70
