@@ -41,6 +41,9 @@ DISTANCE = 2.5
 POINTS = 150
 """Of the scene, by which the cameras' residual is measured."""
 
+LATE, CLIP = 30, 120
+"""Frames by which clips of a rig begin late at the most, and how many they have."""
+
 NEIGHBOURS = 8
 """Cameras of a rig that are calibrated together."""
 
@@ -74,7 +77,7 @@ def run(
     rows = []
     for seed in range(first_seed, first_seed + seeds):
         if scene is not None:
-            rows += rig_rows(open_scene(scene), seed, Cache(cache or out / "stages"))
+            rows += rig_rows(open_scene(scene), seed, Cache(cache or out / "stages"), "sync" in wanted)
         else:
             rows += room_rows(seed, wanted)
         print(table(rows), flush=True)
@@ -200,8 +203,11 @@ def offset_errors(folder: Path, found: Calibration, truth: PhoneTruth) -> dict[s
     return {"offset_mean": round(float(off.mean()), 3), "offset_max": round(float(off.max()), 3)}
 
 
-def rig_rows(scene: Scene, seed: int, cache: Cache) -> list[dict[str, Any]]:
-    """The neighbours of one camera, the same with focal lengths 2 % off, and as many anywhere in the rig."""
+def rig_rows(scene: Scene, seed: int, cache: Cache, sync: bool) -> list[dict[str, Any]]:
+    """The neighbours of one camera, the same with focal lengths 2 % off, and as many anywhere in the rig.
+
+    sync: of the first, offsets too.
+    """
     truth = {video.name: video.camera for video in scene.videos}
     names, rng = list(truth), np.random.default_rng(seed)
     middle = "5" if "5" in truth and seed % 2 == 0 else names[int(rng.integers(len(names)))]
@@ -223,4 +229,36 @@ def rig_rows(scene: Scene, seed: int, cache: Cache) -> list[dict[str, Any]]:
         started = time.process_time()
         found = calibrate_clips(clips, CalibrateOptions(seed=seed), cache=cache, tell=tell)
         rows.append(row(what, seed, found, truth, time.process_time() - started))
+        if sync and len(rows) == 1 and len(found.found) > 1:
+            rows[-1] |= rig_offsets(scene.take(chosen), found, seed, cache)
     return rows
+
+
+def rig_offsets(scene: Scene, found: Calibration, seed: int, cache: Cache) -> dict[str, float]:
+    """Errors in frames of the offsets of clips that begin up to a second late, from images and the cameras that were
+    found, and beside them from the true ones; the first camera's clip is the reference.
+    """
+    rng = np.random.default_rng([seed, 5])
+    late = [0, *(int(k) for k in rng.integers(0, LATE + 1, len(scene.videos) - 1))]
+    taken = {camera.name: camera for camera in found.found}
+    doubtful = {camera.name: camera.doubt for camera in found.found if camera.doubt}
+    out: dict[str, float] = {}
+    for which in ("", "_given"):
+        videos = []
+        for video, k in zip(scene.videos, late, strict=True):
+            if video.name not in taken:
+                continue
+            length = min(len(video.frames) - LATE, CLIP)
+            clip = replace(video, frames=video.frames[k : k + length], timestamps=None, fps=video.fps or 30.0)
+            own = taken[video.name]
+            if not which:
+                clip = replace(clip, camera=replace(video.camera, K=own.K, w2c=np.asarray(own.w2c), distortion=own.distortion))
+            videos.append((clip, k))
+        names = [video.name for video, _ in videos]
+        part = replace(scene.take(names), videos=tuple(video for video, _ in videos))
+        part = replace(part, masks=(None,) * len(videos), doubtful={} if which else doubtful)
+        offsets = synchronize_scene(part, cache=cache, tell=tell).offsets
+        true = np.array([k - videos[0][1] for _, k in videos], float)
+        off = np.abs(offsets.frames - true)[1:]
+        out |= {f"offset_mean{which}": round(float(off.mean()), 3), f"offset_max{which}": round(float(off.max()), 3)}
+    return out
