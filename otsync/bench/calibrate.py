@@ -252,7 +252,9 @@ def rig_offsets(scene: Scene, found: Calibration, seed: int, cache: Cache) -> di
             clip = replace(video, frames=video.frames[k : k + length], timestamps=None, fps=video.fps or 30.0)
             own = taken[video.name]
             if not which:
-                clip = replace(clip, camera=replace(video.camera, K=own.K, w2c=np.asarray(own.w2c), distortion=own.distortion))
+                clip = replace(
+                    clip, camera=replace(video.camera, K=own.K, w2c=np.asarray(own.w2c), distortion=own.distortion)
+                )
             videos.append((clip, k))
         names = [video.name for video, _ in videos]
         part = replace(scene.take(names), videos=tuple(video for video, _ in videos))

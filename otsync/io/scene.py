@@ -132,12 +132,18 @@ def read_document(path: str | os.PathLike[str], *, reader: str | None = None) ->
 
 
 def scene_from_document(
-    document: dict[str, Any], root: Path, *, allow_outside: bool = False, file: Path | None = None
+    document: dict[str, Any],
+    root: Path,
+    *,
+    allow_outside: bool = False,
+    file: Path | None = None,
+    first: int = 0,
 ) -> Scene:
     """Build the scene; ValueError names the file, the video and the field for anything unsound.
 
     Args:
-        root: the folder that paths are relative to. file: where the document is from, for errors.
+        root: the folder that paths are relative to. file: where the document is from, for errors; first: which of its
+            videos the document begins with.
     """
     file = file or file_of(root)
     checked(document, SceneFile, file)
@@ -154,7 +160,7 @@ def scene_from_document(
             f"{file}: videos: expected unique names; {', '.join(map(shown, twice))} occur more than once. Rename them."
         )
     builder = Paths(root, allow_outside)
-    built = [_video(entry, n, builder, file) for n, entry in enumerate(entries)]
+    built = [_video(entry, n, builder, file) for n, entry in enumerate(entries, first)]
     return Scene(
         tuple(video for video, _, _, _ in built),
         tuple(masks for _, masks, _, _ in built),
@@ -347,7 +353,12 @@ class Paths:
             if not 0 < len(pattern) <= MAX_FILES:
                 raise ValueError(f"frames: expected 1 to {MAX_FILES} files; found {len(pattern)}.")
             return [self.one(p) for p in pattern]
-        if not isinstance(pattern, str) or "*" not in pattern or ".." in Path(pattern).parts or "**" in pattern:
+        if isinstance(pattern, str) and ".." in Path(pattern).parts:
+            raise ValueError(
+                f"frames: expected files inside {self.root}; {shown(pattern)} points outside. Move them there, or list "
+                "the files one by one and allow it (allow_outside=True, --allow-outside)."
+            )
+        if not isinstance(pattern, str) or "*" not in pattern or "**" in pattern:
             raise ValueError(f"frames: expected a pattern like 'left/*.jpg', or a list; found {shown(pattern)}.")
         base, _, name = pattern.rpartition("/")
         if "*" in base:

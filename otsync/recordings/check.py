@@ -17,7 +17,15 @@ from ..files.strict import checked, shown
 from ..geometry import common_target
 from ..io.frames import VideoFrames
 from ..io.layout import MAX_VIDEOS, SceneFile, VideoFile
-from ..io.scene import Paths, Scene, camera_from, file_of, read_document, scene_from_document, video_frames
+from ..io.scene import (
+    Paths,
+    Scene,
+    camera_from,
+    file_of,
+    read_document,
+    scene_from_document,
+    video_frames,
+)
 from ..types import Camera, Video
 
 FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -86,6 +94,7 @@ def check_scene(
     findings, entries = _layout(document, file_of(path))
     if not entries:
         return findings
+    every = document["videos"]
     document = {**document, "videos": entries}
     for item in document.get("missing") or ():
         findings.append(Finding("error", "", f"still missing: {item}.", "Fill it in, then delete 'missing'."))
@@ -101,7 +110,13 @@ def check_scene(
             continue
         try:
             one = scene_from_document(
-                {**document, "videos": [entry], "missing": []}, root, allow_outside=allow_outside, file=file_of(path)
+                {**document, "videos": [entry], "missing": []},
+                root,
+                allow_outside=allow_outside,
+                file=file_of(path),
+                first=next(
+                    n for n, e in enumerate(every) if isinstance(e, dict) and e.get("name", f"video{n}") == name
+                ),
             )
         except (ValueError, OSError) as error:
             findings.append(Finding("error", name, str(error), ""))
@@ -125,6 +140,11 @@ def looking_wrong(document: dict[str, Any]) -> list[Finding]:
     unmirrored = _unmirrored(entries)
     findings = [finding for entry in entries for finding in _pose(entry, entry["name"], unmirrored)]
     return [*findings, *_common_volume(_cameras(entries))]
+
+
+def _number(every: Sequence[Any], name: str) -> int:
+    """Which of a document's videos, sound and unsound ones, has a name."""
+    return next(n for n, e in enumerate(every) if isinstance(e, dict) and e.get("name", f"video{n}") == name)
 
 
 def _layout(document: dict[str, Any], file: Path) -> tuple[list[Finding], list[dict[str, Any]]]:

@@ -206,3 +206,11 @@ def test_a_file_that_is_no_scene_is_a_finding(tmp_path):
 
 def test_the_papers_scene_is_sound(data):
     assert [f for f in check_scene(data / "panoptic_basketball", every_frame=False) if f.severity == "error"] == []
+
+
+def test_findings_say_which_video_of_the_file_and_that_files_lie_outside(sound):
+    def elsewhere(videos):
+        videos[2]["frames"] = "../c2/*.jpg"
+
+    (found,) = [f for f in findings(sound, elsewhere) if f.video == "c2"]
+    assert "videos[2] (c2)" in found.what and "points outside" in found.what
