@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from ..geometry import fundamental, sampson, undistort
 from ..types import Camera
 from .clips import Lens
-from .mapping import LEAST_OF_A_HALF, Model, Pictures, adjust, colmap_camera, lenses_found, quiet
+from .mapping import LEAST_OF_A_HALF, Model, Pictures, adjust, found_camera, lenses_found, quiet
 
 OBEYS = 1.5
 """Pixels at 640 of width that a match may lie off its epipolar line, and a point off where it is seen. Right matches of
@@ -113,13 +113,7 @@ def _reconstruction(
         for n, u, v in track:
             keypoints[n].append((u, v))
     for n, uv in keypoints.items():
-        lens = lenses[n]
-        name, parameters = colmap_camera(lens)
-        values = [float(x) for x in parameters.split(",")]
-        if name == "SIMPLE_RADIAL" and lens.distortion is not None:
-            values[3] = float(lens.distortion[0])
-        width, height = (max(1, round(2 * float(c))) for c in lens.K[:2, 2])
-        camera = pycolmap.Camera(model=name, width=width, height=height, params=values, camera_id=n + 1)
+        camera = pycolmap.Camera(camera_id=n + 1, **found_camera(lenses[n]))
         built.add_camera_with_trivial_rig(camera)
         image = pycolmap.Image(name=f"{n}", keypoints=np.array(uv), camera_id=n + 1, image_id=n + 1)
         built.add_image_with_trivial_frame(image, pycolmap.Rigid3d(model.w2c[n, :3]))

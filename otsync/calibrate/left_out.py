@@ -1,6 +1,6 @@
 """Static cameras that a mapper leaves out, put where their matches with all others say: likely right, never confirmed.
 
-A leaf with :mod:`otsync.calibrate.poses`: it needs poselib.
+A leaf like :mod:`otsync.calibrate.poses`: it needs poselib.
 """
 
 from __future__ import annotations
@@ -13,8 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .clips import Lens
-from .mapping import Model, Pictures, lenses_found
-from .poses import poselib_camera
+from .mapping import Model, Pictures, found_camera, lenses_found
 
 LEAST, SHARE = 30, 0.2
 """Matches that must agree on the pose, and the share of all which they must be."""
@@ -127,7 +126,7 @@ def rig_pose(
         pair = poselib.PairwiseMatches()
         pair.cam_id1, pair.cam_id2, pair.x1, pair.x2 = k, 0, uv[:, :2], uv[:, 2:]
         pairs.append(pair)
-    cameras = [poselib_camera(lens) for lens in lenses]
+    cameras = [found_camera(lens) for lens in lenses]
     rig = [pose_of(w2c[n]) for n, _ in seen]
     options = {"max_epipolar_error": error, "seed": 0, **TRIALS}
     found, info = poselib.estimate_generalized_relative_pose(

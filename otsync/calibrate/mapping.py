@@ -402,6 +402,16 @@ def colmap_camera(lens: Lens) -> tuple[str, str]:
     return "FULL_OPENCV", ",".join(repr(float(x)) for x in [*pinhole, *np.pad(bends, (0, 8 - len(bends)))])
 
 
+def found_camera(lens: Lens) -> dict[str, Any]:
+    """A lens after the mapping, with the radial term that was found, as COLMAP and poselib name its parts."""
+    name, parameters = colmap_camera(lens)
+    values = [float(x) for x in parameters.split(",")]
+    if name == "SIMPLE_RADIAL" and lens.distortion is not None:
+        values[3] = float(lens.distortion[0])
+    width, height = (max(1, round(2 * float(c))) for c in lens.K[:2, 2])  # nobody reads them for poses
+    return {"model": name, "width": width, "height": height, "params": values}
+
+
 @contextmanager
 def opened(pycolmap: Any, path: Path) -> Any:
     database = pycolmap.Database.open(path)

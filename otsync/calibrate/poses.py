@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 
 from ..priors.working import WorkingFrames
 from .clips import Lens
-from .mapping import Model, colmap_camera
+from .mapping import Model, found_camera
 
 LEAST = 20
 """Points that must agree on a frame's pose."""
@@ -91,16 +91,6 @@ def _followed(
         yield k, here.reshape(-1, 2).astype(float) + 0.5, xyz
 
 
-def poselib_camera(lens: Lens) -> dict[str, Any]:
-    """A lens as poselib takes it."""
-    name, parameters = colmap_camera(lens)
-    values = [float(x) for x in parameters.split(",")]
-    if name == "SIMPLE_RADIAL" and lens.distortion is not None:
-        values[3] = float(lens.distortion[0])
-    width, height = (max(1, round(2 * float(c))) for c in lens.K[:2, 2])  # poselib does not read them
-    return {"model": name, "width": width, "height": height, "params": values}
-
-
 def _pnp(
     uv: Float[np.ndarray, "N 2"], xyz: Float[np.ndarray, "N 3"], lens: Lens, frames: WorkingFrames
 ) -> Float[np.ndarray, "4 4"] | None:
@@ -108,7 +98,7 @@ def _pnp(
     import poselib
 
     options = {"max_reproj_error": ERROR * max(frames.unit, 0.3), "seed": 0}
-    pose, info = poselib.estimate_absolute_pose(uv, xyz, poselib_camera(lens), options, {})
+    pose, info = poselib.estimate_absolute_pose(uv, xyz, found_camera(lens), options, {})
     if info["num_inliers"] < max(LEAST, len(uv) / 3):
         return None
     w2c = np.eye(4)
