@@ -21,6 +21,10 @@ AGREES = 1 / 30
 that misses it by four."""
 
 
+OF_CLOCKS = frozenset({Status.SHORT_OVERLAP, Status.BROKEN_CLOCK, Status.RATE_MISMATCH})
+"""Flags that tell of clocks and clips: a pair that has no others, and fits the answer, accuses no camera."""
+
+
 def with_doubts(offsets: Offsets, doubtful: Collection[str]) -> Offsets:
     """The offsets with MISPLACED for the named videos."""
     if not set(doubtful) & set(offsets.names):
@@ -30,7 +34,7 @@ def with_doubts(offsets: Offsets, doubtful: Collection[str]) -> Offsets:
 
 
 def misplaced(offsets: Offsets) -> set[str]:
-    """Names of the videos most of whose pairs are flagged or contradict the answer.
+    """Names of the videos most of whose pairs are flagged, by more than clocks, or contradict the answer.
 
     The worst comes first, and its pairs then count no more.
 
@@ -38,7 +42,8 @@ def misplaced(offsets: Offsets) -> set[str]:
     """
     least = max(AGREES, 1 / offsets.fps[offsets.reference])
     sound = {
-        pair: a.status.ok and abs(a.stats.get("residual", np.nan)) < least for pair, a in offsets.alignments.items()
+        pair: OF_CLOCKS.issuperset(a.flags) and abs(a.stats.get("residual", np.nan)) < least
+        for pair, a in offsets.alignments.items()
     }
     found: set[int] = set()
     while True:

@@ -40,6 +40,18 @@ def test_the_camera_whose_pairs_fail_is_named_and_no_other(residual):
     assert misplaced(offsets({(0, 1), (1, 2)})) == set()  # half of its pairs: far cameras have such
 
 
+@pytest.mark.parametrize("flag", [Status.SHORT_OVERLAP, Status.BROKEN_CLOCK, Status.RATE_MISMATCH])
+def test_clocks_and_short_clips_accuse_no_camera_unless_pairs_contradict_the_answer(flag):
+    """Real clips of 1.4 s, all pairs of which are too short: every camera stood where it stood."""
+    sound = offsets(set())
+    pairs = {pair: replace(a, flags=(flag,)) for pair, a in sound.alignments.items()}
+    assert misplaced(replace(sound, alignments=pairs)) == set()
+    bad = {(min(a, 2), max(a, 2)) for a in (0, 1, 3, 4)}
+    away = offsets(bad, residual=4.0)
+    pairs = {pair: replace(a, flags=(flag,)) for pair, a in away.alignments.items()}
+    assert misplaced(replace(away, alignments=pairs)) == {"v2"}
+
+
 def test_fast_cameras_may_miss_by_some_of_their_frames_and_slow_ones_by_one():
     bad = {(min(a, 2), max(a, 2)) for a in (0, 1, 3, 4)}
     for fps, frames, named in ((120.0, 3.0, False), (120.0, 5.0, True), (6.0, 0.8, False), (6.0, 1.2, True)):
