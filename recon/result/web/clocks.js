@@ -77,5 +77,6 @@ function filmedWords(cameras, clocks, seconds) {
   const nearest = beside.indexOf(Math.min(...beside));
   if (beside[nearest] === Infinity) return 'rendered; no video filmed then';
   if (beside[nearest] <= FILMED) return `rendered; video ${cameras[nearest].name} has a frame of this instant`;
-  return `rendered between frames; the nearest is ${(1000 * beside[nearest]).toFixed(1)} ms away, in video ${cameras[nearest].name}`;
+  const away = `${(1000 * beside[nearest]).toFixed(1)} ms away`;
+  return `rendered between frames; the nearest is ${away}, in video ${cameras[nearest].name}`;
 }

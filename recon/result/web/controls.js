@@ -89,7 +89,7 @@ function listen(actions) {
 }
 
 /** A tile for every video: its picture, name, offset and how far it can be trusted. Names are text, never markup. */
-function videoTiles(list, { cameras, step }, chosen) {
+function videoTiles(list, { cameras, step }, origin, chosen) {
   return cameras.map((camera, v) => {
     const item = document.createElement('li');
     const button = document.createElement('button');
@@ -103,8 +103,8 @@ function videoTiles(list, { cameras, step }, chosen) {
     words.className = 'words';
     words.style.borderTopColor = camera.color;
     name.textContent = camera.name;
-    offset.textContent = offsetWords(camera);
-    offset.title = `${(camera.offset / step).toFixed(2)} frames of the reference`;
+    offset.textContent = offsetWords(camera, origin);
+    offset.title = `${(lateBy(camera, origin) / step).toFixed(2)} frames of the reference`;
     trust.textContent = camera.trust;
     trust.title = camera.remedy;
     trust.className = camera.doubtful ? 'doubt' : '';
@@ -121,10 +121,15 @@ function videoTiles(list, { cameras, step }, chosen) {
   });
 }
 
-/** How late a video started, and how sure that is. */
-function offsetWords(camera) {
+/** World seconds from where the reference's video begins to where this one does: what the bars show. */
+function lateBy({ rate, first, offset }, origin) {
+  return rate * first + offset - origin;
+}
+
+/** How late a video began, and how sure that is; `origin`: the world second at which the reference's begins. */
+function offsetWords(camera, origin) {
   if (camera.reference) return 'the reference';
-  const late = camera.offset >= 0 ? 'late' : 'early';
+  const late = lateBy(camera, origin);
   const sure = camera.sigma === null ? '' : ` ± ${(1000 * camera.sigma).toFixed(1)}`;
-  return `${(1000 * Math.abs(camera.offset)).toFixed(1)}${sure} ms ${late}`;
+  return `${(1000 * Math.abs(late)).toFixed(1)}${sure} ms ${late >= 0 ? 'late' : 'early'}`;
 }

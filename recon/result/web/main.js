@@ -138,7 +138,8 @@ class Page {
     this.timeline.draw(seconds);
     about.cameras.forEach((camera, v) => {
       this.tiles[v].button.setAttribute('aria-pressed', String(this.view.camera === v));
-      this.tiles[v].offset.textContent = this.clocks.synchronised ? offsetWords(camera) : 'offset not applied';
+      const { synchronised, origin } = this.clocks;
+      this.tiles[v].offset.textContent = synchronised ? offsetWords(camera, origin) : 'offset not applied';
       this.#showTile(v, this.clocks.own(camera, seconds));
     });
     part('tour').setAttribute('aria-pressed', String(this.view.mode === 'tour'));
@@ -215,7 +216,7 @@ class Page {
     const select = part('camera');
     select.append(new Option('free', '-1'), ...about.cameras.map((camera, v) => new Option(camera.name, String(v))));
     select.addEventListener('change', () => this.lookThrough(Number(select.value)));
-    this.tiles = videoTiles(part('videos'), about, (v) => this.lookThrough(v));
+    this.tiles = videoTiles(part('videos'), about, this.clocks.origin, (v) => this.lookThrough(v));
     this.timeline = new Timeline(part('timeline'), about, this.clocks, (t) => this.seek(t));
     [part('time').min, part('time').max] = this.timeline.range;
     part('time').addEventListener('input', () => this.seek(Number(part('time').value)));

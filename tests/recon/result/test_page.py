@@ -326,6 +326,16 @@ def test_clocks_as_filmed_and_synchronised(opened, scene_page):
     assert shown == pytest.approx([(0.5 - 0.16) / 1.02, 0.5, 0.5])
 
 
+def test_a_file_whose_own_clock_begins_late_is_as_late_as_its_bar(opened, scene_page):
+    """An offset of -.3725 s and a file that begins at .5 s of its clock: .1275 s late, not .3725 early."""
+    opened.open(scene_page)
+    told = "camera => [offsetWords(camera, 0.02), lateBy(camera, 0.02)]"
+    words, late = opened.page.evaluate(told, {"rate": 1, "first": 0.5, "offset": -0.3525, "sigma": 0.0014})
+    assert words == "127.5 ± 1.4 ms late" and late == pytest.approx(0.1275)
+    words, _ = opened.page.evaluate(told, {"rate": 1, "first": 0, "offset": -0.08, "sigma": None})
+    assert words == "100.0 ms early"
+
+
 def test_it_says_whether_a_frame_is_of_this_instant(opened, scene_page):
     cameras = about_of(scene_page)["cameras"]
     frames = [
