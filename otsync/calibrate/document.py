@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from ..io.document import document
-from ..io.scene import names_of
-from .clips import kind_of
+from ..io.scene import names_of, read_document
+from .clips import kind_of, uncalibrated
 from .found import Calibration, FoundCamera
 
 
@@ -47,8 +48,20 @@ def told_of(calibration: Calibration) -> dict[str, Any]:
     return {
         "method": calibration.method,
         "unit": calibration.unit,
+        "helpers": [camera.name for camera in calibration.helpers],
         "cameras": {camera.name: _told(camera) for camera in calibration.cameras},
     }
+
+
+def came_later(folder: str | os.PathLike[str]) -> tuple[str, ...]:
+    """Clips of a folder that were not there when ``otsync calibrate`` found the cameras of its scene.json."""
+    document, _ = read_document(folder)
+    told = document.get("calibration")
+    if not isinstance(told, dict) or not isinstance(told.get("helpers"), list):
+        return ()
+    known = {*told.get("cameras", {}), *told["helpers"]}
+    names = [str(entry["name"]) for entry in uncalibrated(folder)["videos"]]
+    return tuple(name for name in names if name not in known and kind_of(name) != "board")
 
 
 def _camera(camera: FoundCamera, entry: Mapping[str, Any]) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -32,7 +33,7 @@ class Calibrate:
     out: Path | None = None
     """Folder for calibration.html and the stages, from which a killed run continues; default: FOLDER/calibration."""
     force: bool = False
-    """Replace cameras that scene.json already has."""
+    """Replace cameras that scene.json has from elsewhere. Those that otsync calibrate found are always found anew."""
     options: Annotated[CalibrateOptions, tyro.conf.arg(name="")] = field(default_factory=CalibrateOptions)
 
     json: bool = False
@@ -56,7 +57,7 @@ class Calibrate:
         else:
             print(camera_table(found))
             print(f"wrote {self.folder / 'scene.json'} and {out / 'calibration.html'}")
-        return told_doubts(found)
+        return told_doubts(found, self.folder)
 
 
 def calibrate_folder(folder: Path, out: Path, options: CalibrateOptions, *, force: bool = False) -> Calibration:
@@ -87,7 +88,10 @@ def prepared(path: Path, *, allow_outside: bool = False) -> int:
     A folder with a scene.json, or whose reader knows the cameras, stays as it is: 0. What is done is printed on stderr.
     ValueError where fewer than two cameras can be found.
     """
-    if not path.is_dir() or (path / "scene.json").exists():
+    if not path.is_dir():
+        return 0
+    if (path / "scene.json").exists():
+        _told_of_late_clips(path)
         return 0
     from ..files.claim import claimed
     from ..io.scene import read_document
@@ -98,19 +102,21 @@ def prepared(path: Path, *, allow_outside: bool = False) -> int:
         return 0
     clockless = [item for item in document.get("missing") or () if "fps" in item]
     if clockless:
-        raise ValueError(f"{path}: still missing: {'; '.join(clockless)}. Give it first: otsync init {path} --fps 30.")
-    tell(f"{path}: no scene.json and no cameras: looking for them (otsync calibrate {path})")
+        raise ValueError(
+            f"{path}: still missing: {'; '.join(clockless)}. Give it first: otsync init {quoted(path)} --fps 30."
+        )
+    tell(f"{path}: no scene.json and no cameras: looking for them (otsync calibrate {quoted(path)})")
     with claimed(path / "calibration", "otsync calibrate") as out:
         found = calibrate_folder(path, out, CalibrateOptions())
     tell(camera_table(found))
-    doubts = told_doubts(found)
+    doubts = told_doubts(found, path)
     if len(found.found) < 2:
         raise ValueError(
             f"{path}: expected cameras of two videos and more; found {len(found.found)}. {found.cameras[0].remedy}"
         )
     for finding in check_scene(path, every_frame=False, allow_outside=allow_outside):
         print(f"{finding.severity}: {finding.video or 'scene'}: {finding.what} {finding.remedy}", file=sys.stderr)
-    tell(f"wrote {path / 'scene.json'}; synchronising (otsync sync {path})")
+    tell(f"wrote {path / 'scene.json'}; synchronising (otsync sync {quoted(path)})")
     return doubts
 
 
@@ -138,7 +144,24 @@ def camera_table(found: Calibration) -> str:
     return "\n".join(lines)
 
 
-def told_doubts(found: Calibration) -> int:
+def quoted(path: Path) -> str:
+    """A path as a shell takes it."""
+    return shlex.quote(str(path))
+
+
+def _told_of_late_clips(folder: Path) -> None:
+    """Say which clips lie beside a calibrated scene.json and had no part in it: a walk that was filmed since."""
+    from ..calibrate.document import came_later
+
+    late = came_later(folder)
+    if late:
+        tell(
+            f"{folder}: {', '.join(late)} came after the cameras were found and had no part in it. To find them anew: "
+            f"otsync calibrate {quoted(folder)}"
+        )
+
+
+def told_doubts(found: Calibration, folder: Path) -> int:
     """Say which cameras are not to be trusted, why, and what to film, on stderr; 1 where there are any, else 0."""
     remedies = []
     for camera in found.cameras:
@@ -147,6 +170,8 @@ def told_doubts(found: Calibration) -> int:
             remedies.append(camera.remedy)
     for remedy in dict.fromkeys(remedies):
         print(f"what to do: {remedy}", file=sys.stderr)
+    if remedies:
+        print(f"then: otsync calibrate {quoted(folder)}", file=sys.stderr)
     return 0 if found.ok else 1
 
 

@@ -91,6 +91,7 @@ class CalibrationFile(Document, frozen=True, kw_only=True):
     method: Literal["incremental", "global"]
     unit: Literal["arbitrary", "metres"]
     cameras: Annotated[dict[Name, CalibratedFile], Meta(max_length=MAX_VIDEOS)]
+    helpers: Annotated[list[Name], Meta(max_length=MAX_VIDEOS)] = field(default_factory=list)
 
 
 class SceneFile(Document, frozen=True, kw_only=True):

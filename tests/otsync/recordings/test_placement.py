@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from otsync.calibrate.document import came_later
+from otsync.cli.calibrate import prepared
 from otsync.io import open_scene
 from otsync.priors.stereo import EmptyHull
 from otsync.recordings import routes
@@ -97,3 +100,24 @@ def test_an_empty_hull_leaves_the_epipolar_answer(tmp_path, monkeypatch):
     np.testing.assert_array_equal(found.offsets.seconds, first.seconds)
     with pytest.raises(EmptyHull):
         routes.synchronize_scene(scene, route="stereo")
+
+
+def test_a_walk_that_was_filmed_since_is_told(tmp_path, capsys):
+    """The remedy of a doubtful calibration is a new clip: sync says that it had no part in the cameras."""
+    folder = tmp_path / "four phones"
+    write_recording(folder, [0.0, 2.0], frames=3)
+    document = json.loads((folder / "scene.json").read_text())
+    names = [video["name"] for video in document["videos"]]
+    pictures = (folder / document["videos"][0]["frames"]).parent
+    cameras = {name: {"lens": "found"} for name in names}
+    document["calibration"] = {"method": "global", "unit": "arbitrary", "cameras": cameras}
+    (folder / "scene.json").write_text(json.dumps(document))
+    assert came_later(folder) == ()  # of an earlier version: nobody knows what was there
+    document["calibration"]["helpers"] = []
+    (folder / "scene.json").write_text(json.dumps(document))
+    before = set(came_later(folder))
+    shutil.copytree(pictures, folder / "walk")
+    assert set(came_later(folder)) == before | {"walk"}
+    assert prepared(folder) == 0
+    told = capsys.readouterr().err
+    assert "walk" in told and f"otsync calibrate '{folder}'" in told
