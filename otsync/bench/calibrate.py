@@ -22,7 +22,7 @@ from ..calibrate.document import calibrated_document
 from ..calibrate.verb import calibrate_clips
 from ..calibrate.world import centres, degrees, laid_over
 from ..files.cache import Cache
-from ..geometry import common_target, undistort
+from ..geometry import common_target
 from ..io import open_scene
 from ..io.readers import describe_folder
 from ..io.scene import Scene, scene_from_document
@@ -40,6 +40,9 @@ DISTANCE = 2.5
 
 POINTS = 150
 """Of the scene, by which the cameras' residual is measured."""
+
+BEHIND = 1e4
+"""Pixels that a point behind a camera misses."""
 
 LATE, CLIP = 30, 120
 """Frames by which clips of a rig begin late at the most, and how many they have."""
@@ -108,7 +111,8 @@ def residual(found: Calibration, truth: dict[str, Camera], right: Collection[str
     """Pixels at 640 of width that points of the scene miss, as the median over cameras that are right: points between
     the cameras are seen through the true ones, triangulated with those that were found, and projected again.
 
-    None for fewer than two cameras. Needs no frame in common, and tells what a reconstruction suffers.
+    None for fewer than two cameras. Pixels are those of ideal pinholes. Needs no frame in common, and tells what a
+    reconstruction suffers.
     """
     named = [camera for camera in found.found if camera.name in right]
     if len(named) < 2:
@@ -124,7 +128,8 @@ def residual(found: Calibration, truth: dict[str, Camera], right: Collection[str
     for p in np.flatnonzero(np.sum(inside, 0) >= 2):
         views = [v for v in range(len(mine)) if inside[v][p]]
         rays = [(mine[v], seen[v][p]) for v in views]
-        again = np.array([camera.project(_triangulated(rays)[None, None])[0, 0] for camera, _ in rays])
+        xyz_found = _triangulated(rays)
+        again = np.array([camera.project(xyz_found[None, None])[0, 0] for camera, _ in rays])
         wide = np.array([640 / camera.width for camera, _ in rays])
         off += (np.linalg.norm(again - [uv for _, uv in rays], axis=1) * wide).tolist()
     return round(float(np.median(off)), 3) if off else None
@@ -141,12 +146,12 @@ def _triangulated(rays: Sequence[tuple[Camera, np.ndarray]]) -> np.ndarray:
     rows = []
     for camera, uv in rays:
         P = camera.K @ camera.w2c[:3]
-        x = undistort(camera, uv[None])[0]
-        rows += [x[0] * P[2] - P[0], x[1] * P[2] - P[1]]
+        rows += [uv[0] * P[2] - P[0], uv[1] * P[2] - P[1]]
     start = np.linalg.svd(np.array(rows))[2][-1]
 
     def off(xyz: np.ndarray) -> np.ndarray:
-        return np.concatenate([camera.project(xyz[None, None])[0, 0] - uv for camera, uv in rays])
+        missed = np.concatenate([camera.project(xyz[None, None])[0, 0] - uv for camera, uv in rays])
+        return np.nan_to_num(missed, nan=BEHIND)
 
     return np.asarray(least_squares(off, start[:3] / start[3], max_nfev=20).x)
 

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ..files.strict import checked
 from ..io.document import document
-from ..io.scene import names_of, read_document
+from ..io.layout import SceneFile
+from ..io.scene import file_of, names_of, read_document
 from .clips import kind_of, uncalibrated
 from .found import Calibration, FoundCamera
 
@@ -54,12 +57,19 @@ def told_of(calibration: Calibration) -> dict[str, Any]:
 
 
 def came_later(folder: str | os.PathLike[str]) -> tuple[str, ...]:
-    """Clips of a folder that were not there when ``otsync calibrate`` found the cameras of its scene.json."""
-    document, _ = read_document(folder)
-    told = document.get("calibration")
-    if not isinstance(told, dict) or not isinstance(told.get("helpers"), list):
+    """Clips of a folder that were not there when ``otsync calibrate`` found the cameras of its scene.json.
+
+    None where that file does not say, or is no sound scene: whoever reads it says why.
+    """
+    try:
+        document, _ = read_document(folder)
+        checked(document, SceneFile, file_of(Path(folder)))
+    except ValueError:
         return ()
-    known = {*told.get("cameras", {}), *told["helpers"]}
+    told = document.get("calibration") or {}
+    if "helpers" not in told:
+        return ()
+    known = {*told["cameras"], *told["helpers"]}
     names = [str(entry["name"]) for entry in uncalibrated(folder)["videos"]]
     return tuple(name for name in names if name not in known and kind_of(name) != "board")
 

@@ -36,9 +36,9 @@ class Timeline {
     const place = (t) => ((t - range[0]) / (range[1] - range[0])) * width;
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
     context.clearRect(0, 0, width, height);
-    this.#axis(context, style, place, width, height);
     context.font = `${BAR.label}px system-ui, sans-serif`;
     context.textBaseline = 'middle';
+    this.#axis(context, style, place, width, height);
     this.about.cameras.forEach((camera, v) => {
       const y = BAR.gap + v * (BAR.height + BAR.gap);
       const [x0, x1] = [camera.first, camera.last].map((own) => place(this.clocks.at(camera, own)));
@@ -62,11 +62,10 @@ class Timeline {
 
   /** A tick at the foot of the bar for every frame, where they lie far enough apart to be told apart. */
   #frames(context, camera, place, y) {
-    const instants = frameTimes(camera);
     const pixels = (place(1) - place(0)) * (camera.last - camera.first);
-    if (pixels < FRAME_TICKS * (instants.length - 1)) return;
+    if (pixels < FRAME_TICKS * (frameCount(camera) - 1)) return;
     context.globalAlpha = 0.75;
-    for (const own of instants) context.fillRect(place(this.clocks.at(camera, own)) - 0.5, y + BAR.height - 4, 1, 4);
+    for (const own of frameTimes(camera)) context.fillRect(place(this.clocks.at(camera, own)) - 0.5, y + BAR.height - 4, 1, 4);
     context.globalAlpha = 1;
   }
 
@@ -92,10 +91,14 @@ function roundStep(least) {
   return power * [1, 2, 5, 10].find((n) => n * power >= least * (1 - 1e-9));
 }
 
+function frameCount({ first, last, shots: { times, step } }) {
+  return times ? times.length : Math.round((last - first) / step) + 1;
+}
+
 /** Seconds of a video's own clock at which it has a frame. */
-function frameTimes({ first, last, shots: { times, step } }) {
-  if (times) return times;
-  return Array.from({ length: Math.round((last - first) / step) + 1 }, (_, k) => first + k * step);
+function frameTimes(camera) {
+  const { first, shots } = camera;
+  return shots.times ?? Array.from({ length: frameCount(camera) }, (_, k) => first + k * shots.step);
 }
 
 /** World seconds from the first to the last moment of any bar, whichever clocks are chosen. */

@@ -121,3 +121,13 @@ def test_a_walk_that_was_filmed_since_is_told(tmp_path, capsys):
     assert prepared(folder) == 0
     told = capsys.readouterr().err
     assert "walk" in told and f"otsync calibrate '{folder}'" in told
+
+
+@pytest.mark.parametrize("told", [{"helpers": [[]]}, {"helpers": 3}, {"helpers": [], "cameras": None}, [], "walk"])
+def test_a_calibration_that_is_none_is_left_to_its_reader(tmp_path, told):
+    write_recording(tmp_path, [0.0, 2.0], frames=3)
+    document = json.loads((tmp_path / "scene.json").read_text())
+    (tmp_path / "scene.json").write_text(json.dumps({**document, "calibration": told}))
+    assert came_later(tmp_path) == () and prepared(tmp_path) == 0
+    with pytest.raises(ValueError, match="calibration"):
+        open_scene(tmp_path)
