@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from scipy.interpolate import BSpline
 from scipy.linalg import solveh_banded
+
+from .jumps import find_jumps
 
 DEGREE = 3
 
@@ -21,6 +25,9 @@ RIDGE = 1e-6
 
 BRIDGE_FRAMES = 2.5
 """Longest step between two samples that a curve is believed across: one dropped frame, not two."""
+
+BESIDE_JUMP = 1
+"""Whole steps on either side of a jump's own in which the curve does not answer."""
 
 ON_SAMPLE = 1e-6
 """Frames within which a time is that of a sample, for rounding."""
@@ -40,7 +47,9 @@ class TrackSplines:
 
     Minimises Σ ‖x(t_k) - x_k‖² + λ Σ ‖Δ³c‖² over the coefficients c of a cubic B-spline with uniform knots. The
     penalty carries the curve through gaps, but :meth:`support` says where it means something: between two
-    consecutive samples that were both seen. Linear interpolation instead would lock the offset to whole frames.
+    consecutive samples that were both seen. Linear interpolation instead would lock the offset to whole frames; so
+    would a curve through a jump (:mod:`otsync.clocks.jumps`), which is therefore taken out before and put back
+    after, and the curve does not answer beside it.
 
     Args:
         times: (T,) seconds, increasing. xyz: (M,T,3), nan where unobserved.
@@ -66,8 +75,9 @@ class TrackSplines:
         self.knots = times[0] + self.step * np.arange(-DEGREE, intervals + DEGREE + 1)
         self.n = intervals + DEGREE
         self._by_track: np.ndarray | None = None
+        self.jumps = find_jumps(xyz)
         #: (n, M*3) coefficients around each track's own mean, which keeps them small
-        self.mean, self.coefficients = self._fit(xyz, smoothing * max(1.0, 1 / (30 * self.frame)))
+        self.mean, self.coefficients = self._fit(self._joined(xyz), smoothing * max(1.0, 1 / (30 * self.frame)))
 
     def _fit(self, xyz: np.ndarray, penalty: float) -> tuple[np.ndarray, np.ndarray]:
         """(M,3) means, and (n, M*3) coefficients around them. Memory grows with T + n, not with its square."""
@@ -98,6 +108,7 @@ class TrackSplines:
         part.__dict__ |= self.__dict__
         part._by_track = None
         part.seen, part.mean = self.seen[index], self.mean[index]
+        part.jumps = self.jumps.take(index) if len(self.jumps) else self.jumps
         part.coefficients = self.coefficients.reshape(self.n, -1, 3)[:, index].reshape(self.n, -1)
         return part
 
@@ -110,6 +121,13 @@ class TrackSplines:
 
     def value(self, t: Float[np.ndarray, " S"]) -> Float[np.ndarray, "M S 3"]:
         """Positions at seconds ``t``; outside the clip the end values."""
+        x = self.joined(t)
+        for track, before, after, by in self._jumps():
+            x[track, t > 0.5 * (self.times[before] + self.times[after])] += by
+        return x
+
+    def joined(self, t: Float[np.ndarray, " S"]) -> Float[np.ndarray, "M S 3"]:
+        """Positions at ``t`` as they would be had no track jumped: what the coefficients say."""
         flat = self._design(self._inside(t), DEGREE) @ self.coefficients
         return flat.reshape(len(t), -1, 3).transpose(1, 0, 2) + self.mean[:, None]
 
@@ -147,11 +165,26 @@ class TrackSplines:
         right = np.where(on_sample, left, np.minimum(left + 1, len(times) - 1))
         inside = (t >= times[0] - ON_SAMPLE * self.frame) & (t <= times[-1] + ON_SAMPLE * self.frame)
         inside &= times[right] - times[left] <= BRIDGE_FRAMES * self.frame
-        return self.seen[:, left] & self.seen[:, right] & inside
+        known = self.seen[:, left] & self.seen[:, right] & inside
+        for track, before, after, _ in self._jumps():
+            begin, end = max(before - BESIDE_JUMP, 0), min(after + BESIDE_JUMP, len(times) - 1)
+            known[track, (t > times[begin]) & (t < times[end])] = False
+        return known
 
     def sample(self, t: Float[np.ndarray, " S"]) -> Float[np.ndarray, "M S 3"]:
         """Positions at ``t``, nan where not supported."""
         return np.where(self.support(t)[..., None], self.value(t), np.nan)
+
+    def _jumps(self) -> Iterator[tuple[int, int, int, np.ndarray]]:
+        return zip(self.jumps.track, self.jumps.before, self.jumps.after, self.jumps.by, strict=True)
+
+    def _joined(self, xyz: np.ndarray) -> np.ndarray:
+        """Samples with the jumps taken out."""
+        if len(self.jumps):
+            xyz = xyz.copy()
+            for track, _, after, by in self._jumps():
+                xyz[track, after:] -= by
+        return xyz
 
     def _inside(self, t: np.ndarray) -> np.ndarray:
         return np.clip(t, self.times[0], self.times[-1] - WITHIN * self.step)

@@ -69,7 +69,7 @@ class Side:
         slack = 1e-6 * own.frame
         lo = np.searchsorted(t, t - window - slack)
         hi = np.searchsorted(t, t + window + slack, side="right")
-        return cls(own, own.value(t), other, lo, hi, forward)
+        return cls(own, own.joined(t), other, lo, hi, forward)
 
     def there(self, clock: Clock) -> Float[np.ndarray, " T"]:
         """The moments of the other video that this one's frames show."""
@@ -303,10 +303,9 @@ def velocity_correlation(a: TrackSplines, b: TrackSplines, fit: Fit, window: flo
     """Correlation of matched velocities, differences over ± ``window`` s, pooled with the fit's weights."""
     clock = fit.clock
     t = a.times[a.support(a.times).any(0)]
-    lo, hi = a.sample(t - window), a.sample(t + window)
-    LO, HI = b.sample(clock.own(t - window)), b.sample(clock.own(t + window))
-    u, v = hi - lo, HI - LO
-    known = np.isfinite(u[..., 0]) & np.isfinite(v[..., 0])
+    early, late = t - window, t + window
+    u, v = a.joined(late) - a.joined(early), b.joined(clock.own(late)) - b.joined(clock.own(early))
+    known = a.support(early) & a.support(late) & b.support(clock.own(early)) & b.support(clock.own(late))
     u, v = np.where(known[..., None], u, 0), np.where(known[..., None], v, 0)
     uv, uu, vv = (float(fit.weights @ (x * y).sum((1, 2))) for x, y in ((u, v), (u, u), (v, v)))
     return uv / np.sqrt(uu * vv) if uu > 0 and vv > 0 else 0.0

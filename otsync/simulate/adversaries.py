@@ -95,6 +95,35 @@ def flock(rng: np.random.Generator) -> Scene:
     return Scene(Parts.join([thing(i, HORSE, (0.06,) * 3) for i in range(count)]), pose)
 
 
+def rain(rng: np.random.Generator) -> Scene:
+    """Forty different things fall, each at a speed of its own, and come again on top the moment they reach the floor."""
+    count, high = 40, 2.4
+    spot = rng.uniform(-1.5, 1.5, (count, 2))
+    speed, start = rng.uniform(0.6, 1.8, count), rng.uniform(0, high, count)
+
+    def pose(t: np.ndarray) -> Poses:
+        z = (start[:, None] - speed[:, None] * t[None]) % high
+        x = np.broadcast_to(spot[:, None], (count, len(t), 2))
+        return np.broadcast_to(np.eye(3), (count, len(t), 3, 3)), np.concatenate([x, z[..., None]], 2)
+
+    return Scene(Parts.join([thing(i, N_KINDS + i, (0.06,) * 3) for i in range(count)]), pose)
+
+
+def portals(rng: np.random.Generator) -> Scene:
+    """Twenty-four different things wander, and each is elsewhere all at once every second or two."""
+    count = 24
+    wander = Wander(rng, 3 * count, 0.3, 0.3, 1.0)
+    when = np.cumsum(rng.uniform(1.0, 2.0, (count, 40)), 1) - 15.0
+    place = rng.uniform(-1.0, 1.0, (count, 41, 3)) + np.array([0, 0, 1.2])
+
+    def pose(t: np.ndarray) -> Poses:
+        own = wander(t).reshape(len(t), count, 3).transpose(1, 0, 2)
+        now = np.stack([np.searchsorted(w, t) for w in when])
+        return np.broadcast_to(np.eye(3), (count, len(t), 3, 3)), place[np.arange(count)[:, None], now] + own
+
+    return Scene(Parts.join([thing(i, N_KINDS + i, (0.06,) * 3) for i in range(count)]), pose)
+
+
 ADVERSARIES: dict[str, Callable[[np.random.Generator], Scene]] = {
     "canon": canon,
     "unison": unison,
@@ -102,5 +131,7 @@ ADVERSARIES: dict[str, Callable[[np.random.Generator], Scene]] = {
     "carousel": carousel,
     "belt": belt,
     "flock": flock,
+    "rain": rain,
+    "portals": portals,
 }
 """Motions that mislead, by name."""

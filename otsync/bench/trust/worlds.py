@@ -219,5 +219,8 @@ CLASSES: dict[str, Callable[[int], World]] = {
     "carousel": partial(plain, motion="carousel", alike=True),
     "belt": partial(plain, motion="belt", alike=True),
     "flock": partial(plain, motion="flock", alike=True),
+    "rain": partial(plain, motion="rain"),
+    "things that jump": partial(plain, motion="portals"),
+    "things that jump, hard": partial(plain, motion="portals", preset="hard"),
 }
 """Classes by name: those of the benchmark first, then those that mislead."""
