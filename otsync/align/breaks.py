@@ -273,6 +273,7 @@ def _as_a_rate(curves: Float[np.ndarray, "W K"], straight: float) -> tuple[float
     W, K = curves.shape
     position = np.arange(W) - (W - 1) / 2
     most = min(K // 2, int(np.ceil(SLOPES * W * 10)))
+    summed = np.concatenate([np.zeros((1, K)), np.cumsum(curves, 0)])
     gain, line = 0.0, np.zeros(W, np.int64)
     for ends in range(-most, most + 1):
         shift = np.rint(ends * position / max(W - 1, 1)).astype(np.int64)
@@ -280,7 +281,9 @@ def _as_a_rate(curves: Float[np.ndarray, "W K"], straight: float) -> tuple[float
         if 2 * reach >= K:
             continue
         middle = np.arange(reach, K - reach)
-        total = sum(curves[w, middle + shift[w]] for w in range(W))
+        edges = np.flatnonzero(np.diff(shift, prepend=shift[0] - 1, append=shift[-1] + 1))
+        by_shift = summed[edges[1:]] - summed[edges[:-1]]  # windows of one shift follow each other
+        total = by_shift[np.arange(len(by_shift))[:, None], middle + shift[edges[:-1], None]].sum(0)
         top = int(np.argmax(total))
         if total[top] - straight > gain:
             gain, line = float(total[top] - straight), middle[top] + shift

@@ -7,8 +7,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..clocks.common import CommonClock, common_clock, strongest
+from ..clocks.common import SAMPLES, CommonClock, common_clock, readable, strongest
 from ..clocks.splines import TrackSplines
+from ..compute.indices import evenly
 from ..costs.linear import binary_scale, velocity
 from ..types import Alignment, Matches, Status, TrackSet, in_order
 from ..types.checks import positive
@@ -17,6 +18,7 @@ from .breaks import find_breaks
 from .peaks import separate_peaks, vertex
 from .signal import Signal
 from .slot import Aligner
+from .spectra import lag_statistics
 
 MIN_OVERLAP = 24 / 30
 """Seconds that two videos must share for an offset to be considered."""
@@ -38,6 +40,18 @@ COMMON_RATES = (4 / 5, 5 / 6, 24 / 25, 25 / 24, 6 / 5, 5 / 4)
 """Clock ratios of the frame rates 24, 25 and 30, by which a container's fps may be wrong."""
 
 RATE_MATCHES = 40
+"""Matches that other rates are tried with, at most; of long clips fewer, a quarter as many samples
+as the answer is read from."""
+
+FEWER = 0.25
+
+DIRECT = 300_000_000
+"""Matches times lags times common frames up to which sums are made one by one: about a second. Beyond, spectra tell
+the velocities and whole positions, and windows are only looked at where they matter."""
+
+CONTENDERS, BACKGROUND = 32, 64
+"""Peaks of the velocities at which the windows of long clips are looked at, and lags spread evenly over all whose
+median, by common frames, is what they have elsewhere."""
 
 
 READS = ("evidence", "margin", "disagreement", "alias", "overlap", "matches", "motion", "rate_gain")
@@ -82,7 +96,7 @@ class LikelihoodScan(Aligner):
         self.trust.check("LikelihoodScan.trust", READS)
 
     def __call__(self, a: TrackSet, b: TrackSet, matches: Matches) -> Alignment:
-        matches = strongest(matches, self.limit)
+        matches = strongest(matches, readable(self.limit, a, b))
         pair, scale = normalised(common_clock(a, b, matches))
         lags = pair.lags(max(1, round(self.min_overlap * pair.fps)), self.max_lag)
         if len(matches) == 0 or len(lags) == 0:
@@ -180,12 +194,23 @@ def evidence(pair: CommonClock, lags: Int[np.ndarray, " K"], weight: Float[np.nd
     least = frames(MIN_FRAMES)
     count, power, residual = statistics(*positions, lags, least)
     floor = noise_floor(count, power, residual)
-    total = np.zeros((1, len(lags)))
-    begin, (block, few) = np.maximum(lags, 0), (frames(BLOCK), frames(MIN_WINDOW))  # treats a and b alike
-    kernels.windowed_evidence(*positions[0].arrays, *positions[1].arrays, lags, begin, block, few, floor, weight, total)
-    observed = (count > 0).sum(0).astype(float)
-    windows = np.where(observed > 0, total[0] / len(pair.a), -np.inf)
     fast, slow = (velocity_score(pair, lags, frames(half), least, weight) for half in (FAST, SLOW))
+    seen_at = np.arange(len(lags))
+    if not direct(*positions, lags):
+        tops = separate_peaks(fast + slow, frames(APART), CONTENDERS)
+        near = np.add.outer(tops, np.arange(-frames(APART), frames(APART) + 1)).ravel()
+        spread = evenly(len(lags), BACKGROUND)
+        seen_at = np.unique(np.clip(np.concatenate([near, spread]), 0, len(lags) - 1))
+    total, some = np.zeros((1, len(seen_at))), lags[seen_at]
+    begin, (block, few) = np.maximum(some, 0), (frames(BLOCK), frames(MIN_WINDOW))  # treats a and b alike
+    kernels.windowed_evidence(*positions[0].arrays, *positions[1].arrays, some, begin, block, few, floor, weight, total)
+    everywhere = total[0]
+    if len(seen_at) < len(lags):
+        common = pair.overlap(lags)
+        everywhere = common * float(np.median(total[0, np.searchsorted(seen_at, spread)] / common[spread]))
+        everywhere[seen_at] = total[0]
+    observed = (count > 0).sum(0).astype(float)
+    windows = np.where(observed > 0, everywhere / len(pair.a), -np.inf)
     shared = 0.5 * (count * (power - residual)).sum(0) / np.maximum(count.sum(0), 1)
     extent = 0.5 * (positions[0].extent + positions[1].extent)
     return Curves(
@@ -204,9 +229,18 @@ def statistics(
     """Frames in common, Var a + Var b and Var(a - b) of every match at every lag."""
     from . import kernels
 
+    if not direct(a, b, lags):
+        return lag_statistics(a, b, lags, least)
     out = tuple(np.zeros((len(a.arrays[0]), len(lags))) for _ in range(3))
     kernels.lag_statistics(*a.arrays, *b.arrays, lags, least, *out)
     return out  # type: ignore[return-value]
+
+
+def direct(a: Signal, b: Signal, lags: Int[np.ndarray, " K"]) -> bool:
+    """Whether sums over the common frames of every match and lag are made one by one: see :data:`DIRECT`."""
+    Ta, Tb = a.arrays[0].shape[2], b.arrays[0].shape[2]
+    common = np.minimum(Ta, Tb + lags) - np.maximum(0, lags)
+    return len(a.arrays[0]) * float(np.maximum(common, 0).sum()) <= DIRECT
 
 
 def noise_floor(count: np.ndarray, power: np.ndarray, residual: np.ndarray) -> float:
@@ -245,7 +279,8 @@ def other_rate(
 
     A warning, not an answer: read from a few dozen matches only, as every pair pays for it.
     """
-    some = np.unique(np.linspace(0, len(matches) - 1, RATE_MATCHES).astype(int))
+    many = readable(RATE_MATCHES, a, b, FEWER * SAMPLES)
+    some = np.unique(np.linspace(0, len(matches) - 1, many).astype(int))
     half, least = max(1, round(SLOW * pair.fps)), max(1, round(MIN_FRAMES * pair.fps))
 
     def rise(p: CommonClock) -> float:

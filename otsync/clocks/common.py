@@ -19,6 +19,11 @@ EVEN = 1e-3
 WHOLE = 1e-6
 """Frames by which a clip may fall short of a whole number of them, for rounding."""
 
+SAMPLES = 3_000_000
+"""Samples of one video that aligners and refiners read, at most: 28 tracks of an hour at 30 fps, 333 of five minutes.
+Memory and time are bounded by it. More would change an offset by less than what limbs and drifts have in common.
+"""
+
 USUAL_FPS = 30.0
 """Rate of a single frame, which has none."""
 
@@ -74,6 +79,11 @@ def strongest(matches: Matches, limit: int) -> Matches:
     shuffled = np.random.default_rng(0).permutation(len(matches))
     chosen = np.sort(shuffled[np.argsort(-matches.score[shuffled], kind="stable")[:limit]])
     return matches.take(chosen)
+
+
+def readable(limit: int, a: TrackSet, b: TrackSet, samples: float = SAMPLES) -> int:
+    """Matches of two clips that are read, at most: ``limit``, or what ``samples`` allow."""
+    return max(1, min(limit, int(samples) // max(a.n_frames, b.n_frames)))
 
 
 def nominal_fps(tracks: TrackSet) -> float:

@@ -15,7 +15,7 @@ AROUND = 3
 """Steps on either side that a step is compared with."""
 
 UNLIKE = 8.0
-"""A step jumps that differs from the median of those around it so many times more than any of them does: a limb that
+"""A step jumps that differs from the mean of those around it so many times more than any of them does: a limb that
 sets out, a ball that is hit keep their new speed, and noise of the tracker has that of its neighbours."""
 
 LEAST = 8.0
@@ -30,8 +30,8 @@ FARTHER = 4
 ROUNDING = 1e-6
 """Of the largest coordinate: steps that differ by less do not differ."""
 
-TRACKS = 256
-"""Tracks that the usual difference of steps is taken from."""
+ENOUGH_STEPS = 2**20
+"""Of all tracks together: how many the usual difference of steps is taken from."""
 
 AT_ONCE = 2**20
 """Samples that are looked at together."""
@@ -64,7 +64,7 @@ class Jumps:
 def find_jumps(x: Float[np.ndarray, "M T 3"]) -> Jumps:
     """The jumps of tracks, nan where unseen.
 
-    A step between two samples jumps where it differs from the median of those around it far more than any of them
+    A step between two samples jumps where it differs from the mean of those around it far more than any of them
     does. Two jumps that near to each other are none: a sample far off, which robust fits leave out, or things that
     move by jerks (copied frames, whole pixels), whose motion the jerks are.
     """
@@ -85,7 +85,7 @@ def _jumps(x: Float[np.ndarray, "M T 3"], first: int, usual: float) -> Jumps:
     around[(at < 0) | (at >= step.shape[1])] = np.nan
     known = np.isfinite(around[..., 0])
     around[~known.any(1)] = 0.0  # nothing is known there: a step is compared with rest
-    middle = np.nanmedian(around, axis=1)
+    middle = np.nanmean(around, axis=1)  # a median would depend on the axes
     spread = np.nanmax(np.linalg.norm(around - middle[:, None], axis=2), axis=1)
     spread = np.maximum(spread, np.where(known.sum(1) < ENOUGH, LEAST * usual, 0.0))
     frames = after - before
@@ -116,9 +116,9 @@ def _candidates(
 
 def _usual(x: Float[np.ndarray, "M T 3"]) -> float:
     """Median difference of consecutive steps; infinite where none is known."""
-    some = x[:: max(1, len(x) // TRACKS)]
-    change = np.linalg.norm(np.diff(some, n=2, axis=1), axis=2)
+    at = np.arange(1, x.shape[1] - 1, max(1, x.shape[0] * x.shape[1] // ENOUGH_STEPS))
+    change = np.linalg.norm((x[:, at + 1] - x[:, at]) - (x[:, at] - x[:, at - 1]), axis=2)
     change = change[np.isfinite(change)]
     if not len(change):
         return np.inf
-    return max(float(np.median(change)), ROUNDING * float(np.nanmax(np.abs(some))))
+    return max(float(np.median(change)), ROUNDING * float(np.nanmax(np.abs(x))))

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float
 
-from ..clocks.common import nominal_fps, strongest
+from ..clocks.common import nominal_fps, readable, strongest
 from ..clocks.splines import SMOOTHING, TrackSplines
 from ..costs.linear import binary_scale
 from ..types import Alignment, Clock, Matches, Status, TrackSet, in_order
@@ -91,7 +91,7 @@ class SplineRefine(Refiner):
     def __call__(self, a: TrackSet, b: TrackSet, matches: Matches, alignment: Alignment) -> Alignment:
         if not math.isfinite(alignment.offset):
             return alignment
-        matches = strongest(matches, self.limit)
+        matches = strongest(matches, readable(self.limit, a, b))
         curves = self.splines(a, b, matches)
         start = Clock(alignment.offset, alignment.rate)
         weight = None if matches.weight is None else matches.shares
@@ -104,7 +104,8 @@ class SplineRefine(Refiner):
         spread = max((self._apart(o, fit, curves) for o in others), default=0.0)
         fps = min(nominal_fps(a), nominal_fps(b))
         shared = spread**2 / 2 + (fit.blur**2 / COMMON_ERRORS) ** 2 + LEAST_SIGMA**2
-        ends = self._ends(curves, fit, free, shared, unsettled_rate(rate_stats, fit.clock.rate))
+        unsettled = unsettled_rate(rate_stats, fit.clock.rate)
+        ends = self._ends(curves, fit, free, shared, unsettled, rate_stats.get("rate_sigma"))
         stats = (
             alignment.stats
             | rate_stats
@@ -145,15 +146,15 @@ class SplineRefine(Refiner):
     def with_rate(self, rate: Rate) -> SplineRefine:
         return replace(self, rate=rate)
 
-    def splines(self, a: TrackSet, b: TrackSet, matches: Matches) -> tuple[TrackSplines, TrackSplines]:
+    def splines(self, a: TrackSet, b: TrackSet, matches: Matches) -> tuple[TrackSplines, ...]:
         """Curves of the matched tracks, in units of a power of two near their size; repeated tracks are fitted once."""
-        xa, xb = a.positions(), b.positions()
-        scale = max(binary_scale(xa), binary_scale(xb))
-        curves = []
-        for tracks, x, column in ((a, xa, 0), (b, xb, 1)):
-            used, index = np.unique(matches.pairs[:, column], return_inverse=True)
-            curves.append(TrackSplines(tracks.times, x[used] / scale, smoothing=self.smoothing).take(index))
-        return curves[0], curves[1]
+        used, index = zip(*(np.unique(column, return_inverse=True) for column in matches.pairs.T), strict=True)
+        x = [tracks.take(some).positions() for tracks, some in zip((a, b), used, strict=True)]
+        scale = max(binary_scale(one) for one in x)
+        return tuple(
+            TrackSplines(tracks.times, one / scale, smoothing=self.smoothing).take(where)
+            for tracks, one, where in zip((a, b), x, index, strict=True)
+        )
 
     def _apart(self, other: Fit | None, fit: Fit, curves: tuple[TrackSplines, TrackSplines]) -> float:
         """Seconds between two answers; a window without an answer counts as a frame."""
@@ -180,10 +181,18 @@ class SplineRefine(Refiner):
         return free, free, (), stats
 
     def _ends(
-        self, curves: tuple[TrackSplines, TrackSplines], fit: Fit, free: Fit | None, shared: float, unsettled: float
+        self,
+        curves: tuple[TrackSplines, TrackSplines],
+        fit: Fit,
+        free: Fit | None,
+        shared: float,
+        unsettled: float,
+        measured: float | None,
     ) -> tuple[float, float]:
-        """One sigma at the beginning and at the end of the overlap; shared: variance of errors that both have;
-        unsettled: of the rate.
+        """One sigma at the beginning and at the end of the overlap.
+
+        shared: variance of errors that both ends have; unsettled: what the rate may be off by; measured: one sigma of
+        the rate where it was fitted.
         """
         a, b = curves
         own = fit.clock.own(a.times[[0, -1]])
@@ -194,7 +203,9 @@ class SplineRefine(Refiner):
             C = free.covariance
             variance = [float(C[0, 0] + 2 * t * C[0, 1] + t * t * C[1, 1]) for t in (begin, end)]
         else:
-            drift = math.hypot(DECLARED, unsettled) * (end - begin) / 2
+            # a free fit that agrees with the declared rate knows it better over a long overlap
+            known = DECLARED if measured is None else min(DECLARED, measured)
+            drift = math.hypot(known, unsettled) * (end - begin) / 2
             variance = [float(fit.covariance[0, 0]) + drift**2] * 2
         return math.sqrt(max(variance[0], 0) + shared), math.sqrt(max(variance[1], 0) + shared)
 

@@ -96,7 +96,7 @@ def flock(rng: np.random.Generator) -> Scene:
 
 
 def rain(rng: np.random.Generator) -> Scene:
-    """Forty different things fall, each at a speed of its own, and come again on top the moment they reach the floor."""
+    """Forty different things fall, each at its own speed, and come again on top the moment they reach the floor."""
     count, high = 40, 2.4
     spot = rng.uniform(-1.5, 1.5, (count, 2))
     speed, start = rng.uniform(0.6, 1.8, count), rng.uniform(0, high, count)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..clocks.common import strongest
+from ..clocks.common import readable, strongest
 from ..clocks.splines import TrackSplines
 from ..refine.gauss_newton import fit_clock
 from ..refine.splines import SplineRefine
@@ -86,7 +86,7 @@ def mended(tracks: TrackSet, breaks: Sequence[Break]) -> TrackSet:
 
 def suspects(answer: Answer, a: TrackSet, b: TrackSet, fps: Sequence[float]) -> list[Suspect]:
     """Both readings of every jump of a pair's offset, located to a frame and measured below it."""
-    matches = strongest(answer.matches, LIMIT)
+    matches = strongest(answer.matches, readable(LIMIT, a, b))
     curves = SplineRefine().splines(a, b, matches)
     raw = Raw.of(a, matches.pairs[:, 0]), Raw.of(b, matches.pairs[:, 1])
     found = []
@@ -154,7 +154,7 @@ class Raw:
 
     @classmethod
     def of(cls, tracks: TrackSet, index: np.ndarray) -> Raw:
-        return cls(tracks.times, tracks.positions()[index])
+        return cls(tracks.times, tracks.take(index).positions())
 
     def at(self, t: np.ndarray) -> np.ndarray:
         """(M,S,3) between two samples on a line; nan outside."""
@@ -286,7 +286,7 @@ def culprit(found: Sequence[Suspect], sound: Sequence[tuple[int, int]]) -> Suspe
 
 def remeasured(answer: Answer, a: TrackSet, b: TrackSet, moment: float) -> tuple[float, float]:
     """What is left of a jump after it was mended, s, and one sigma of it; ``moment``: of the break, on a's clock."""
-    curves = SplineRefine().splines(a, b, strongest(answer.matches, LIMIT))
+    curves = SplineRefine().splines(a, b, strongest(answer.matches, readable(LIMIT, a, b)))
     start = Clock(answer.refined.offset, answer.refined.rate)
     one = fit_clock(curves[0].within(-math.inf, moment - MARGIN), curves[1], start, WINDOW)
     two = fit_clock(curves[0].within(moment + MARGIN, math.inf), curves[1], start, WINDOW)
@@ -302,7 +302,7 @@ def runs_on(answer: Answer, a: TrackSet, b: TrackSet, before: float, behind: flo
     Args:
         before, behind: the moments on a's clock up to which the first part goes, and from which on the second one does.
     """
-    pairs = strongest(answer.matches, LIMIT).pairs
+    pairs = strongest(answer.matches, readable(LIMIT, a, b)).pairs
     raw = Raw.of(a, pairs[:, 0]), Raw.of(b, pairs[:, 1])
     clock = Clock(answer.refined.offset, answer.refined.rate)
     first, last = clock.world(float(b.times[0])), clock.world(float(b.times[-1]))
