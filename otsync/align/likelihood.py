@@ -183,8 +183,6 @@ class Curves:
 
 def evidence(pair: CommonClock, lags: Int[np.ndarray, " K"], weight: Float[np.ndarray, " M"] | None = None) -> Curves:
     """The scan's score and its parts at ``lags``; ``weight``: of the matches, with mean 1."""
-    from . import kernels
-
     weight = np.ones(len(pair.a)) if weight is None else weight
 
     def frames(seconds: float) -> int:
@@ -194,24 +192,13 @@ def evidence(pair: CommonClock, lags: Int[np.ndarray, " K"], weight: Float[np.nd
     least = frames(MIN_FRAMES)
     count, power, residual = statistics(*positions, lags, least)
     floor = noise_floor(count, power, residual)
-    fast, slow = (velocity_score(pair, lags, frames(half), least, weight) for half in (FAST, SLOW))
-    seen_at = np.arange(len(lags))
-    if not direct(*positions, lags):
-        tops = separate_peaks(fast + slow, frames(APART), CONTENDERS)
-        near = np.add.outer(tops, np.arange(-frames(APART), frames(APART) + 1)).ravel()
-        spread = evenly(len(lags), BACKGROUND)
-        seen_at = np.unique(np.clip(np.concatenate([near, spread]), 0, len(lags) - 1))
-    total, some = np.zeros((1, len(seen_at))), lags[seen_at]
-    begin, (block, few) = np.maximum(some, 0), (frames(BLOCK), frames(MIN_WINDOW))  # treats a and b alike
-    kernels.windowed_evidence(*positions[0].arrays, *positions[1].arrays, some, begin, block, few, floor, weight, total)
-    everywhere = total[0]
-    if len(seen_at) < len(lags):
-        common = pair.overlap(lags)
-        everywhere = common * float(np.median(total[0, np.searchsorted(seen_at, spread)] / common[spread]))
-        everywhere[seen_at] = total[0]
     observed = (count > 0).sum(0).astype(float)
-    windows = np.where(observed > 0, everywhere / len(pair.a), -np.inf)
-    shared = 0.5 * (count * (power - residual)).sum(0) / np.maximum(count.sum(0), 1)
+    power -= residual
+    power *= count
+    shared = 0.5 * power.sum(0) / np.maximum(count.sum(0), 1)
+    del count, power, residual  # of long clips, hundreds of megabytes
+    fast, slow = (velocity_score(pair, lags, frames(half), least, weight) for half in (FAST, SLOW))
+    windows = np.where(observed > 0, window_score(pair, *positions, lags, fast + slow, floor, weight), -np.inf)
     extent = 0.5 * (positions[0].extent + positions[1].extent)
     return Curves(
         total=fast + slow + windows,
@@ -221,6 +208,40 @@ def evidence(pair: CommonClock, lags: Int[np.ndarray, " K"], weight: Float[np.nd
         motion=np.sqrt(np.maximum(shared, 0)) / extent if extent > 0 else np.zeros(len(lags)),
         floor=floor,
     )
+
+
+def window_score(
+    pair: CommonClock,
+    a: Signal,
+    b: Signal,
+    lags: Int[np.ndarray, " K"],
+    motion: Float[np.ndarray, " K"],
+    floor: float,
+    weight: Float[np.ndarray, " M"],
+) -> Float[np.ndarray, " K"]:
+    """Mean LLR of the positions in windows; of long clips that at the peaks of ``motion``, the score of velocities, and
+    beside them what lags by chance have.
+    """
+    from . import kernels
+
+    def frames(seconds: float) -> int:
+        return max(1, round(seconds * pair.fps))
+
+    def at(some: Int[np.ndarray, " L"]) -> Float[np.ndarray, " L"]:
+        total, begin = np.zeros((1, len(some))), np.maximum(some, 0)  # treats a and b alike
+        block, few = frames(BLOCK), frames(MIN_WINDOW)
+        kernels.windowed_evidence(*a.arrays, *b.arrays, some, begin, block, few, floor, weight, total)
+        return total[0] / len(pair.a)
+
+    if direct(a, b, lags):
+        return at(lags)
+    some, common = evenly(len(lags), BACKGROUND), pair.overlap(lags)
+    score = common * float(np.median(at(lags[some]) / common[some]))
+    tops = separate_peaks(motion, frames(APART), CONTENDERS)
+    near = np.add.outer(tops, np.arange(-frames(APART), frames(APART) + 1)).ravel()
+    some = np.unique(np.clip(near, 0, len(lags) - 1))
+    score[some] = at(lags[some])
+    return score
 
 
 def statistics(
@@ -265,7 +286,12 @@ def velocity_score(
     a, b = Signal.of(velocity(pair.a, half)), Signal.of(velocity(pair.b, half))
     count, power, residual = statistics(a, b, lags, least)
     floor = noise_floor(count, power, residual)
-    gain = count * np.log((power + floor) / (residual + floor))
+    # in place: of long clips these are the largest arrays
+    power += floor
+    residual += floor
+    gain = np.divide(power, residual, out=power)
+    np.log(gain, out=gain)
+    gain *= count
     if weight is not None:
         gain *= weight[:, None]
     score = 0.5 * gain.sum(0) / len(pair.a)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 
+from ..clocks.common import thinned
 from ..compute.indices import evenly
 from ..costs.linear import binary_scale
 from ..costs.places import apart
@@ -63,8 +64,9 @@ def vouch(alignment: Alignment, a: TrackSet, b: TrackSet, matches: Matches, alig
         flags += scan.flags
         if not abs(scan.offset - alignment.offset) <= AGREES + 1e-9:
             flags.append(Status.DISAGREE)
-    if all(drifts(tracks, index) for tracks, index in zip((a, b), matches.pairs.T, strict=True)) or (
-        Status.DISAGREE not in flags and only_drift(a, b, matches, alignment.offset)
+    few_a, few_b = thinned(a), thinned(b)
+    if all(drifts(tracks, index) for tracks, index in zip((few_a, few_b), matches.pairs.T, strict=True)) or (
+        Status.DISAGREE not in flags and only_drift(few_a, few_b, matches, alignment.offset)
     ):
         flags.append(Status.STATIC)
     if a.frame is not None and a.frame == b.frame:
@@ -73,7 +75,7 @@ def vouch(alignment: Alignment, a: TrackSet, b: TrackSet, matches: Matches, alig
             flags.append(Status.AMBIGUOUS)
         told = {"apart": distance}
         if a.features is not None and b.features is not None:
-            other = rival(a, b, matches, alignment.offset)
+            other = rival(few_a, few_b, matches, alignment.offset)
             told |= {"rival": other.ratio, "rival_as_good": float(other.as_good)}
             if other.as_good:
                 flags.append(Status.AMBIGUOUS)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -19,10 +19,13 @@ EVEN = 1e-3
 WHOLE = 1e-6
 """Frames by which a clip may fall short of a whole number of them, for rounding."""
 
-SAMPLES = 3_000_000
-"""Samples of one video that aligners and refiners read, at most: 28 tracks of an hour at 30 fps, 333 of five minutes.
+SAMPLES = 2_000_000
+"""Samples of one video that aligners and refiners read, at most: 18 tracks of an hour at 30 fps, 222 of five minutes.
 Memory and time are bounded by it. More would change an offset by less than what limbs and drifts have in common.
 """
+
+LEAST_FRAMES = 5000
+"""Frames that a clip is never thinned below."""
 
 USUAL_FPS = 30.0
 """Rate of a single frame, which has none."""
@@ -84,6 +87,22 @@ def strongest(matches: Matches, limit: int) -> Matches:
 def readable(limit: int, a: TrackSet, b: TrackSet, samples: float = SAMPLES) -> int:
     """Matches of two clips that are read, at most: ``limit``, or what ``samples`` allow."""
     return max(1, min(limit, int(samples) // max(a.n_frames, b.n_frames)))
+
+
+def thinned(tracks: TrackSet) -> TrackSet:
+    """Every k-th frame of a long clip, so that all its tracks together have about :data:`SAMPLES`: for what looks at
+    where tracks are, not at what a frame's difference tells.
+    """
+    step = min(-(-len(tracks) * tracks.n_frames // SAMPLES), tracks.n_frames // LEAST_FRAMES)
+    if step < 2:
+        return tracks
+    taken = {f: v[:, ::step] for f in ("xyz", "visible", "uv", "sigma") if (v := getattr(tracks, f)) is not None}
+    fps = None if tracks.fps is None else tracks.fps / step
+    timestamps = None if tracks.timestamps is None else tracks.timestamps[::step]
+    camera = tracks.camera
+    if camera is not None and camera.w2c.ndim == 3:
+        camera = replace(camera, w2c=camera.w2c[::step])
+    return replace(tracks, **taken, fps=fps if timestamps is None else None, timestamps=timestamps, camera=camera)
 
 
 def nominal_fps(tracks: TrackSet) -> float:

@@ -6,10 +6,14 @@ videos alike only where their frames coincide, so that it would lock an offset t
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+
+from ..compute.indices import blocks
 
 AROUND = 3
 """Steps on either side that a step is compared with."""
@@ -33,13 +37,10 @@ ROUNDING = 1e-6
 ENOUGH_STEPS = 2**20
 """Of all tracks together: how many the usual difference of steps is taken from."""
 
-AT_ONCE = 2**20
-"""Samples that are looked at together."""
-
 
 @dataclass(frozen=True, eq=False)
 class Jumps:
-    """E jumps of tracks, by track and time.
+    """E jumps of tracks, in order of tracks and time.
 
     Args:
         track: of each jump. before, after: the frames between which it lies, both seen, none between them.
@@ -58,7 +59,16 @@ class Jumps:
         """Those of the tracks at ``index`` (repeats allowed), under their new numbers."""
         new = [np.flatnonzero(index == track) for track in self.track]
         each = np.repeat(np.arange(len(self)), [len(n) for n in new])
-        return Jumps(np.concatenate([self.track[:0], *new]), self.before[each], self.after[each], self.by[each])
+        track = np.concatenate([self.track[:0], *new])
+        order = np.lexsort((self.before[each], track))
+        each = each[order]
+        return Jumps(track[order], self.before[each], self.after[each], self.by[each])
+
+    def each_track(self) -> Iterator[tuple[int, slice]]:
+        """Every track that jumps, and where its jumps are, in order of time."""
+        edges = np.flatnonzero(np.diff(self.track, prepend=-1, append=np.iinfo(self.track.dtype).max))
+        for first, end in itertools.pairwise(edges):
+            yield int(self.track[first]), slice(first, end)
 
 
 def find_jumps(x: Float[np.ndarray, "M T 3"]) -> Jumps:
@@ -69,9 +79,8 @@ def find_jumps(x: Float[np.ndarray, "M T 3"]) -> Jumps:
     move by jerks (copied frames, whole pixels), whose motion the jerks are.
     """
     usual, found = _usual(x), [Jumps(*(np.zeros(0, np.int64),) * 3, np.zeros((0, 3)))]
-    many = max(1, AT_ONCE // max(x.shape[1], 1))
     if x.shape[1] > 1:
-        found += [_jumps(x[first : first + many], first, usual) for first in range(0, len(x), many)]
+        found += [_jumps(x[some], some.start, usual) for some in blocks(*x.shape[:2])]
     parts = zip(*((j.track, j.before, j.after, j.by) for j in found), strict=True)
     return Jumps(*(np.concatenate(part) for part in parts))
 
@@ -91,7 +100,8 @@ def _jumps(x: Float[np.ndarray, "M T 3"], first: int, usual: float) -> Jumps:
     frames = after - before
     by = x[track, after] - x[track, before] - frames[:, None] * middle
     limit = np.minimum(frames, FARTHER) * np.maximum(UNLIKE * spread, LEAST * usual)
-    jumps = np.linalg.norm(by, axis=1) > limit
+    jumps = np.flatnonzero(np.linalg.norm(by, axis=1) > limit)
+    jumps = jumps[np.lexsort((before[jumps], track[jumps]))]
     return Jumps(first + track[jumps], before[jumps], after[jumps], by[jumps])
 
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from scipy.interpolate import BSpline
 from scipy.linalg import solveh_banded
 
+from ..compute.indices import blocks
 from .jumps import find_jumps
 
 DEGREE = 3
@@ -34,9 +33,6 @@ ON_SAMPLE = 1e-6
 
 THIRD = (-1.0, 3.0, -3.0, 1.0)
 """Weights of a third difference."""
-
-AT_ONCE = 2**20
-"""Samples and coefficients that are solved for together: some 100 MB, whatever the length of the clip."""
 
 WITHIN = 1e-9
 """Share of a knot's distance by which the last time is kept inside the last interval."""
@@ -86,9 +82,7 @@ class TrackSplines:
         products = [basis[:, : self.n - d].multiply(basis[:, d:]).T.tocsr() for d in range(DEGREE + 1)]
         transposed, regular = basis.T.tocsr(), _penalty_bands(self.n, penalty)
         mean, coefficients = np.zeros((count, 3)), np.zeros((self.n, count, 3))
-        many = max(1, AT_ONCE // (len(self.times) + self.n))
-        for first in range(0, count, many):
-            part = slice(first, first + many)
+        for part in blocks(count, len(self.times) + self.n):
             seen = self.seen[part]
             weight = seen.astype(float)
             values = np.where(seen[..., None], xyz[part], 0.0)
@@ -99,7 +93,7 @@ class TrackSplines:
             for d in range(DEGREE + 1):
                 bands[:, DEGREE - d, d:] += (products[d] @ weight.T).T
             for m in range(len(values)):
-                coefficients[:, first + m] = solveh_banded(bands[m], right[:, m], check_finite=False)
+                coefficients[:, part.start + m] = solveh_banded(bands[m], right[:, m], check_finite=False)
         return mean, coefficients.reshape(self.n, -1)
 
     def take(self, index: np.ndarray) -> TrackSplines:
@@ -122,8 +116,10 @@ class TrackSplines:
     def value(self, t: Float[np.ndarray, " S"]) -> Float[np.ndarray, "M S 3"]:
         """Positions at seconds ``t``; outside the clip the end values."""
         x = self.joined(t)
-        for track, before, after, by in self._jumps():
-            x[track, t > 0.5 * (self.times[before] + self.times[after])] += by
+        jumps = self.jumps
+        for track, those in jumps.each_track():
+            when = 0.5 * (self.times[jumps.before[those]] + self.times[jumps.after[those]])
+            x[track] += np.concatenate([np.zeros((1, 3)), np.cumsum(jumps.by[those], 0)])[np.searchsorted(when, t)]
         return x
 
     def joined(self, t: Float[np.ndarray, " S"]) -> Float[np.ndarray, "M S 3"]:
@@ -166,24 +162,24 @@ class TrackSplines:
         inside = (t >= times[0] - ON_SAMPLE * self.frame) & (t <= times[-1] + ON_SAMPLE * self.frame)
         inside &= times[right] - times[left] <= BRIDGE_FRAMES * self.frame
         known = self.seen[:, left] & self.seen[:, right] & inside
-        for track, before, after, _ in self._jumps():
-            begin, end = max(before - BESIDE_JUMP, 0), min(after + BESIDE_JUMP, len(times) - 1)
-            known[track, (t > times[begin]) & (t < times[end])] = False
+        jumps = self.jumps
+        for track, those in jumps.each_track():
+            begin = times[np.maximum(jumps.before[those] - BESIDE_JUMP, 0)]
+            end = times[np.minimum(jumps.after[those] + BESIDE_JUMP, len(times) - 1)]
+            known[track] &= np.searchsorted(begin, t) <= np.searchsorted(end, t, side="right")
         return known
 
     def sample(self, t: Float[np.ndarray, " S"]) -> Float[np.ndarray, "M S 3"]:
         """Positions at ``t``, nan where not supported."""
         return np.where(self.support(t)[..., None], self.value(t), np.nan)
 
-    def _jumps(self) -> Iterator[tuple[int, int, int, np.ndarray]]:
-        return zip(self.jumps.track, self.jumps.before, self.jumps.after, self.jumps.by, strict=True)
-
     def _joined(self, xyz: np.ndarray) -> np.ndarray:
         """Samples with the jumps taken out."""
-        if len(self.jumps):
-            xyz = xyz.copy()
-            for track, _, after, by in self._jumps():
-                xyz[track, after:] -= by
+        jumps = self.jumps
+        if len(jumps):
+            level = np.zeros_like(xyz)
+            level[jumps.track, jumps.after] = jumps.by
+            xyz = xyz - np.cumsum(level, 1)
         return xyz
 
     def _inside(self, t: np.ndarray) -> np.ndarray:

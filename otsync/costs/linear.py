@@ -8,6 +8,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from ..compute.indices import blocks
 from ..types import TrackSet
 
 TRACK_BLOCK = 128
@@ -144,8 +145,9 @@ def velocity(x: Float[np.ndarray, "M T 3"], half: int) -> Float[np.ndarray, "M T
     out = np.full_like(x, np.nan)
     T = x.shape[1]
     if 2 * half + 1 <= T:
-        windows = np.lib.stride_tricks.sliding_window_view(x, 2 * half + 1, axis=1)
-        out[:, half : T - half] = windows @ (q / (q @ q))
+        for some in blocks(len(x), T):
+            windows = np.lib.stride_tricks.sliding_window_view(x[some], 2 * half + 1, axis=1)
+            out[some, half : T - half] = windows @ (q / (q @ q))
     return out
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..clocks.common import CommonClock, common_clock, strongest
+from ..clocks.common import CommonClock, common_clock, readable, strongest
 from ..types import Matches, TrackSet
 from .linear import velocity
 
@@ -26,7 +26,7 @@ def apart(a: TrackSet, b: TrackSet, matches: Matches, offset: float) -> float:
     Velocities do not see a constant offset: somebody else who does the same a little later fits as well as the same
     point, but is somewhere else.
     """
-    pair = common_clock(a, b, strongest(matches, MATCHES))
+    pair = common_clock(a, b, strongest(matches, readable(MATCHES, a, b)))
     x, y = in_common(pair, round(pair.lag(offset)))
     supporting = moves_alike(x, y, max(1, round(FAST * pair.fps)))
     if supporting.sum() < ENOUGH:

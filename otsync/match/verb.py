@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 
+from ..clocks.common import thinned
 from ..clocks.shutter import at_frame_times
 from ..types import Matches, Refused, TrackSet
 from ..types.checks import positive
@@ -34,7 +35,7 @@ def match(
     """
     a.check("a", xyz=False)
     b.check("b", xyz=False)
-    a, b = at_frame_times(a), at_frame_times(b)
+    a, b = thinned(at_frame_times(a)), thinned(at_frame_times(b))
     if matcher is not None and budget is not None:
         raise ValueError("matcher, budget: expected one of them; found both. A budget chooses the matcher.")
     chosen = matcher_for(len(a), len(b), budget) if matcher is None else Matcher.of(matcher)
