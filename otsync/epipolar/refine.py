@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from ..clocks.common import in_space, nominal_fps, on_clock
 from ..clocks.splines import TrackSplines
 from ..geometry import fundamentals, seen_pixels
+from ..refine.gauss_newton import CLUSTER, GROUPS, jackknife, neighbours
 from ..refine.slot import JUDGED_BY, Refiner
 from ..types import Alignment, Matches, Status, TrackSet, in_order
 from ..types.trust import Trust
@@ -162,7 +165,7 @@ class _Problem:
         return (hb * la).sum(2) / np.maximum(norm, 1e-300)
 
     def solve(self, offset: float, window: float, iterations: int, reach: float) -> tuple[float, float]:
-        """Offset and one sigma (clustered by match and by second), s; nan when nothing overlaps."""
+        """Offset and one sigma, s; nan when nothing overlaps."""
         start, step, half = offset, 0.5 / self.fps, max(LEAST_HALF, round(window * self.fps))
         sigma = float("nan")
         for _ in range(iterations):
@@ -183,13 +186,33 @@ class _Problem:
                 return float("nan"), float("nan")
             pull = w * J * R
             move = -float(pull.sum()) / curvature
-            by_match = pull.sum(1)
-            blocks = np.add.reduceat(pull.sum(0), np.arange(0, pull.shape[1], max(1, round(self.fps))))
-            sigma = float(np.sqrt((by_match**2).sum() + (blocks**2).sum()) / curvature)
+            sigma = self._scatter(w * J * J, pull)
             offset += float(np.clip(move, -step, step))
             if abs(move) < CONVERGED / self.fps or abs(offset - start) > reach:
                 break
         return offset, sigma
+
+    def _scatter(self, information: Float[np.ndarray, "M T"], pull: Float[np.ndarray, "M T"]) -> float:
+        """One sigma, s: by neighbourhoods of tracks or by blocks of time, whichever is larger."""
+        part = np.zeros((2, GROUPS)), np.zeros((2, -(-pull.shape[1] // self.block)))
+        block = np.arange(pull.shape[1]) // self.block
+        for k, x in enumerate((information, pull)):
+            np.add.at(part[0][k], self.group, x.sum(1))
+            np.add.at(part[1][k], block, x.sum(0))
+        return max(float(np.sqrt(jackknife(H[:, None, None], g[:, None])[0, 0])) for H, g in part)
+
+    @property
+    def block(self) -> int:
+        """Frames within which errors are taken as dependent."""
+        return max(1, round(CLUSTER * self.fps))
+
+    @cached_property
+    def group(self) -> Int[np.ndarray, " M"]:
+        """Neighbourhoods of a's tracks: those of one limb err alike."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # of tracks that a's clock never sees
+            middle = np.nan_to_num(np.nanmedian(self.xa, 1))
+        return neighbours(in_space(middle[:, None])[:, 0], GROUPS)
 
 
 def detrended(x: Float[np.ndarray, "M T"], known: Bool[np.ndarray, "M T"], half: int) -> Float[np.ndarray, "M T"]:

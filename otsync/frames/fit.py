@@ -263,7 +263,7 @@ def linearise(
     H_group, g_group = np.zeros((GROUPS, 8, 8)), np.zeros((GROUPS, 8))
     if clusters:
         where = (a.mean - state.middle_a) / root + (b.mean - state.middle_b) @ turned
-        group = neighbours(where, GROUPS, where.mean(0))  # in a turned frame the median is another point
+        group = neighbours(where, GROUPS)
         np.add.at(H_group, group, H_match)
         np.add.at(g_group, group, g_match)
     power = sum(float(weight @ p[7].sum(1)) for p in parts)

@@ -390,7 +390,7 @@ def _too_doubtful(first: Offsets, stages: Stages) -> str:
     ]
     if apart:
         return f"no stereo: {', '.join(apart)} could not be put on the common clock"
-    doubtful = [n for n, s in zip(first.names, first.status, strict=True) if s is not Status.OK]
+    doubtful = [n for n, s in zip(first.names, first.status, strict=True) if s not in (Status.OK, Status.COARSE)]
     if len(doubtful) > len(first) / 2:
         return f"no stereo: the epipolar offsets of {', '.join(doubtful)} are doubtful"
     return ""

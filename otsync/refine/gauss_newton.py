@@ -180,15 +180,7 @@ class System:
         answer is taken to follow Student's distribution with their degrees of freedom, and one sigma is what holds 68 %
         of it.
         """
-        found = []
-        for Hc, gc in (self.by_match, self.by_time):
-            leverage = np.einsum("pq,cqp->c", np.linalg.inv(_regular(self.H)), Hc) / len(self.H)
-            shrink = np.minimum(1.0, MOST_LEVERAGE / np.maximum(leverage, 1e-12))
-            rest = self.H - shrink[:, None, None] * Hc
-            moved = np.linalg.solve(rest + (1e-12 * np.trace(self.H) + 1e-300) * np.eye(len(self.H)), gc[..., None])[
-                ..., 0
-            ]
-            found.append(moved.T @ moved * wider(Hc[:, 0, 0]) ** 2)
+        found = [jackknife(*by) for by in (self.by_match, self.by_time)]
         return max(found, key=lambda c: float(c[0, 0]))
 
     def wander(self) -> float:
@@ -196,6 +188,21 @@ class System:
         H, g = self.by_time[0][:, 0, 0], self.by_time[1][:, 0]
         told = 1e-9 * max(float(H.sum()), 1e-300) < H
         return float(np.sqrt((g[told] ** 2 / H[told]).sum() / max(float(H[told].sum()), 1e-300)))
+
+
+def jackknife(H: Float[np.ndarray, "C P P"], g: Float[np.ndarray, "C P"]) -> Float[np.ndarray, "P P"]:
+    """Covariance of the answer by leaving out one cluster after another: see :meth:`System.covariance`.
+
+    Args:
+        H, g: normal equations of every cluster.
+    """
+    whole = H.sum(0)
+    leverage = np.einsum("pq,cqp->c", np.linalg.inv(_regular(whole)), H) / len(whole)
+    shrink = np.minimum(1.0, MOST_LEVERAGE / np.maximum(leverage, 1e-12))
+    rest = whole - shrink[:, None, None] * H
+    rest = rest + (1e-12 * np.trace(whole) + 1e-300) * np.eye(len(whole))
+    moved = np.linalg.solve(rest, g[..., None])[..., 0]
+    return moved.T @ moved * wider(H[:, 0, 0]) ** 2
 
 
 def wider(information: Float[np.ndarray, " C"]) -> float:
@@ -281,14 +288,12 @@ def _linearise(
     return System(H_match.sum(0), g_match.sum(0), (H_group, g_group), (H_time, g_time), weight, float(blur))
 
 
-def neighbours(
-    x: Float[np.ndarray, "M 3"], groups: int, middle: Float[np.ndarray, " 3"] | None = None
-) -> Int[np.ndarray, " M"]:
+def neighbours(x: Float[np.ndarray, "M 3"], groups: int) -> Int[np.ndarray, " M"]:
     """Group of each point: nearest of ``groups`` points far from each other (farthest-point sampling).
 
-    The first one is nearest to the ``middle``; None: the median of each coordinate.
+    The first one is nearest to the mean, which depends on no axes.
     """
-    distance = np.linalg.norm(x - (np.median(x, 0) if middle is None else middle), axis=1)
+    distance = np.linalg.norm(x - x.mean(0), axis=1)
     nearest = np.zeros(len(x), np.int64)
     closest = np.full(len(x), np.inf)
     for k in range(min(groups, len(x))):

@@ -151,6 +151,6 @@ def _solved(
             alignments={} if before is None else before.alignments,
             stats={"told": float(len(told)), "contradictions": float(len(contradictions))},
             breaks=() if before is None else before.breaks,
-        ),
+        ).judged_by_sigma(),
         contradictions,
     )

@@ -339,7 +339,7 @@ def to_offsets(
         matches={a.pair: a.matches for a in verdict.answers},
         stats=verdict.stats | {"seconds": seconds},
         breaks=found,
-    )
+    ).judged_by_sigma()
 
 
 def check_tracks(

@@ -15,6 +15,10 @@ class Status(StrEnum):
     """
 
     OK = "To be trusted."
+    COARSE = (
+        "The offset is known to about a frame, not to a fraction: sigma is more than a third of a frame. Use longer "
+        "clips, sharper or swifter motion, or more videos; a reconstruction (otsync run) refines it by the pictures."
+    )
     FORCED = (
         "Part of the matches join tracks that are nothing alike: what only one video sees was forced onto something. "
         "Use only the best of them, or a matcher of partial or relaxed mass (PartialFGW, UnbalancedFGW, AnchoredFGW)."

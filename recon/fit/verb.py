@@ -219,7 +219,7 @@ def _finish(run: Run, seconds: float) -> Reconstruction:
         flags=tuple(flags),
         rates=_put(p.offsets.rates, p.index, values["clock_rates"].cpu().numpy()),
         stats=dict(p.offsets.stats) | ({PHOTOMETRIC: 1.0} if "offsets" in run.adam.groups else {}),
-    )
+    ).judged_by_sigma()
     history = History.of(run.rows)
     stats = {
         "steps": float(run.step),

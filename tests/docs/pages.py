@@ -4,6 +4,7 @@ A comment before a block says how the tests treat it:
 
 ``<!-- not run: REASON -->``   a Python block that needs what a test does not have
 ``<!-- run -->``               a shell block whose lines are run, in order, in the page's folder; others are only parsed
+``<!-- run, flagged -->``      the same, every line ending with exit code 1: the answer carries a flag
 ``<!-- needs: PACKAGE -->``    skip the page's rest where a package is not installed
 """
 
@@ -40,7 +41,12 @@ class Block:
 
     @property
     def runs(self) -> bool:
-        return self.comment == "run" or self.comment.startswith("run:")
+        return self.comment == "run" or self.comment.startswith("run:") or self.flagged
+
+    @property
+    def flagged(self) -> bool:
+        """Whether every line ends with exit code 1, since its answer carries a flag."""
+        return self.comment == "run, flagged"
 
 
 def name_of(page: Path) -> str:

@@ -13,7 +13,7 @@ from otsync import Alignment, Matches, Status, TrackSet, synchronize
 from otsync.align.peaks import separate_peaks
 from otsync.costs.positions import CurveDistance, MedianPosition, SynchronousDistance, capped, scene_scale
 from otsync.epipolar.kernels import epipolar_evidence
-from otsync.epipolar.refine import EpipolarRefine, detrended
+from otsync.epipolar.refine import EpipolarRefine, _Problem, detrended
 from otsync.epipolar.scan import TRACK_CAP, EpipolarScan, mixture
 from otsync.geometry import common_target, fundamental, fundamentals, sampson, undistort, view_angle
 from otsync.match.candidates import Candidates
@@ -331,3 +331,20 @@ def test_a_peak_that_outliers_explain_better_is_weak(level, weak):
     found = EpipolarScan()._answer(lags, total, np.full(121, 4.0), 0.0, FPS, Matches(pairs, np.ones(30)))
     assert found.offset * FPS == pytest.approx(7, abs=0.3)
     assert (Status.WEAK in found.flags) == weak
+
+
+def test_tracks_of_one_limb_are_not_independent():
+    """Two hundred tracks in ten places, those of a place wrong alike: sigma knows of ten, not of two hundred."""
+    rng = np.random.default_rng(0)
+    places, each, frames = 10, 20, 150
+    wrong, asked = [], []
+    for _ in range(60):
+        own = rng.normal(0, 0.3, places)
+        middle = np.repeat(rng.uniform(0, 640, (places, 2)), each, 0) + rng.normal(0, 2, (places * each, 2))
+        xa = np.repeat(middle[:, None], frames, 1)
+        problem = _Problem(xa, None, np.arange(frames) / 30, None, 0.0, 30.0, np.ones(places * each))
+        information = np.ones((places * each, frames))
+        pull = information * np.repeat(own, each)[:, None] + rng.normal(0, 1, information.shape)
+        wrong.append(pull.sum() / information.sum())
+        asked.append(problem._scatter(information, pull))
+    assert 0.6 < np.sqrt(np.mean(np.square(wrong))) / np.sqrt(np.mean(np.square(asked))) < 1.1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import zipfile
 
@@ -374,3 +375,16 @@ def test_status_is_a_code_and_a_remedy():
     assert in_order([Status.SPREAD, Status.OK, Status.WEAK, Status.SPREAD]) == (Status.WEAK, Status.SPREAD)
     with pytest.raises(ValueError, match="expected one of ok"):
         Status.from_code("nonsense")
+
+
+def test_coarse_is_what_three_sigmas_leave_open_by_a_frame_of_the_slower_video():
+    known = Offsets.known(["a", "b", "c", "d", "e"], np.zeros(5), 30.0)
+    found = dataclasses.replace(
+        known,
+        fps=np.array([30.0, 30.0, 30.0, 120.0, 15.0]),
+        sigma=np.array([0.0, 0.3, 0.4, 0.3, 0.6]) / 30,
+        flags=((), (Status.COARSE,), (Status.WEAK,), (), (Status.COARSE,)),
+    ).judged_by_sigma()
+    assert found.flags == ((), (), (Status.WEAK, Status.COARSE), (), ())
+    lost = dataclasses.replace(known, sigma=np.full(5, np.nan)).judged_by_sigma()
+    assert lost.ok, "what has no answer has a flag of its own"
