@@ -146,15 +146,17 @@ class SplineRefine(Refiner):
     def with_rate(self, rate: Rate) -> SplineRefine:
         return replace(self, rate=rate)
 
-    def splines(self, a: TrackSet, b: TrackSet, matches: Matches) -> tuple[TrackSplines, ...]:
+    def splines(self, a: TrackSet, b: TrackSet, matches: Matches) -> tuple[TrackSplines, TrackSplines]:
         """Curves of the matched tracks, in units of a power of two near their size; repeated tracks are fitted once."""
-        used, index = zip(*(np.unique(column, return_inverse=True) for column in matches.pairs.T), strict=True)
-        x = [tracks.take(some).positions() for tracks, some in zip((a, b), used, strict=True)]
-        scale = max(binary_scale(one) for one in x)
-        return tuple(
-            TrackSplines(tracks.times, one / scale, smoothing=self.smoothing).take(where)
-            for tracks, one, where in zip((a, b), x, index, strict=True)
+        sides = []
+        for tracks, column in ((a, matches.pairs[:, 0]), (b, matches.pairs[:, 1])):
+            used, index = np.unique(column, return_inverse=True)
+            sides.append((tracks.times, tracks.take(used).positions(), index))
+        scale = max(binary_scale(x) for _, x, _ in sides)
+        first, second = (
+            TrackSplines(times, x / scale, smoothing=self.smoothing).take(index) for times, x, index in sides
         )
+        return first, second
 
     def _apart(self, other: Fit | None, fit: Fit, curves: tuple[TrackSplines, TrackSplines]) -> float:
         """Seconds between two answers; a window without an answer counts as a frame."""
