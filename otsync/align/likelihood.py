@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 
 from ..clocks.common import SAMPLES, CommonClock, common_clock, readable, strongest
 from ..clocks.splines import TrackSplines
-from ..compute.indices import evenly
+from ..compute.indices import blocks, evenly
 from ..costs.linear import binary_scale, velocity
 from ..types import Alignment, Matches, Status, TrackSet, in_order
 from ..types.checks import positive
@@ -191,15 +191,14 @@ def evidence(pair: CommonClock, lags: Int[np.ndarray, " K"], weight: Float[np.nd
     positions = Signal.of(pair.a), Signal.of(pair.b)
     least = frames(MIN_FRAMES)
     count, power, residual = statistics(*positions, lags, least)
-    floor = noise_floor(count, power, residual)
+    floor, extent = noise_floor(count, power, residual), 0.5 * (positions[0].extent + positions[1].extent)
     observed = (count > 0).sum(0).astype(float)
     power -= residual
     power *= count
     shared = 0.5 * power.sum(0) / np.maximum(count.sum(0), 1)
-    del count, power, residual  # of long clips, hundreds of megabytes
+    del count, power, residual, positions  # of long clips, hundreds of megabytes
     fast, slow = (velocity_score(pair, lags, frames(half), least, weight) for half in (FAST, SLOW))
-    windows = np.where(observed > 0, window_score(pair, *positions, lags, fast + slow, floor, weight), -np.inf)
-    extent = 0.5 * (positions[0].extent + positions[1].extent)
+    windows = np.where(observed > 0, window_score(pair, lags, fast + slow, floor, weight), -np.inf)
     return Curves(
         total=fast + slow + windows,
         slow=slow,
@@ -212,8 +211,6 @@ def evidence(pair: CommonClock, lags: Int[np.ndarray, " K"], weight: Float[np.nd
 
 def window_score(
     pair: CommonClock,
-    a: Signal,
-    b: Signal,
     lags: Int[np.ndarray, " K"],
     motion: Float[np.ndarray, " K"],
     floor: float,
@@ -223,6 +220,8 @@ def window_score(
     beside them what lags by chance have.
     """
     from . import kernels
+
+    a, b = Signal.of(pair.a), Signal.of(pair.b)
 
     def frames(seconds: float) -> int:
         return max(1, round(seconds * pair.fps))
@@ -283,8 +282,10 @@ def velocity_score(
     weight: Float[np.ndarray, " M"] | None = None,
 ) -> Float[np.ndarray, " K"]:
     """Mean LLR of the velocities over ±``half`` frames, the matches counted by ``weight`` (mean 1)."""
-    a, b = Signal.of(velocity(pair.a, half)), Signal.of(velocity(pair.b, half))
-    count, power, residual = statistics(a, b, lags, least)
+    count, power, residual = (np.zeros((len(pair.a), len(lags))) for _ in range(3))
+    for some in blocks(len(pair.a), max(pair.a.shape[1], pair.b.shape[1])):
+        a, b = Signal.of(velocity(pair.a[some], half)), Signal.of(velocity(pair.b[some], half))
+        count[some], power[some], residual[some] = statistics(a, b, lags, least)
     floor = noise_floor(count, power, residual)
     # in place: of long clips these are the largest arrays
     power += floor

@@ -19,13 +19,13 @@ EVEN = 1e-3
 WHOLE = 1e-6
 """Frames by which a clip may fall short of a whole number of them, for rounding."""
 
-SAMPLES = 2_000_000
-"""Samples of one video that aligners and refiners read, at most: 18 tracks of an hour at 30 fps, 222 of five minutes.
+SAMPLES = 1_500_000
+"""Samples of one video that aligners and refiners read, at most: 13 tracks of an hour at 30 fps, 166 of five minutes.
 Memory and time are bounded by it. More would change an offset by less than what limbs and drifts have in common.
 """
 
-LEAST_FRAMES = 5000
-"""Frames that a clip is never thinned below."""
+LEAST_FRAMES, LEAST_FPS = 5000, 7.5
+"""Frames, and frames a second, that a clip is never thinned below: swings of limbs stay what they are."""
 
 USUAL_FPS = 30.0
 """Rate of a single frame, which has none."""
@@ -93,7 +93,8 @@ def thinned(tracks: TrackSet) -> TrackSet:
     """Every k-th frame of a long clip, so that all its tracks together have about :data:`SAMPLES`: for what looks at
     where tracks are, not at what a frame's difference tells.
     """
-    step = min(-(-len(tracks) * tracks.n_frames // SAMPLES), tracks.n_frames // LEAST_FRAMES)
+    most = min(tracks.n_frames // LEAST_FRAMES, int(nominal_fps(tracks) / LEAST_FPS))
+    step = min(-(-len(tracks) * tracks.n_frames // SAMPLES), most)
     if step < 2:
         return tracks
     taken = {f: v[:, ::step] for f in ("xyz", "visible", "uv", "sigma") if (v := getattr(tracks, f)) is not None}
