@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from ..calibrate.verb import CalibrateOptions
+from ..files.strict import nearest
 from ..progress import tell
 
 if TYPE_CHECKING:
@@ -43,7 +44,11 @@ class Calibrate:
         from ..files.claim import claimed
 
         if not self.folder.is_dir():
-            raise ValueError(f"{self.folder}: expected a folder of videos; found none. Check the path.")
+            near = self.folder.parent
+            there = sorted(p.name for p in near.iterdir() if p.is_dir()) if near.is_dir() else []
+            close = nearest(self.folder.name, there)
+            meant = f" Did you mean {close!r}?" if close else ""
+            raise ValueError(f"{self.folder}: expected a folder of videos; found none.{meant} Check the path.")
         with claimed(self.out or self.folder / "calibration", "otsync calibrate") as out:
             return self._run(out)
 

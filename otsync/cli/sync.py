@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 
 from ..files.claim import claimed
+from ..io.footage import VIDEO_SUFFIXES
 from ..sync.graph import Graph
 from ..sync.own_frames import COMPLETE, Frames
 from ..sync.verb import unique_names
@@ -86,6 +87,12 @@ class Sync:
         if words:
             raise ValueError(
                 f"{words[0]}: expected an algorithm that there is, after the options; otsync sync --help lists them."
+            )
+        videos = [path for path in self.tracks if path.suffix.lower() in VIDEO_SUFFIXES]
+        if videos:
+            raise ValueError(
+                f"{videos[0]}: expected one folder that holds all videos, or two and more .npz of tracks; found a "
+                "video file. Put the videos into a folder, and run otsync sync FOLDER."
             )
         tracks = [TrackSet.load(path) for path in self.tracks]
         names = unique_names(tracks)

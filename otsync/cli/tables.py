@@ -117,14 +117,15 @@ def table(offsets: Offsets, truth: Any = None) -> str:
     import numpy as np
 
     fps = offsets.fps[offsets.component]
-    true = np.full(len(offsets), np.nan) if truth is None else np.asarray(truth) * fps
+    columns = [("offset", 9, offsets.frames), ("sigma", 8, offsets.sigma * fps)]
+    if truth is not None:
+        true = np.asarray(truth) * fps
+        columns += [("true", 9, true), ("error", 8, offsets.frames - true)]
     width = max(5, *map(len, offsets.names))
-    lines = [
-        f"{'video':{width}}  {'offset':>9} {'sigma':>8} {'true':>9} {'error':>8}  status   (frames of the reference)"
-    ]
+    head = " ".join(name.rjust(w) for name, w, _ in columns)
+    lines = [f"{'video':{width}}  {head}  status   (frames of the reference)"]
     for v, name in enumerate(offsets.names):
-        values = (offsets.frames[v], offsets.sigma[v] * fps[v], true[v], offsets.frames[v] - true[v])
-        cells = [f"{x:{w}.3f}" if np.isfinite(x) else "–".rjust(w) for x, w in zip(values, (9, 8, 9, 8), strict=True)]
+        cells = [f"{x[v]:{w}.3f}" if np.isfinite(x[v]) else "–".rjust(w) for _, w, x in columns]
         status = "reference" if v == offsets.reference else offsets.status[v].code
         lines.append(f"{name:{width}}  {' '.join(cells)}  {status}")
     return "\n".join([*lines, *offsets.clock_notes(), *frame_lines(offsets, width)])

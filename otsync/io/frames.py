@@ -215,8 +215,10 @@ class _Errors:
             ) from None
         if isinstance(error, ValueError) and str(error).startswith(str(self.path)):
             return
+        found = "something else" if type(error).__name__ == "InvalidDataError" else f"{type(error).__name__}: {error}"
         raise ValueError(
-            f"{self.path}: expected a readable video; {type(error).__name__}: {error}. Copy or remux the file."
+            f"{self.path}: expected a readable video; found {found}. Copy or remux the file, or take it out of the "
+            "folder."
         ) from None
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -13,6 +13,9 @@ from .datasets import DATASETS
 from .footage import ImageFolders, VideoFiles, VideosAndImages
 from .panoptic import Panoptic
 from .pose2sim import Pose2Sim
+
+SHOWN = 6
+"""Entries of a folder that an error names."""
 
 
 class Reader(Protocol):
@@ -72,8 +75,19 @@ def find_reader(folder: str | os.PathLike[str], name: str | None = None) -> tupl
     for each in asked:
         if known[each].claims(folder) or (name is not None and getattr(known[each], "insists", False)):
             return each, known[each]
+    there = sorted(entry.name for entry in folder.iterdir() if not entry.name.startswith("."))
+    if not there and name is None:
+        raise ValueError(f"{folder}: expected videos, or a recording in a known layout; found nothing in it.")
     wanted = "; ".join(f"{each}: {_looks_for(known[each])}" for each in asked)
-    raise ValueError(f"{folder}: expected a layout that a reader knows ({wanted}); found none. Check the path.")
+    raise ValueError(
+        f"{folder}: expected a layout that a reader knows ({wanted}); found {_listed(there)}. Check the path."
+    )
+
+
+def _listed(names: Sequence[str]) -> str:
+    """The first few of a folder's entries."""
+    shown = ", ".join(repr(name) for name in names[:SHOWN])
+    return f"{shown} and {len(names) - SHOWN} more" if len(names) > SHOWN else shown or "nothing"
 
 
 def claiming(folder: str | os.PathLike[str]) -> list[str]:

@@ -256,11 +256,34 @@ def _speed(curves: TrackSplines, begin: float, end: float) -> float:
     return float(np.sqrt(np.median(power[there] / seen.sum(1)[there]))) if there.any() else math.nan
 
 
-def culprit(found: Sequence[Suspect], sound: Sequence[tuple[int, int]]) -> Suspect | None:
+@dataclass(frozen=True)
+class Seen:
+    """What one pair that answers without any doubt sees of a video: from ``begin`` to ``end`` of its own clock, s."""
+
+    video: int
+    begin: float
+    end: float
+
+    @classmethod
+    def by(cls, answer: Answer, a: TrackSet, b: TrackSet) -> tuple[Seen, Seen]:
+        """Of both videos of a pair."""
+        clock = Clock(answer.refined.offset, answer.refined.rate)
+        begin, end = (clock.world(float(t)) for t in b.times[[0, -1]])
+        begin, end = max(begin, float(a.times[0])), min(end, float(a.times[-1]))
+        i, j = answer.pair
+        return cls(i, begin, end), cls(j, clock.own(begin), clock.own(end))
+
+    def across(self, suspect: Suspect) -> bool:
+        """Whether it is of the suspect's video and sees enough on both sides of its break to have seen that."""
+        last = suspect.found.at + max(suspect.found.jump, 0.0)
+        return self.video == suspect.video and self.begin <= suspect.found.at - AROUND and self.end >= last + AROUND
+
+
+def culprit(found: Sequence[Suspect], sound: Sequence[Seen]) -> Suspect | None:
     """The reading with most votes from all pairs, its jump the median of theirs.
 
     Args:
-        sound: pairs that answer without any doubt: each is a vote for the clocks of both its videos.
+        sound: what pairs that answer without any doubt see: each is a vote for the clock of its video, there.
     """
     best, most = None, 0.0
     for one in found:
@@ -271,7 +294,7 @@ def culprit(found: Sequence[Suspect], sound: Sequence[tuple[int, int]]) -> Suspe
             and abs(s.found.at - one.found.at) < SAME_MOMENT
             and abs(s.found.jump - one.found.jump) < SAME_JUMP
         ]
-        votes = sum(s.votes for s in same) - sum(one.video in pair for pair in sound)
+        votes = sum(s.votes for s in same) - sum(seen.across(one) for seen in sound)
         if votes > most + 1e-9:
             still = float(np.median([s.found.still for s in same]))
             middle = Break(

@@ -99,7 +99,7 @@ def with_told(offsets: Offsets, told: Sequence[Told]) -> tuple[Offsets, list[Con
         in_order((*flags, *((Status.INCONSISTENT,) if v in doubted and v != offsets.reference else ())))
         for v, flags in enumerate(answer.flags)
     )
-    return replace(answer, flags=flags), [*contradictions, *more]
+    return replace(answer, flags=flags).judged_by_sigma(), [*contradictions, *more]
 
 
 def _solved(
@@ -151,6 +151,6 @@ def _solved(
             alignments={} if before is None else before.alignments,
             stats={"told": float(len(told)), "contradictions": float(len(contradictions))},
             breaks=() if before is None else before.breaks,
-        ).judged_by_sigma(),
+        ),
         contradictions,
     )

@@ -26,7 +26,7 @@ from ..match.unbalanced import UnbalancedOT
 from ..refine.slot import Rate, Refiner, RefinerLike
 from ..refine.splines import SplineRefine
 from ..types import Alignment, Break, Clock, Matches, Offsets, Status, TrackSet, in_order
-from .breaks import MOST, culprit, mended, remeasured, runs_on, suspects
+from .breaks import MOST, Seen, Suspect, culprit, mended, remeasured, runs_on, suspects
 from .graph import Graph, Pair
 from .method import Method, with_costs
 from .own_frames import Frames, refuse_common, solver_from, synchronize_own
@@ -153,7 +153,7 @@ def mend_clocks(
     for _ in range(MOST):
         doubtful = [a for a in verdict.answers if len(a.scanned.parts) and not NOTHING_COMMON & set(a.scanned.flags)]
         named = [s for a in doubtful for s in suspects(a, tracks[a.pair[0]], tracks[a.pair[1]], fps)]
-        one = culprit(named, [a.pair for a in verdict.answers if a.refined.status.ok])
+        one = culprit(named, _seen(verdict, tracks))
         if one is None:
             break
         v = one.video
@@ -169,9 +169,28 @@ def mend_clocks(
     # a clock that is whole again is so against every video: one pair that still breaks speaks against the mend
     still = {v for a in verdict.answers if Status.BROKEN_CLOCK in a.refined.flags for v in a.pair}
     doubtful_mends |= still & set(broken)
+    doubtful_mends |= {s.video for s in suspected(verdict, tracks, fps)}
     if doubtful_mends:
         verdict = judged([_doubted(a) if doubtful_mends & set(a.pair) else a for a in verdict.answers])
     return jobs, verdict, broken
+
+
+def _seen(verdict: Verdict, tracks: Sequence[TrackSet]) -> list[Seen]:
+    """What the pairs without any doubt see of their videos."""
+    sound = [a for a in verdict.answers if a.refined.status.ok and a.finite]
+    return [seen for a in sound for seen in Seen.by(a, tracks[a.pair[0]], tracks[a.pair[1]])]
+
+
+def suspected(verdict: Verdict, tracks: Sequence[TrackSet], fps: Sequence[float]) -> list[Suspect]:
+    """Breaks that were not mended, and that no pair which sees both sides of them speaks against."""
+    doubtful = [
+        a
+        for a in verdict.answers
+        if len(a.scanned.parts) and Status.BROKEN_CLOCK in a.refined.flags and not NOTHING_COMMON & set(a.refined.flags)
+    ]
+    sound = _seen(verdict, tracks)
+    named = [s for a in doubtful for s in suspects(a, tracks[a.pair[0]], tracks[a.pair[1]], fps)]
+    return [s for s in named if not any(seen.across(s) for seen in sound)]
 
 
 def _doubted(answer: Answer) -> Answer:

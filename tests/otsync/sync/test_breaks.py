@@ -134,3 +134,15 @@ def test_a_slow_motion_is_no_lost_frames_that_are_mended(seed):
     """Beside a break that was mended the clock must run on evenly; a slow motion begins and ends in a ramp."""
     tracks, _ = broken(SlowMotion(2.0), seed=seed)
     assert Status.BROKEN_CLOCK in synchronize(tracks).flags[1]
+
+
+def test_pairs_speak_only_for_what_they_see_of_a_clock():
+    """Two of three pairs of the frozen video end before its freeze: they outvoted the one that saw it, and the end was
+    off by the 30 frames of the freeze, with every status ok.
+    """
+    world = CLASSES["freeze of 30, four videos"](28003)
+    found = synchronize(world.tracks)
+    ends, _ = world.errors(found)
+    assert ends.max() < 0.2
+    (broken,) = found.breaks[2]
+    assert broken.jump == pytest.approx(-1.0) and found.ok
