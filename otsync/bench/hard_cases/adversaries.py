@@ -98,6 +98,31 @@ def half_canon(later: int = 20) -> Given:
     return filmed(both[0], 1), filmed(both[1], 2), ALL
 
 
+def rain(late: float) -> Given:
+    """Things that fall, each at its own speed, sway, and come again on top; b began ``late`` s later."""
+    rng = np.random.default_rng(35)
+    place, speed = rng.uniform(-1, 1, (N, 1, 3)), rng.uniform(0.6, 1.8, (N, 1))
+    phase, rate = rng.uniform(0, 6.28, (N, 1, 2)), rng.uniform(0.2, 0.9, (N, 1, 2))
+
+    def at(t: np.ndarray) -> np.ndarray:
+        sway = place[..., :2] + 0.15 * np.sin(2 * np.pi * rate * t[:, None] + phase)
+        return np.concatenate([sway, ((place[..., 2] - speed * t) % 2.4)[..., None]], 2)
+
+    t = np.arange(FRAMES) / 30
+    return filmed(at(t), 1), filmed(at(t + late), 2), ALL
+
+
+def other_points(share: float = 0.5) -> Given:
+    """Half of b's tracks take up another point of the scene somewhere in the middle."""
+    rng = np.random.default_rng(36)
+    xyz = cloud(N, FRAMES + 10, 37)
+    b = xyz[:, 10:].copy()
+    for k in np.flatnonzero(rng.random(N) < share):
+        when = int(rng.integers(30, FRAMES - 30))
+        b[k, when:] = xyz[int(rng.integers(N)), 10 + when :]
+    return filmed(xyz[:, :FRAMES], 1), filmed(b, 2), ALL
+
+
 wrong_anywhere = near(1e9)
 
 CASES: tuple[Case, ...] = (
@@ -167,6 +192,22 @@ CASES: tuple[Case, ...] = (
         lambda: dropped(10),
         (FLAGGED,),
         check=wrong_anywhere,
+    ),
+    Case(
+        "things that come again on top",
+        "every track jumps, between two frames, nobody knows when: a curve through a jump rings",
+        "jumps are taken out of the curves",
+        lambda: rain(0.35),
+        (FLAGGED, RIGHT),
+        check=near(0.35),
+    ),
+    Case(
+        "half of the tracks take up another point",
+        "each of them is right up to its jump alone",
+        "jumps are taken out of the curves; what moves otherwise behind them loses weight",
+        other_points,
+        (FLAGGED, RIGHT),
+        check=near(1 / 3),
     ),
     Case(
         "frame rate wrong by 1 %, 12 s",
