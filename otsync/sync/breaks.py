@@ -58,16 +58,6 @@ BESIDE, OFF, OTHERS = 0.45, 1.5 / 30, 10 / 30
 of the answer is the best (46 worlds of mid noise); beside a slow motion that is taken for lost frames one that is 2 to
 7 frames off (10 of 10)."""
 
-AT_AN_END, KNOWN, REACH_AT_END = 10 / 30, 1.0, 12 / 30
-"""Seconds at either end of the overlap, of what lies beside them, and of other offsets: a break so near to an end
-leaves too little for the search by windows."""
-
-END_SUITS, WITNESSES = 0.28, 5
-"""How much better another offset may suit the end of an overlap, and matches that must be seen there. Trusted answers
-to 90 clean pairs (mid to brutal, few tracks, like people, flocks, rates, jumps; seeds 500-529) have .16 at most, but
-for one of brutal noise (.37) and one of few tracks; four of ten frames that were lost within 23 frames of an end,
-trusted and wrong there, .30 to 1.56."""
-
 MOST = 4
 """Breaks that are mended, at most."""
 
@@ -352,30 +342,6 @@ def runs_on(answer: Answer, a: TrackSet, b: TrackSet, before: float, behind: flo
         if abs(steps[int(np.argmax(suits))]) > OFF:
             return False
     return True
-
-
-def breaks_at_an_end(answer: Answer, a: TrackSet, b: TrackSet) -> bool:
-    """Whether another offset clearly suits the first or the last third of a second of the overlap, where the constant
-    differences of the matches are those of the second beside it.
-    """
-    pairs = strongest(answer.matches, readable(LIMIT, a, b)).pairs
-    raw = Raw.of(a, pairs[:, 0]), Raw.of(b, pairs[:, 1])
-    clock = Clock(answer.refined.offset, answer.refined.rate)
-    first, last = (clock.world(float(t)) for t in b.times[[0, -1]])
-    t = a.times[(a.times >= first) & (a.times <= last)]
-    if len(t) < 3 or t[-1] - t[0] < 2 * (AT_AN_END + KNOWN):
-        return False
-    steps = np.arange(-round(REACH_AT_END * 30), round(REACH_AT_END * 30) + 1) / 30
-    for apart in (t - t[0], t[-1] - t):
-        near, known = t[apart < AT_AN_END], t[(apart >= AT_AN_END + MARGIN) & (apart < AT_AN_END + MARGIN + KNOWN)]
-        seen = np.isfinite(raw[0].at(near)[..., 0]) & np.isfinite(raw[1].at(clock.own(near))[..., 0])
-        if len(near) < LEAST_BESIDE or len(known) < ENOUGH or seen.any(1).sum() < WITNESSES:
-            continue
-        suits = np.array([_level(*raw, clock, s, known, near) for s in steps])
-        best = int(np.argmax(suits))
-        if abs(steps[best]) > OFF and suits[best] - suits[len(steps) // 2] > END_SUITS:
-            return True
-    return False
 
 
 def _level(a: Raw, b: Raw, clock: Clock, late: float, known: np.ndarray, asked: np.ndarray) -> float:

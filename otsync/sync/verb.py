@@ -26,7 +26,7 @@ from ..match.unbalanced import UnbalancedOT
 from ..refine.slot import Rate, Refiner, RefinerLike
 from ..refine.splines import SplineRefine
 from ..types import Alignment, Break, Clock, Matches, Offsets, Status, TrackSet, in_order
-from .breaks import MOST, Seen, Suspect, breaks_at_an_end, culprit, mended, remeasured, runs_on, suspects
+from .breaks import MOST, Seen, Suspect, culprit, mended, remeasured, runs_on, suspects
 from .graph import Graph, Pair
 from .method import Method, with_costs
 from .own_frames import Frames, refuse_common, solver_from, synchronize_own
@@ -126,10 +126,6 @@ def synchronize(
         breaking = set(unsteady(aligning, tracks, sound, verdict.x))
         if breaking:
             verdict = judged([_doubted(a) if breaking & set(a.pair) else a for a in verdict.answers])
-    else:
-        ends = [a.refined.status.ok and breaks_at_an_end(a, *(tracks[v] for v in a.pair)) for a in verdict.answers]
-        if any(ends):
-            verdict = judged([_doubted(a) if broke else a for a, broke in zip(verdict.answers, ends, strict=True)])
     return to_offsets(original, verdict, time.perf_counter() - started, broken)
 
 

@@ -45,4 +45,6 @@ def test_motions_that_mislead_are_smooth_and_drawn_by_the_seed(motion):
     (a, b), _ = simulate(motion, preset="clean", videos=2, effects=(), seed=4)
     (c, _), _ = simulate(motion, preset="clean", videos=2, effects=(), seed=4)
     np.testing.assert_array_equal(a.positions(), c.positions())
-    assert np.nanmax(np.abs(np.diff(b.positions(), axis=1))) < 1.0
+    steps = np.abs(np.diff(b.positions(), axis=1)).max(2)
+    jumps = motion in ("rain", "portals")  # every second or two, whatever the frame rate
+    assert np.nanquantile(steps, 0.95 if jumps else 1.0) < 1.0
