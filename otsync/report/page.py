@@ -66,7 +66,7 @@ def write_report(
         "<h2>How sure</h2>",
         _offset_table(offsets, truth),
         "<p class=s>A positive offset means that the video's clock started later than the reference's: "
-        f"t<sub>world</sub> = rate · t<sub>video</sub> + offset. ± is one standard deviation. {TRUSTED}</p>",
+        f"t<sub>world</sub> = rate · t<sub>video</sub> + offset. ± is one standard deviation. {TRUSTED}{told_truth(truth)}</p>",
         late_starts(offsets, own),
         remedies(offsets),
         _frames_table(offsets),
@@ -191,6 +191,11 @@ def _frames_table(offsets: Offsets) -> str:
     return f"<h3>Frames of reference</h3>{cards(head, rows)}"
 
 
+def told_truth(truth: Sequence[float] | np.ndarray | None) -> str:
+    """Where the columns of the truth come from; empty where there are none."""
+    return "" if truth is None else " True offsets came with the recording; they are used for these columns alone."
+
+
 def status_words(status: Status, flags: Sequence[Status]) -> str:
     if status.ok:
         return "<span class=ok>✓ trusted</span>"
@@ -217,8 +222,9 @@ def _told(flags: set[Status]) -> str:
 
 def _graph(offsets: Offsets) -> str:
     """Residuals of the pairs against the graph, where there are more pairs than a tree needs."""
+    fps = float(offsets.fps[offsets.reference])
     rows = [
-        (f"{offsets.names[i]} – {offsets.names[j]}", (p.offset - offsets.between(i, j)) * p.fps, p.status.ok)
+        (f"{offsets.names[i]} – {offsets.names[j]}", (p.offset - offsets.between(i, j)) * fps, p.status.ok)
         for (i, j), p in sorted(offsets.alignments.items())
         if np.isfinite(p.offset - offsets.between(i, j))
     ]
@@ -249,9 +255,9 @@ def footer(stats: Mapping[str, float]) -> str:
     """With what and where the page was made."""
     from .. import __version__
 
-    told = ", ".join(f"{k} {v:.4g}" for k, v in stats.items())
+    told = f"Solved in {stats['seconds']:.1f} s." if "seconds" in stats else ""
     where = f"otsync {__version__}, Python {platform.python_version()}, {platform.machine()}"
-    return f"<footer>{where}. {escape(told)}</footer>"
+    return f"<footer>{where}. {told}</footer>"
 
 
 def number(x: float, digits: int) -> str:

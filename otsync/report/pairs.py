@@ -43,9 +43,10 @@ def pair_section(
 
     ranked = sorted(offsets.alignments.items(), key=rank)
     shown = ranked[:DETAILED_PAIRS]
+    doubtful = "" if all(pair.status.ok for _, pair in ranked) else " The doubtful ones come first."
     parts = [
-        f"<h2>Pairs</h2><p class=s>{len(ranked)} pairs of videos were compared; the doubtful ones come first. Unfold "
-        "one to see its evidence.</p>"
+        f"<h2>Pairs</h2><p class=s>{len(ranked)} pairs of videos were compared.{doubtful} Unfold one to see its "
+        "evidence. Frames are those of the reference; in the figures, of the slower video of the two.</p>"
     ]
     for key, pair in shown:
         parts.append(
@@ -63,13 +64,13 @@ def _summary(offsets: Offsets, key: tuple[int, int], pair: Alignment, truth: Seq
     i, j = key
     words = "<span class=ok>✓ trusted</span>" if pair.status.ok else f"<span class=no>⚠ {_codes(pair)}</span>"
     count = f"{len(offsets.matches[key])} matches" if key in offsets.matches else ""
-    error = ""
+    fps, error = float(offsets.fps[offsets.component[j]]), ""
     if truth is not None and np.isfinite(pair.offset):
-        error = f"error {(pair.offset - (truth[j] - truth[i])) * pair.fps:.3f}"
+        error = f"error {(pair.offset - (truth[j] - truth[i])) * fps:.3f}"
     tail = "".join(f"<span class=s>{text}</span> " for text in (count, error) if text)
     return (
         f"<b>{escape(offsets.names[i])} – {escape(offsets.names[j])}</b> "
-        f"<span>{measured(pair.frames, pair.sigma * pair.fps)} frames</span> {tail}{words}"
+        f"<span>{measured(pair.offset * fps, pair.sigma * fps)} frames</span> {tail}{words}"
     )
 
 

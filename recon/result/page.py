@@ -14,6 +14,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import math
 from collections.abc import Sequence
 from html import escape
 from importlib.resources import files
@@ -23,7 +24,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from otsync.files.arrays import atomic_write
+from otsync.files.arrays import atomic_write, read_json
 from recon.backdrop.surroundings import up_axis
 from recon.motion import PerGaussian, Scaffold, Static
 from recon.raster import sh
@@ -186,8 +187,27 @@ def header(packing: Packing, scene: Gaussians4D, result: SavedReconstruction | N
         "motion": moving,
         "cameras": cameras,
         "reference": reference,
+        "quality": _quality(result),
         **_surroundings(videos, middle - centre, centre),
     }
+
+
+GRADES = ((30.0, "sharp"), (25.0, "fair"), (20.0, "rough"))
+"""PSNR in dB from which on a held-out camera's pictures are called so; below, a sketch."""
+
+
+def _quality(result: SavedReconstruction | None) -> str:
+    """How near the scene is to what a camera filmed that the fit did not see, in words; empty where nothing is known."""
+    path = None if result is None or result.folder is None else Path(result.folder) / "metrics.json"
+    if path is None or not path.is_file():
+        return ""
+    document = read_json(path)
+    held = document.get("held_out") if isinstance(document, dict) else None
+    psnr = held.get("psnr") if isinstance(held, dict) else None
+    if not isinstance(psnr, int | float) or not math.isfinite(psnr):
+        return "no camera was held out to measure quality"
+    grade = next((word for least, word in GRADES if psnr >= least), "a sketch")
+    return f"{grade}: {psnr:.1f} dB at a camera that the fit did not see"
 
 
 def _surroundings(videos: Sequence[FilmedBy], middle: np.ndarray, centre: np.ndarray) -> dict[str, Any]:

@@ -24,6 +24,7 @@ from otsync.report.page import (
     remedies,
     stage_bars,
     status_words,
+    told_truth,
     verdict,
     write_page,
 )
@@ -83,7 +84,7 @@ def write_reconstruction_report(
         _offset_rows(reconstruction, coarse, truth),
         "<p class=s>Frames are those of the reference. A positive offset means that the video's clock started later: "
         "t<sub>world</sub> = rate · t<sub>video</sub> + offset. ± is one standard deviation; after the fit, of what "
-        f"tracks and pictures say together: it grows where the two disagree. {TRUSTED}</p>",
+        f"tracks and pictures say together: it grows where the two disagree. {TRUSTED}{told_truth(truth)}</p>",
         late_starts(offsets, own) if filmed else "",
         remedies(offsets),
         "<h2>What accuracy cost</h2>",
@@ -161,8 +162,8 @@ def _offset_rows(reconstruction: Reconstruction, coarse: Offsets, truth: np.ndar
 
 
 def _moved(frames: float, reference: bool) -> str:
-    """How far a fit moved a clock, in words where it did not."""
-    return "reference" if reference else "held" if frames == 0 else number(frames, 3)
+    """How far a fit moved a clock, in words where it had no part in it."""
+    return "reference" if reference else "not fitted" if frames == 0 else number(frames, 3)
 
 
 def convergence(

@@ -337,8 +337,9 @@ function blank(context, words) {
 function factsOf(about) {
   const count = (n) => n.toLocaleString('en');
   const videos = `${about.cameras.length} ${about.cameras.length === 1 ? 'camera' : 'cameras'}`;
-  const gaussians = `${count(about.moving)} moving Gaussians` + (about.still ? `, ${count(about.still)} still` : '');
-  return `${videos} · ${gaussians} · ${(about.span[1] - about.span[0]).toFixed(2)} s`;
+  const gaussians = `${count(about.moving)} moving blobs of colour` + (about.still ? `, ${count(about.still)} that stand still` : '');
+  const seconds = `${(about.span[1] - about.span[0]).toFixed(2)} s`;
+  return [videos, gaussians, seconds, about.quality].filter(Boolean).join(' · ');
 }
 
 /** Says what went wrong in place of the scene. */
