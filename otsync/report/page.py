@@ -66,7 +66,8 @@ def write_report(
         "<h2>How sure</h2>",
         _offset_table(offsets, truth),
         "<p class=s>A positive offset means that the video's clock started later than the reference's: "
-        f"t<sub>world</sub> = rate · t<sub>video</sub> + offset. ± is one standard deviation. {TRUSTED}{told_truth(truth)}</p>",
+        f"t<sub>world</sub> = rate · t<sub>video</sub> + offset. ± is one standard deviation. {TRUSTED}"
+        f"{told_truth(truth)}</p>",
         late_starts(offsets, own),
         remedies(offsets),
         _frames_table(offsets),

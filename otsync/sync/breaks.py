@@ -165,6 +165,17 @@ class Raw:
         outside = (t < self.times[0]) | (t > self.times[-1])
         return np.where(outside[None, :, None], np.nan, x)
 
+    def bent(self, t: np.ndarray) -> np.ndarray:
+        """(M,S) how far a curve may lie off such a line, squared: an eighth of the second difference; 0 where unknown.
+
+        At a sample it is an eighth as well: curves that bend there are not known better than their samples are apart.
+        """
+        square = np.zeros(self.x.shape[:2])
+        second = ((self.x[:, 2:] - 2 * self.x[:, 1:-1] + self.x[:, :-2]) ** 2).sum(2) / 64
+        square[:, 1:-1] = np.where(np.isfinite(second), second, 0.0)
+        right = np.clip(np.searchsorted(self.times, t), 1, len(self.times) - 1)
+        return np.maximum(square[:, right - 1], square[:, right])
+
 
 def _moment(
     a: Raw, b: Raw, first: float, second: float, near: float, limits: tuple[float, float]
@@ -220,17 +231,29 @@ def _suits(a: Raw, b: Raw, offset: float, t: np.ndarray, inside: np.ndarray) -> 
 
 def _agreement(apart: np.ndarray, inside: np.ndarray) -> np.ndarray:
     """(S,) how well positions agree, from the differences (M,S,3) of matched tracks: see :func:`_suits`."""
+    level = levels(apart, inside)
+    return np.asarray(np.nansum(level, 0) / np.maximum(np.isfinite(level).sum(0), 1))
+
+
+def levels(apart: np.ndarray, inside: np.ndarray, bent: np.ndarray | float = 0.0) -> np.ndarray:
+    """(M',S) how well each matched track agrees at each moment, in (-inf, 1]; nan where it is not seen.
+
+    Args:
+        apart: (M,S,3) differences of matched tracks; of those that are hardly known there is no row.
+        inside: (S,) the moments that tell each match's constant difference, its median, and what is usual.
+        bent: (M,S) squared error of what was read between two samples, which counts for nothing.
+    """
     seen = np.isfinite(apart[..., 0])
     known = seen & inside
     use = known.sum(1) >= 5
     if not use.any():
-        return np.zeros(apart.shape[1])
+        return np.full((0, apart.shape[1]), np.nan)
     apart, seen, known = apart[use], seen[use], known[use]
     middle = np.nanmedian(np.where(known[..., None], apart, np.nan), 1)
     off = np.where(seen, ((apart - middle[:, None]) ** 2).sum(2), 0.0)
     usual = float(np.median(off[known])) + 1e-300
-    level = np.where(seen, 1 - np.log1p(off / (4 * usual)), 0.0)
-    return np.asarray(level.sum(0) / np.maximum(seen.sum(0), 1))
+    usual = usual + (bent[use] if isinstance(bent, np.ndarray) else bent)
+    return np.where(seen, 1 - np.log1p(off / (4 * usual)), np.nan)
 
 
 def stood_still(curves: TrackSplines, start: float, length: float) -> bool:

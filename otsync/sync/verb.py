@@ -27,6 +27,7 @@ from ..refine.slot import Rate, Refiner, RefinerLike
 from ..refine.splines import SplineRefine
 from ..types import Alignment, Break, Clock, Matches, Offsets, Status, TrackSet, in_order
 from .breaks import MOST, Seen, Suspect, culprit, mended, remeasured, runs_on, suspects
+from .ends import broken_end, unvouched
 from .graph import Graph, Pair
 from .method import Method, with_costs
 from .own_frames import Frames, refuse_common, solver_from, synchronize_own
@@ -126,7 +127,25 @@ def synchronize(
         breaking = set(unsteady(aligning, tracks, sound, verdict.x))
         if breaking:
             verdict = judged([_doubted(a) if breaking & set(a.pair) else a for a in verdict.answers])
+    else:
+        verdict = with_ends_checked(verdict, tracks, judged)
     return to_offsets(original, verdict, time.perf_counter() - started, broken)
+
+
+def with_ends_checked(
+    verdict: Verdict, tracks: Sequence[TrackSet], judged: Callable[[Sequence[Answer]], Verdict]
+) -> Verdict:
+    """The verdict, with pairs doubted whose answer does not hold at an end of what both videos share."""
+    ends = {}
+    for a in verdict.answers:
+        first, second = (tracks[v] for v in a.pair)
+        if a.refined.status.ok and a.finite and first.xyz is not None and second.xyz is not None:
+            ends[a.pair] = broken_end(a, first, second)
+    broken = {pair: end for pair, end in ends.items() if end is not None}
+    if not broken:
+        return verdict
+    unsure = unvouched(broken, verdict.answers, tracks)
+    return judged([_doubted(a) if a.pair in unsure else a for a in verdict.answers])
 
 
 def _still_broken(fresh: Answer, first: Answer) -> Answer:

@@ -197,7 +197,7 @@ GRADES = ((30.0, "sharp"), (25.0, "fair"), (20.0, "rough"))
 
 
 def _quality(result: SavedReconstruction | None) -> str:
-    """How near the scene is to what a camera filmed that the fit did not see, in words; empty where nothing is known."""
+    """How near the scene is to what a camera filmed that the fit did not see, in words; empty where unknown."""
     path = None if result is None or result.folder is None else Path(result.folder) / "metrics.json"
     if path is None or not path.is_file():
         return ""

@@ -55,9 +55,12 @@ def test_twice_is_once():
 @settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 10**6), share=st.floats(0, 1), single=st.booleans())
 def test_what_moves_evenly_is_recovered_exactly_and_what_is_not_seen_is_left_alone(seed, share, single):
-    """At any readout, on any clock, with any rows and gaps; junk where nothing is visible changes nothing."""
+    """At any readout, on any clock, with any rows and gaps; junk where nothing is visible changes nothing.
+
+    Readouts up to the shortest frame: beyond it neighbours are read at nearly one time, and tell nothing of motion.
+    """
     rng, t, seen = clip(seed)
-    readout = share * float(np.median(np.diff(t)))
+    readout = share * float(np.diff(t).min())
     row = np.clip(0.4 * rng.uniform(-1, 1, (6, 1)) + 0.2 * rng.uniform(-1, 1, seen.shape), -0.5, 0.5)
     p, v = rng.normal(size=(2, 6, 1, 3))
     if single:

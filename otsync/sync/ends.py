@@ -1,0 +1,156 @@
+"""Ends of overlaps: a clock that breaks there leaves too little for the search by windows, and the answer says "ok".
+
+Two things tell of it. Another offset may suit the last moments better. And positions that agree everywhere else may not
+agree there, though no other offset can be seen to suit them: the tracks were matched at the answer, so that those which
+the other offset needs are not among the matches.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from ..clocks.common import readable, strongest
+from ..types import Clock, TrackSet
+from .breaks import LEAST_BESIDE, LIMIT, MARGIN, OFF, OTHERS, Raw, Seen, levels
+from .graph import Pair
+from .verdict import Answer
+
+LENGTHS = (10 / 30, 16 / 30)
+"""Seconds of an end that another offset may suit better; the shorter one is asked whether positions agree."""
+
+BESIDE = 1.0
+"""Seconds beside a window that tell the constant differences of its matches."""
+
+SUITS_BETTER = 0.2
+"""How much better another offset may suit an end. Of 270 trusted answers to worlds without a break (mid to brutal, few
+tracks, like people, flocks, clean ones; seeds 500-560) none has more than .16."""
+
+AGREES, USUALLY = 0.5, 0.1
+"""Share of the samples that agree at an end, over this quantile of the shares within the clip: .57 at least in the same
+270. Of 17 answers that were wrong behind a break .2 to 1.2 s from an end and trusted without this module (seeds
+500-549: ten frames lost or twelve frozen), the two limits together catch 15."""
+
+WITNESSES, KNOWN = 5, 5
+"""Matches that must be seen at both offsets, and samples that tell where a match's own constant difference lies."""
+
+REACH = 20.0
+"""Seconds from an end that are looked at."""
+
+WINDOWS = 40
+"""Windows within the clip that tell the usual agreement, at most."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Matched:
+    """Matched tracks of a pair at its answer, from one end of the overlap inwards.
+
+    Args:
+        t: (S,) moments on a's clock. away: (S,) seconds from the end.
+    """
+
+    a: Raw
+    b: Raw
+    clock: Clock
+    t: Float[np.ndarray, " S"]
+    away: Float[np.ndarray, " S"]
+
+    def window(self, begin: float, length: float) -> tuple[np.ndarray, np.ndarray]:
+        """Moments of a window that begins ``begin`` s from the end, and of what lies beside it, further inwards."""
+        inner = begin + length + MARGIN
+        within = (self.away >= begin) & (self.away < begin + length)
+        return self.t[within], self.t[(self.away >= inner) & (self.away < inner + BESIDE)]
+
+    def levels(self, asked: np.ndarray, known: np.ndarray, late: float = 0.0) -> Float[np.ndarray, "M A"]:
+        """How well every match agrees at the moments ``asked`` and an offset that is larger by ``late`` s, where its
+        constant difference is that of the ``known`` moments at the answer: see :func:`otsync.sync.breaks.levels`.
+        """
+        at_a = np.concatenate([known, asked])
+        at_b = np.concatenate([self.clock.own(known), self.clock.own(asked - late)])
+        bent = self.a.bent(at_a) + self.b.bent(at_b)
+        inside = np.arange(len(at_a)) < len(known)
+        return levels(self.a.at(at_a) - self.b.at(at_b), inside, bent)[:, len(known) :]
+
+
+def broken_end(answer: Answer, a: TrackSet, b: TrackSet) -> tuple[float, float] | None:
+    """The end of a pair's overlap in which its answer does not hold: from when to when on a's clock; None: none."""
+    pairs = strongest(answer.matches, readable(LIMIT, a, b)).pairs
+    raw = Raw.of(a, pairs[:, 0]), Raw.of(b, pairs[:, 1])
+    clock = Clock(answer.refined.offset, answer.refined.rate)
+    seen = Seen.by(answer, a, b)[0]
+    for late in (False, True):
+        away = seen.end - a.times if late else a.times - seen.begin
+        near = (away >= 0) & (away < min(REACH, seen.end - seen.begin))
+        matched = _Matched(*raw, clock, a.times[near], away[near])
+        if suits_another(matched) or does_not_agree(matched):
+            length = LENGTHS[-1]
+            return (seen.end - length, seen.end) if late else (seen.begin, seen.begin + length)
+    return None
+
+
+def suits_another(matched: _Matched) -> bool:
+    """Whether another offset clearly suits the end better, by the samples that are seen at both."""
+    steps = np.arange(-round(OTHERS * 30), round(OTHERS * 30) + 1) / 30
+    for length in LENGTHS:
+        asked, known = matched.window(0.0, length)
+        if len(asked) < LEAST_BESIDE or len(known) < KNOWN:
+            continue
+        here = matched.levels(asked, known)
+        for step in steps[np.abs(steps) > OFF]:
+            gain = matched.levels(asked, known, step) - here
+            witnesses = np.isfinite(gain).sum(0)
+            told = witnesses >= WITNESSES
+            if told.sum() < LEAST_BESIDE:
+                continue
+            if float((np.nansum(gain[:, told], 0) / witnesses[told]).mean()) > SUITS_BETTER:
+                return True
+    return False
+
+
+def does_not_agree(matched: _Matched) -> bool:
+    """Whether far fewer positions agree at the end than usually do within the clip, each predicted from beside it."""
+    length = LENGTHS[0]
+    last = float(matched.away.max(initial=0.0)) - length - MARGIN - BESIDE
+    if last < length:
+        return False
+    begins = np.arange(0.0, last, max(length / 2, last / WINDOWS))
+    shares = np.array([_share(matched, begin, length) for begin in begins])
+    told = shares[np.isfinite(shares)]
+    return bool(np.isfinite(shares[0]) and shares[0] < AGREES * float(np.quantile(told, USUALLY)))
+
+
+def _share(matched: _Matched, begin: float, length: float) -> float:
+    """Of the samples in a window, the share that agrees; nan where fewer than two a frame are seen."""
+    asked, known = matched.window(begin, length)
+    if len(asked) < LEAST_BESIDE or len(known) < KNOWN:
+        return np.nan
+    level = matched.levels(asked, known)
+    seen = int(np.isfinite(level).sum())
+    return float((level > 0).sum() / seen) if seen >= 2 * len(asked) else np.nan
+
+
+def unvouched(
+    broken: Mapping[Pair, tuple[float, float]], answers: Sequence[Answer], tracks: Sequence[TrackSet]
+) -> set[Pair]:
+    """The pairs that ends which do not hold make doubtful.
+
+    They are those pairs themselves, and all of a video for whose clock there no sound pair vouches that sees it.
+
+    Args:
+        broken: of pairs, the ends that do not hold, on the first video's clock; see :func:`broken_end`.
+    """
+    sound = [a for a in answers if a.pair not in broken and a.refined.status.ok and a.finite]
+    sees = [seen for a in sound for seen in Seen.by(a, tracks[a.pair[0]], tracks[a.pair[1]])]
+    videos = set()
+    for answer in answers:
+        if answer.pair not in broken:
+            continue
+        begin, end = broken[answer.pair]
+        clock = Clock(answer.refined.offset, answer.refined.rate)
+        for video, low, high in zip(answer.pair, (begin, clock.own(begin)), (end, clock.own(end)), strict=True):
+            if not any(s.video == video and s.begin <= low and s.end >= high for s in sees):
+                videos.add(video)
+    return set(broken) | {a.pair for a in answers if videos & set(a.pair)}

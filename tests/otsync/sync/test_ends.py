@@ -1,0 +1,111 @@
+"""Ends of overlaps: breaks there are doubted, and right answers are not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from otsync import synchronize
+from otsync.bench.trust.worlds import CLASSES, plain
+from otsync.simulate import simulate
+from otsync.simulate.effects import Drop, In
+from otsync.sync.ends import broken_end, unvouched
+from otsync.sync.verdict import Answer
+from otsync.types import Alignment, Matches, Status, TrackSet
+
+FPS = 30.0
+
+
+@pytest.mark.parametrize("name", ["ten frames dropped", "ten frames dropped, hard"])
+def test_a_break_near_an_end_is_never_trusted_and_wrong(name):
+    """Ten frames lost near an end: too little for the search by windows, and trusted before."""
+    world = CLASSES[name](29001)
+    found = synchronize(world.tracks)
+    ends, _ = world.errors(found)
+    assert Status.BROKEN_CLOCK in found.flags[1] or ends.max() < 1
+
+
+@pytest.mark.parametrize("motion", ["softball", "boxes"])
+def test_clean_worlds_are_not_doubted(motion):
+    """Nothing but the bodies' turning keeps matched points apart there: a noise of its own kind."""
+    tracks, truth = simulate(motion, preset="clean", videos=3, frames=100, seed=3, max_offset=10)
+    found = synchronize([t.take(np.arange(0, len(t), 3)) for t in tracks])
+    assert found.ok and np.abs(found.seconds - truth.offsets).max() * FPS < 0.1
+
+
+def pair(late: float = 0.3, breaks: float | None = None, hidden: float = 0.0, seed: int = 0):
+    """Two track sets of 20 points on smooth paths, the second ``late`` s later, and the pair's answer.
+
+    breaks: share of the second clip from which on its frames are a third of a second later; hidden: share of the
+    tracks that the second video does not see from there on.
+    """
+    rng = np.random.default_rng(seed)
+    t = np.arange(120) / FPS
+    phase, speed, size = rng.uniform(0, 6, (20, 1, 3)), rng.uniform(1, 4, (20, 1, 3)), rng.uniform(0.2, 0.6, (20, 1, 3))
+
+    def seen(at):
+        noise = rng.normal(0, 0.01, (20, len(at), 3))
+        return size * np.sin(speed * at[:, None] + phase) + noise
+
+    shown = t + late
+    visible = np.ones((20, len(t)), bool)
+    if breaks is not None:
+        behind = np.arange(len(t)) >= breaks * len(t)
+        shown = shown + behind / 3
+        visible[: round(20 * hidden), behind] = False
+    x = seen(shown) + rng.normal(0, 0.1, (20, 1, 3))
+    a, b = TrackSet(seen(t), fps=FPS, name="a"), TrackSet(x, visible, fps=FPS, name="b")
+    matches = Matches(np.stack([np.arange(20)] * 2, 1), np.ones(20))
+    answer = Alignment(late, fps=FPS)
+    return Answer((0, 1), matches, answer, answer), a, b
+
+
+@pytest.mark.parametrize("late", [-0.4, 0.3])
+@pytest.mark.parametrize("seed", range(3))
+def test_one_offset_holds_to_both_ends(late, seed):
+    assert broken_end(*pair(late, seed=seed)) is None
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_the_end_behind_a_break_is_named(turned):
+    """On the first video's clock, whichever of both broke."""
+    answer, a, b = pair(breaks=0.85)
+    if turned:
+        back = Alignment(-0.3, fps=FPS)
+        answer, a, b = replace(answer, scanned=back, refined=back), b, a
+    found = broken_end(answer, a, b)
+    assert found is not None
+    last = a.times[-1] if not turned else b.times[-1] - 0.3
+    assert found[1] == pytest.approx(last) and 0.3 < found[1] - found[0] < 0.6
+
+
+def test_where_another_offset_cannot_be_seen_positions_that_do_not_agree_tell():
+    """Tracks were matched at the answer: too few of those that the lost frames need are among the matches."""
+    world = plain(524, preset="hard", first=(In(1, Drop(10 / 30, at=0.9)),))
+    found = synchronize(world.tracks)
+    ends, _ = world.errors(found)
+    assert ends.max() > 9 and Status.BROKEN_CLOCK in found.flags[1]
+
+
+def test_overlaps_too_short_to_judge_are_left_alone():
+    answer, a, b = pair(late=3.0)  # one second in common
+    assert broken_end(answer, a, b) is None
+
+
+def test_who_is_doubted_where_others_see_the_end():
+    """A pair whose end does not hold, and no other sees: both its videos. Where others see it: the pair alone."""
+    t = np.zeros((5, 120, 3))
+    clips = [TrackSet(t, fps=FPS, name=str(n)) for n in range(3)]
+
+    def answer(pair, offset):
+        found = Alignment(offset, fps=FPS)
+        return Answer(pair, Matches(np.zeros((0, 2), int), np.zeros(0)), found, found)
+
+    answers = [answer((0, 1), 0.0), answer((0, 2), 0.0), answer((1, 2), 0.0)]
+    assert unvouched({(0, 1): (3.4, 3.9)}, answers, clips) == {(0, 1)}
+    answers[1:] = [answer((0, 2), -1.0), answer((1, 2), 0.0)]  # 0 and 2 share the first three seconds of 0
+    assert unvouched({(0, 1): (3.4, 3.9)}, answers, clips) == {(0, 1), (0, 2)}
+    answers[2] = answer((1, 2), -1.0)
+    assert unvouched({(0, 1): (3.4, 3.9)}, answers, clips) == {(0, 1), (0, 2), (1, 2)}
