@@ -2,7 +2,8 @@
 PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
-PIP    := $(BIN)/pip --disable-pip-version-check install --quiet -c constraints.txt
+# --no-compile: byte code is made of what is imported, when it is; compiling all of torch takes half a minute
+PIP    := $(BIN)/pip --disable-pip-version-check install --quiet --no-compile -c constraints.txt
 WORKERS ?= 2
 
 .PHONY: demo pictures test test-all test-floors bench schemas docs stability lint format clean

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -45,6 +46,9 @@ SEARCH = 2.0
 
 ENOUGH, LEAST_BESIDE = 15, 4
 """Frames that tell where a match's own constant difference lies; and that are asked beside a break, at least."""
+
+LEAST_KNOWN = 5
+"""Samples that tell where a match's own constant difference lies, at least."""
 
 BACK = 1.5
 """Seconds that a video must go back by to be taken for cut; less is lost frames."""
@@ -165,16 +169,20 @@ class Raw:
         outside = (t < self.times[0]) | (t > self.times[-1])
         return np.where(outside[None, :, None], np.nan, x)
 
+    @cached_property
+    def _bends(self) -> np.ndarray:
+        square = np.zeros(self.x.shape[:2])
+        second = ((self.x[:, 2:] - 2 * self.x[:, 1:-1] + self.x[:, :-2]) ** 2).sum(2) / 64
+        square[:, 1:-1] = np.where(np.isfinite(second), second, 0.0)
+        return square
+
     def bent(self, t: np.ndarray) -> np.ndarray:
         """(M,S) how far a curve may lie off such a line, squared: an eighth of the second difference; 0 where unknown.
 
         At a sample it is an eighth as well: curves that bend there are not known better than their samples are apart.
         """
-        square = np.zeros(self.x.shape[:2])
-        second = ((self.x[:, 2:] - 2 * self.x[:, 1:-1] + self.x[:, :-2]) ** 2).sum(2) / 64
-        square[:, 1:-1] = np.where(np.isfinite(second), second, 0.0)
         right = np.clip(np.searchsorted(self.times, t), 1, len(self.times) - 1)
-        return np.maximum(square[:, right - 1], square[:, right])
+        return np.maximum(self._bends[:, right - 1], self._bends[:, right])
 
 
 def _moment(
@@ -231,29 +239,44 @@ def _suits(a: Raw, b: Raw, offset: float, t: np.ndarray, inside: np.ndarray) -> 
 
 def _agreement(apart: np.ndarray, inside: np.ndarray) -> np.ndarray:
     """(S,) how well positions agree, from the differences (M,S,3) of matched tracks: see :func:`_suits`."""
-    level = levels(apart, inside)
+    level = Usual.of(apart, inside).levels(apart)
     return np.asarray(np.nansum(level, 0) / np.maximum(np.isfinite(level).sum(0), 1))
 
 
-def levels(apart: np.ndarray, inside: np.ndarray, bent: np.ndarray | float = 0.0) -> np.ndarray:
-    """(M',S) how well each matched track agrees at each moment, in (-inf, 1]; nan where it is not seen.
+@dataclass(frozen=True, eq=False)
+class Usual:
+    """How far apart matched tracks usually are, which tells how well they agree elsewhere.
 
     Args:
-        apart: (M,S,3) differences of matched tracks; of those that are hardly known there is no row.
-        inside: (S,) the moments that tell each match's constant difference, its median, and what is usual.
-        bent: (M,S) squared error of what was read between two samples, which counts for nothing.
+        known: (M,) matches of which enough is seen. middle: (M',3) the constant difference of each of them, its median.
+        spread: the median squared distance from it.
     """
-    seen = np.isfinite(apart[..., 0])
-    known = seen & inside
-    use = known.sum(1) >= 5
-    if not use.any():
-        return np.full((0, apart.shape[1]), np.nan)
-    apart, seen, known = apart[use], seen[use], known[use]
-    middle = np.nanmedian(np.where(known[..., None], apart, np.nan), 1)
-    off = np.where(seen, ((apart - middle[:, None]) ** 2).sum(2), 0.0)
-    usual = float(np.median(off[known])) + 1e-300
-    usual = usual + (bent[use] if isinstance(bent, np.ndarray) else bent)
-    return np.where(seen, 1 - np.log1p(off / (4 * usual)), np.nan)
+
+    known: np.ndarray
+    middle: np.ndarray
+    spread: float
+
+    @classmethod
+    def of(cls, apart: np.ndarray, inside: np.ndarray) -> Usual:
+        """From the differences (M,S,3) at the moments ``inside`` (S,)."""
+        seen = np.isfinite(apart[..., 0]) & inside
+        known = seen.sum(1) >= LEAST_KNOWN
+        if not known.any():
+            return cls(known, np.zeros((0, 3)), 1.0)
+        middle = np.nanmedian(np.where(seen[known][..., None], apart[known], np.nan), 1)
+        off = ((apart[known] - middle[:, None]) ** 2).sum(2)
+        return cls(known, middle, float(np.median(off[seen[known]])) + 1e-300)
+
+    def levels(self, apart: np.ndarray, bent: np.ndarray | None = None) -> np.ndarray:
+        """(M',S) how well each known match agrees at each moment, in (-inf, 1]; nan where it is not seen.
+
+        Args:
+            apart: (M,S,3) differences. bent: (M,S) squared error of what was read between samples; it counts for
+                nothing.
+        """
+        off = ((apart[self.known] - self.middle[:, None]) ** 2).sum(2)
+        usual = self.spread if bent is None else self.spread + bent[self.known]
+        return np.asarray(1 - np.log1p(off / (4 * usual)))
 
 
 def stood_still(curves: TrackSplines, start: float, length: float) -> bool:

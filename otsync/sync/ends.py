@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from ..clocks.common import readable, strongest
 from ..types import Clock, TrackSet
-from .breaks import LEAST_BESIDE, LIMIT, MARGIN, OFF, OTHERS, Raw, Seen, levels
+from .breaks import LEAST_BESIDE, LIMIT, MARGIN, OFF, OTHERS, Raw, Seen, Usual
 from .graph import Pair
 from .verdict import Answer
 
@@ -34,8 +34,8 @@ AGREES, USUALLY = 0.5, 0.1
 270. Of 17 answers that were wrong behind a break .2 to 1.2 s from an end and trusted without this module (seeds
 500-549: ten frames lost or twelve frozen), the two limits together catch 15."""
 
-WITNESSES, KNOWN = 5, 5
-"""Matches that must be seen at both offsets, and samples that tell where a match's own constant difference lies."""
+WITNESSES, ENOUGH = 5, 5
+"""Matches that must be seen at both offsets, and frames that tell the constant differences."""
 
 REACH = 20.0
 """Seconds from an end that are looked at."""
@@ -58,21 +58,24 @@ class _Matched:
     t: Float[np.ndarray, " S"]
     away: Float[np.ndarray, " S"]
 
-    def window(self, begin: float, length: float) -> tuple[np.ndarray, np.ndarray]:
-        """Moments of a window that begins ``begin`` s from the end, and of what lies beside it, further inwards."""
-        inner = begin + length + MARGIN
-        within = (self.away >= begin) & (self.away < begin + length)
-        return self.t[within], self.t[(self.away >= inner) & (self.away < inner + BESIDE)]
-
-    def levels(self, asked: np.ndarray, known: np.ndarray, late: float = 0.0) -> Float[np.ndarray, "M A"]:
-        """How well every match agrees at the moments ``asked`` and an offset that is larger by ``late`` s, where its
-        constant difference is that of the ``known`` moments at the answer: see :func:`otsync.sync.breaks.levels`.
+    def window(self, begin: float, length: float) -> tuple[np.ndarray, Usual] | None:
+        """Moments of a window that begins ``begin`` s from the end, and what is usual beside it, further inwards; None
+        where either has too few frames.
         """
-        at_a = np.concatenate([known, asked])
-        at_b = np.concatenate([self.clock.own(known), self.clock.own(asked - late)])
-        bent = self.a.bent(at_a) + self.b.bent(at_b)
-        inside = np.arange(len(at_a)) < len(known)
-        return levels(self.a.at(at_a) - self.b.at(at_b), inside, bent)[:, len(known) :]
+        inner = begin + length + MARGIN
+        asked = self.t[(self.away >= begin) & (self.away < begin + length)]
+        beside = self.t[(self.away >= inner) & (self.away < inner + BESIDE)]
+        if len(asked) < LEAST_BESIDE or len(beside) < ENOUGH:
+            return None
+        return asked, Usual.of(self._apart(beside), np.ones(len(beside), bool))
+
+    def levels(self, asked: np.ndarray, usual: Usual, late: float = 0.0) -> Float[np.ndarray, "M A"]:
+        """How well every match agrees at the moments ``asked`` and an offset that is larger by ``late`` s."""
+        bent = self.a.bent(asked) + self.b.bent(self.clock.own(asked - late))
+        return usual.levels(self._apart(asked, late), bent)
+
+    def _apart(self, t: np.ndarray, late: float = 0.0) -> Float[np.ndarray, "M A 3"]:
+        return self.a.at(t) - self.b.at(self.clock.own(t - late))
 
 
 def broken_end(answer: Answer, a: TrackSet, b: TrackSet) -> tuple[float, float] | None:
@@ -95,12 +98,11 @@ def suits_another(matched: _Matched) -> bool:
     """Whether another offset clearly suits the end better, by the samples that are seen at both."""
     steps = np.arange(-round(OTHERS * 30), round(OTHERS * 30) + 1) / 30
     for length in LENGTHS:
-        asked, known = matched.window(0.0, length)
-        if len(asked) < LEAST_BESIDE or len(known) < KNOWN:
+        if (window := matched.window(0.0, length)) is None:
             continue
-        here = matched.levels(asked, known)
+        here = matched.levels(*window)
         for step in steps[np.abs(steps) > OFF]:
-            gain = matched.levels(asked, known, step) - here
+            gain = matched.levels(*window, step) - here
             witnesses = np.isfinite(gain).sum(0)
             told = witnesses >= WITNESSES
             if told.sum() < LEAST_BESIDE:
@@ -124,12 +126,11 @@ def does_not_agree(matched: _Matched) -> bool:
 
 def _share(matched: _Matched, begin: float, length: float) -> float:
     """Of the samples in a window, the share that agrees; nan where fewer than two a frame are seen."""
-    asked, known = matched.window(begin, length)
-    if len(asked) < LEAST_BESIDE or len(known) < KNOWN:
+    if (window := matched.window(begin, length)) is None:
         return np.nan
-    level = matched.levels(asked, known)
+    level = matched.levels(*window)
     seen = int(np.isfinite(level).sum())
-    return float((level > 0).sum() / seen) if seen >= 2 * len(asked) else np.nan
+    return float((level > 0).sum() / seen) if seen >= 2 * len(window[0]) else np.nan
 
 
 def unvouched(
