@@ -15,6 +15,7 @@ from otsync.bench.chain_worlds import SITUATIONS, world
 
 def test_rows_on_two_situations(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(chain, "SITUATIONS", {name: SITUATIONS[name] for name in ("mid", "no depth")})
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: {0})  # every worker compiles tslearn's loops anew
     assert chain.run(tmp_path, seeds=1, first_seed=31, only=("EMD",)) == 0
     answers = json.loads((tmp_path / "chain_answers.json").read_text())["rows"]
     assert {(r["situation"], r["matcher"]) for r in answers} == {("mid", "EMD"), ("mid", "paper"), ("no depth", "EMD")}
