@@ -313,13 +313,18 @@ function prepareCameras(about, arrays) {
   if (about.motion.kind === 'scaffold') about.motion.clock_of = arrays.clock_of;
 }
 
-/** The first moment that all videos show; where there is none, the middle. */
+const CANDIDATES = 40; // moments that are tried
+
+/** Soon after the first moment that all videos show, as far from any frame as can be; the middle where there is none. */
 function openingMoment(about) {
   const [first, last] = about.span;
   const starts = about.cameras.map(({ offset, rate, first: own }) => rate * own + offset);
   const ends = about.cameras.map(({ offset, rate, last: own }) => rate * own + offset);
-  const start = Math.max(first, ...starts);
-  return start < Math.min(last, ...ends) ? start : (first + last) / 2;
+  const [start, end] = [Math.max(first, ...starts), Math.min(last, ...ends)];
+  if (!about.cameras.length || start >= end) return (first + last) / 2;
+  const beside = (t) => Math.min(...about.cameras.map((c) => c.rate * besideFrame(c, (t - c.offset) / c.rate)));
+  const moments = Array.from({ length: CANDIDATES }, (_, i) => start + (2 * about.step * i) / CANDIDATES);
+  return moments.filter((t) => t < end).reduce((best, t) => (beside(t) > beside(best) ? t : best), start);
 }
 
 /** Says in a tile why it shows no picture. */

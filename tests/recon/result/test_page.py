@@ -345,6 +345,7 @@ def test_it_says_whether_a_frame_is_of_this_instant(opened, scene_page):
     apart = [[np.abs(f - t).min() for f in frames] for t in np.linspace(0.4, 0.7, 200)]
     between = float(np.linspace(0.4, 0.7, 200)[int(np.argmax(np.min(apart, 1)))])
     asked = np.array([np.abs(f - between).min() for f in frames])
+    assert opened.open(scene_page).page.inner_text("#between").startswith("rendered between frames")
     said = opened.open(scene_page, time=f"{between:.4f}").page.inner_text("#between")
     assert said == (
         f"rendered between frames; the nearest is {1000 * asked.min():.1f} ms away, in video "
