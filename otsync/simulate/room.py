@@ -32,6 +32,11 @@ FURNITURE = np.array([[-1.5, 0.9, 1.8], [1.4, 0.9, 2.0], [-2.0, 0.9, -0.5], [2.0
 FURNITURE_RADIUS = 0.45
 """Balls that lie on the floor, m."""
 
+TINTS = np.array(
+    [[176, 168, 150], [150, 160, 176], [206, 202, 192], [128, 112, 98], [166, 176, 160], [182, 172, 160]], float
+)
+"""Of painted walls, in the order of :attr:`Room.pictures`: the third is the ceiling, the fourth the floor."""
+
 MIDDLE = np.array([0.0, 0.2, 0.3])
 """Around this point things move, m."""
 
@@ -44,12 +49,13 @@ class Room:
     """A room and what moves in it.
 
     Args:
-        pictures: six walls' pictures, two for each axis (low, high).
+        pictures: six walls' pictures, two for each axis (low, high). skins: what balls wear, in turns.
         radii: (B,) of the moving balls, m. colours: (B,3) what shines through their pictures, 0 to 255.
         places: seconds (T,) -> centres (B,T,3) of the moving balls, m, at every real time.
     """
 
     pictures: tuple[UInt8[np.ndarray, "h w 3"], ...]
+    skins: tuple[UInt8[np.ndarray, "h w 3"], ...]
     radii: Float[np.ndarray, " B"]
     colours: Float[np.ndarray, "B 3"]
     places: Callable[[Float[np.ndarray, " T"]], Float[np.ndarray, "B T 3"]]
@@ -58,28 +64,44 @@ class Room:
         return f"Room({len(self.radii)} moving things)"
 
 
-def draw_room(seed: int, *, things: int = 7, contrast: float = 1.0) -> Room:
+def draw_room(seed: int, *, things: int = 7, contrast: float = 1.0, pace: float = 1.0, painted: bool = False) -> Room:
     """A room; ``seed`` decides everything.
 
     Args:
         things: how many move.
         contrast: of the pictures on the walls, 0 (plain grey) to 1.
+        pace: how fast things move, as a multiple.
+        painted: whether the walls have a tint each, and each thing a colour of its own and a picture of full contrast:
+            easier to look at, and to follow.
     """
-    if things < 1 or not 0 <= contrast <= 1:
+    if things < 1 or not 0 <= contrast <= 1 or not 0 < pace < np.inf:
         raise ValueError(
-            f"things, contrast: expected at least 1, and a number from 0 to 1; found {things}, {contrast}."
+            "things, contrast, pace: expected at least 1, a number from 0 to 1, and one above 0; "
+            f"found {things}, {contrast} and {pace}."
         )
     rng = stream(seed, "things")
     waves = [(f, rng.normal(size=(things, 1, 3)), rng.uniform(0, 2 * np.pi, (things, 1, 3))) for f in (0.4, 0.9, 1.7)]
     rest = 0.4 * rng.normal(size=(things, 1, 3))
 
     def places(t: Float[np.ndarray, " T"]) -> Float[np.ndarray, "B T 3"]:
-        t = np.asarray(t, float)[None, :, None]
+        t = pace * np.asarray(t, float)[None, :, None]
         path = rest + sum(0.3 / f**0.5 * size * np.sin(2 * np.pi * f * t + phase) for f, size, phase in waves)
         return MIDDLE + 0.9 * np.tanh(path / 0.9) * [1, 0.8, 1]
 
     colours = stream(seed, "colours").integers(0, 2, (things, 3)) * 200.0 + 25
-    return Room(_pictures(seed, contrast), stream(seed, "radii").uniform(0.14, 0.24, things), colours, places)
+    walls = skins = _pictures(seed, contrast)
+    if painted:
+        walls = tuple(
+            np.clip(wall + (tint - 128), 0, 255).astype(np.uint8) for wall, tint in zip(walls, TINTS, strict=True)
+        )
+        skins, colours = _pictures(seed, 1.0), hues(things)
+    return Room(walls, skins, stream(seed, "radii").uniform(0.14, 0.24, things), colours, places)
+
+
+def hues(count: int) -> Float[np.ndarray, "B 3"]:
+    """Bright colours, evenly round the circle of hues, 0 to 255."""
+    turn = np.arange(count)[:, None] / count + np.array([0.0, 1 / 3, 2 / 3])
+    return 255 * np.clip(0.5 + 0.7 * np.cos(2 * np.pi * turn), 0, 1)
 
 
 @lru_cache(4)
@@ -202,7 +224,7 @@ class RoomCamera:
         n = (away + d * z[..., None]) / np.float32(radius)
         x = (np.arctan2(n[..., 0], n[..., 2]) / np.float32(2 * np.pi) + 0.5) * np.float32(SKIN * TEXTURE[0])
         y = (np.arcsin(np.clip(n[..., 1], -1, 1)) / np.float32(np.pi) + 0.5) * np.float32(SKIN * TEXTURE[1])
-        skin = cv2.remap(self.room.pictures[picture % 6], x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR)
+        skin = cv2.remap(self.room.skins[picture % 6], x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR)
         image[where][hit] = skin[hit]
         depth[where][hit] = z[hit]
         return where, hit

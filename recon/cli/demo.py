@@ -28,7 +28,7 @@ class Demo:
     """Folder for recording/ (the videos), result/ (what otsync run makes of them) and demo.json."""
     seed: int = 1
     """Of the world, the phones and their clocks."""
-    steps: int = 500
+    steps: int = 1200
     """Steps of the fit: more give a sharper scene. The clocks stay as the geometry found them."""
 
     def run(self) -> int:

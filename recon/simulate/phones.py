@@ -29,8 +29,8 @@ RATE = 48_000
 """Samples of sound a second."""
 
 
-THINGS, CONTRAST = 7, 0.5
-"""Balls that fly, and the contrast of all pictures in the room."""
+THINGS, PACE, CONTRAST = 6, 0.6, 0.25
+"""Balls that fly, how fast, and the contrast of the walls: a room that five phones can make a scene of."""
 
 TICKS = 3.0
 """Ticks of a ball in a second."""
@@ -113,7 +113,7 @@ def film_phones(
             f"phones, seconds, late: expected two phones and more, above 0, and 0 or more; found {len(phones)}, "
             f"{seconds:g} and {late:g}."
         )
-    folder, room = Path(folder), draw_room(seed, things=THINGS, contrast=CONTRAST)
+    folder, room = Path(folder), draw_room(seed, things=THINGS, contrast=CONTRAST, pace=PACE, painted=True)
     began = np.array([0.0, *(late * stream(seed, v, "late").uniform(-1, 1) for v in range(1, len(phones)))])
     entries: list[dict[str, Any]] = []
     cameras, starts = [], []
