@@ -222,7 +222,7 @@ def read_intrinsics(path: str | os.PathLike[str]) -> dict[str, Lens]:
     A JSON object of ``{name: {"K": 3x3, "distortion": [k1, k2, p1, p2, k3, ...]}}``, or a scene document, whose poses
     are not read. ValueError names the file and the video.
     """
-    content = read_json(path)
+    content = read_json(path, remedy='Give {"name of a video, or *": {"K": [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]}}.')
     if isinstance(content, dict) and isinstance(content.get("videos"), list):
         content = {
             str(entry.get("name", f"video{n}")): entry.get("camera")

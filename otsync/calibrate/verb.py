@@ -124,7 +124,7 @@ def calibrate_clips(
 ) -> Calibration:
     """The same for clips that are already described, walk clips among them."""
     options, cache, progress = options or CalibrateOptions(), cache or Cache(), Progress(tell)
-    _check_distance(options, clips)
+    options = _with_distance(options, clips)
     with progress.stage("pictures"):
         filmed = [_filmed(clip, options, options.pictures_of(clip, len(clips)), cache) for clip in clips]
         for each in filmed:
@@ -305,9 +305,12 @@ def _split(
     return Calibration(scene, method, unit, helpers, seconds=dict(progress.seconds))
 
 
-def _check_distance(options: CalibrateOptions, clips: Sequence[Clip]) -> None:
+def _with_distance(options: CalibrateOptions, clips: Sequence[Clip]) -> CalibrateOptions:
+    """The options with a distance between names of videos, which may be told by their files' names."""
+    if options.distance is None:
+        return options
     names = [clip.name for clip in clips if clip.kind == "scene"]
-    if options.distance is not None:
-        a, b, _ = options.distance
-        if a not in names or b not in names or a == b:
-            raise ValueError(f"--distance: expected two of {', '.join(names)}; found {a} and {b}.")
+    a, b = (told if told in names else Path(told).stem for told in options.distance[:2])
+    if a not in names or b not in names or a == b:
+        raise ValueError(f"--distance: expected two of {', '.join(names)}; found {a} and {b}.")
+    return replace(options, distance=(a, b, options.distance[2]))

@@ -208,6 +208,7 @@ def sync_recording(
         raise ValueError(
             f"--out: expected another folder than the recording's, whose scene.json it would replace: {out}."
         )
+    lost = {name: why for name, why in scene.doubtful.items() if name not in scene.names}
     if options.cameras:
         scene = scene.take(options.cameras)
     chosen = reference_among(scene.names, reference)
@@ -234,9 +235,12 @@ def sync_recording(
         wrote.append(out / "scene.json")
         write_json(wrote[-1], found_document(document, found.offsets))
     if as_json:
-        print_json({"route": found.route, "why": list(found.why), **with_errors(found.offsets, known)})
+        more = {"left_out": lost} if lost else {}
+        print_json({"route": found.route, "why": list(found.why), **with_errors(found.offsets, known), **more})
     else:
         print(table(found.offsets, known))
+        for name, why in lost.items():
+            print(f"{name} is left out, it has no camera: {why}")
         print(f"route {found.route}; wrote {', '.join(map(str, wrote[:-1]))} and {wrote[-1]}")
         if own:
             print(f"scene.json has the cameras that were found; its paths are relative to {scene.root}: copy it there")

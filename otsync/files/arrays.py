@@ -58,15 +58,17 @@ def write_json(path: str | os.PathLike[str], value: Any) -> None:
         stream.write(text)
 
 
-def read_json(path: str | os.PathLike[str], *, max_bytes: int = 64 * 2**20) -> Any:
-    """Read a JSON file of at most ``max_bytes``. Raises ValueError naming the file for anything else."""
+def read_json(
+    path: str | os.PathLike[str], *, max_bytes: int = 64 * 2**20, remedy: str = "Write it again with otsync."
+) -> Any:
+    """Read a JSON file of at most ``max_bytes``. ValueError with the file and the remedy for anything else."""
     path = existing(path)
     if path.stat().st_size > max_bytes:
         raise ValueError(f"{path}: expected a JSON file of at most {max_bytes} bytes; found {path.stat().st_size}.")
     try:
         return json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=_once)
     except (ValueError, RecursionError) as error:  # a ValueError also for a number of more than 4300 digits
-        raise ValueError(f"{path}: expected JSON; {error}. Write it again with otsync.") from None
+        raise ValueError(f"{path}: expected JSON; {error}. {remedy}") from None
     except OSError as error:
         raise type(error)(error.errno, f"cannot be read ({error.strerror}). Check its permissions", str(path)) from None
     except MemoryError:

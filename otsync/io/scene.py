@@ -123,7 +123,7 @@ def read_document(path: str | os.PathLike[str], *, reader: str | None = None) ->
         return describe_folder(path, reader=reader), path
     if path.is_dir():
         path = path / "scene.json"
-    document = read_json(path)
+    document = read_json(path, remedy="Mend it there, or write it anew with otsync init.")
     if not isinstance(document, dict) or document.get("format") != FORMAT:
         raise ValueError(f"{path}: expected a scene (format {FORMAT!r}); found something else. Run: otsync init FOLDER")
     if document.get("version") != VERSION:

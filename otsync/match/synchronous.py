@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..clocks.splines import TrackSplines
+from ..clocks.splines import sampled
 from ..costs.linear import Cosine, Cost, binary_scale, total_cost
 from ..costs.positions import SynchronousDistance
 from ..types import Clock, Matches, Status, TrackSet
@@ -96,8 +96,8 @@ class SynchronousMatching(Matcher):
         t = np.linspace(first, last, MOMENTS)
         xa, xb = a.positions(), b.positions()
         scale = max(binary_scale(xa), binary_scale(xb))
-        at_a = TrackSplines(a.times, xa / scale).sample(t)
-        at_b = TrackSplines(b.times, xb / scale).sample((t - self.offset) / self.rate)
+        at_a = sampled(a.times, xa / scale, t)
+        at_b = sampled(b.times, xb / scale, (t - self.offset) / self.rate)
         extent = 0.5 * (rms_extent(at_a) + rms_extent(at_b))
         if not extent > 0:
             return place, motion

@@ -121,6 +121,9 @@ def check_scene(
         except (ValueError, OSError) as error:
             findings.append(Finding("error", name, str(error), ""))
             continue
+        if doubt := one.doubtful.get(name):
+            remedy = document["calibration"]["cameras"][name].get("remedy") or "Find it anew: otsync calibrate."
+            findings.append(Finding("warning", name, f"its camera is doubtful: {doubt.rstrip('.')}.", remedy))
         findings += _intrinsics(one.videos[0])
         findings += _files(one, every_frame)
         findings += _clock(entry, one.videos[0], Paths(root, allow_outside))

@@ -90,7 +90,7 @@ def write_reconstruction_report(
         "<h2>What accuracy cost</h2>",
         f"<div class=figs><div>{stage_bars(seconds)}</div><div>{figure}</div></div>",
         "<h2>Views</h2>",
-        _view_rows(views, lpips_reason),
+        _view_rows(views, lpips_reason, len(videos)),
         *_pictures(views),
         f"<div class=figs>{views_over_time(views)}</div>" if any(len(v.frames) > 1 for v in views) else "",
         f"<h2>Convergence</h2><p class=s>{_pace(reconstruction)}</p>",
@@ -218,7 +218,8 @@ def offset_curves(
     return [(name, moved[:, v], v == reference) for v, name in enumerate(videos)]
 
 
-def _view_rows(views: Sequence[ViewScore], lpips_reason: str) -> str:
+def _view_rows(views: Sequence[ViewScore], lpips_reason: str, fitted: int) -> str:
+    """The scores, as HTML; ``fitted``: how many videos took part in the fit, of which some are compared."""
     if not views:
         return "<p class=s>No view was scored.</p>"
     names = {
@@ -236,7 +237,9 @@ def _view_rows(views: Sequence[ViewScore], lpips_reason: str) -> str:
         gain = " ".join(f"{g:.3f}" for g in v.gain)
         role = "held out" if v.held_out else "training"
         rows.append([escape(v.name), role, *cells, str(len(v.frames)), gain, HOW[v.clock.how]])
-    missing = f" LPIPS: {escape(lpips_reason)}." if lpips_reason else ""
+    compared = sum(not v.held_out for v in views)
+    some = f" Of the {fitted} cameras of the fit {compared} are compared." if compared < fitted else ""
+    missing = some + (f" LPIPS: {escape(lpips_reason)}." if lpips_reason else "")
     return (
         f"{cards(head, rows)}<p class=s>Renderings use none of the cameras' own pictures: they are static "
         f"Gaussians, and over them what moves. The gain is fitted to what is static.{missing}</p>"

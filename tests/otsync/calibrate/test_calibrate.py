@@ -86,7 +86,7 @@ def test_a_known_distance_gives_metres(world, found, stages):
     """And the same cameras: a second run takes up what the first kept."""
     clips, poses, _ = world
     true = float(np.linalg.norm(centres(poses["phone0"][0]) - centres(poses["phone2"][0])))
-    metric = calibrate_clips(clips, replace(OPTIONS, distance=("phone0", "phone2", true)), cache=stages)
+    metric = calibrate_clips(clips, replace(OPTIONS, distance=("phone0.mp4", "phone2", true)), cache=stages)
     assert [c.K[0, 0] for c in metric.cameras] == [c.K[0, 0] for c in found.cameras]
     ends = [metric[name].places[0] for name in ("phone1", "phone3")]
     want = np.linalg.norm(centres(poses["phone1"][0]) - centres(poses["phone3"][0]))

@@ -10,7 +10,7 @@ from scipy.interpolate import BSpline
 
 from otsync import Matches, TrackSet
 from otsync.clocks.common import common_clock, is_uniform
-from otsync.clocks.splines import RIDGE, SMOOTHING, TrackSplines
+from otsync.clocks.splines import RIDGE, SMOOTHING, TrackSplines, sampled
 from tests.conftest import wiggle
 
 
@@ -141,3 +141,18 @@ def test_memory_grows_with_the_length_of_a_clip_and_not_with_its_square(frames, 
     assert s.n > 50_000
     assert peak < 200 * 2**20  # dense: 20 GiB and more
     np.testing.assert_allclose(s.value(t[:70:7])[1], x[1, :70:7], atol=0.02)
+
+
+@pytest.mark.parametrize("moments", [6, 400])
+def test_few_moments_of_a_long_clip_need_no_curve_of_all_of_it(moments):
+    """Beside gaps, jumps and both ends; many moments take the one curve."""
+    rng = np.random.default_rng(3)
+    t = np.arange(4000) / 30
+    noise = 0.01
+    x = np.sin(t[:, None] * [1.0, 1.7, 2.3]) + noise * rng.normal(size=(3, 4000, 3))
+    x[0, 1990:2030] = np.nan
+    x[1, 2500:] += 2.0
+    asked = np.sort(np.r_[t[0], t[-1], t[2000], rng.uniform(0, t[-1], moments - 3)])
+    whole, near = TrackSplines(t, x).sample(asked), sampled(t, x, asked)
+    np.testing.assert_array_equal(np.isnan(near), np.isnan(whole))
+    assert np.isnan(whole).any() and np.nanmax(np.abs(near - whole)) < (0.2 * noise if moments == 6 else 1e-12)

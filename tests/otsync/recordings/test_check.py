@@ -164,6 +164,16 @@ def test_one_camera_that_looks_elsewhere_is_a_warning(sound):
     assert any(f.severity == "warning" and f.video == "c2" and "others look" in f.what for f in found), text(found)
 
 
+def test_what_calibrate_said_of_a_camera_is_said_again(sound):
+    folder, document = sound
+    told = {"lens": "given", "doubtful": "two pictures only.", "remedy": "Walk past it."}
+    calibration = {"method": "global", "unit": "metres", "cameras": {"c1": told, "c2": {"lens": "given"}}}
+    (folder / "scene.json").write_text(json.dumps({**document, "calibration": calibration}))
+    (found,) = check_scene(folder)
+    assert (found.severity, found.video) == ("warning", "c1")
+    assert found.what == "its camera is doubtful: two pictures only." and found.remedy == "Walk past it."
+
+
 @pytest.mark.parametrize("turned", [0.0, 0.2, 5.0])
 def test_cameras_that_look_in_parallel_are_a_warning_that_says_so(sound, turned):
     """Side by side they are sound; where their axes meet says nothing. Turned outwards they do look away."""

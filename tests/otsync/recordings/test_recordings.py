@@ -78,6 +78,19 @@ def test_a_warm_run_repeats_the_answer_without_work(synced, recording, tmp_path)
     assert before == {p.name: p.stat().st_mtime_ns for p in (synced / "stages").iterdir()}
 
 
+def test_videos_without_a_camera_are_named_beside_the_answer(synced, recording, tmp_path, capsys):
+    shutil.copytree(recording, tmp_path / "r")
+    document = json.loads((recording / "scene.json").read_text())
+    lost = {"phone9": {"lens": "guessed", "doubtful": "nothing in common with the others."}}
+    document["calibration"] = {"method": "global", "unit": "metres", "cameras": lost}
+    (tmp_path / "r" / "scene.json").write_text(json.dumps(document))
+    command = ["sync", str(tmp_path / "r"), "--out", str(tmp_path / "o"), "--recording.cache", str(synced / "stages")]
+    main(command)
+    assert "phone9 is left out, it has no camera: nothing in common with the others." in capsys.readouterr().out
+    main([*command, "--json"])
+    assert json.loads(capsys.readouterr().out)["left_out"] == {"phone9": "nothing in common with the others."}
+
+
 def test_lost_and_broken_stages_are_made_again(synced, recording, tmp_path):
     out = tmp_path / "again"
     shutil.copytree(synced / "stages", out / "stages")
