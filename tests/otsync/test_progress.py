@@ -52,6 +52,7 @@ def test_lines_go_to_standard_output_between_bars(attach, capsys):
     assert capsys.readouterr().out == "line 0\nline 1\n"
 
 
+@pytest.mark.slow
 def test_simulations_and_benchmarks_are_counted(attach, tmp_path):
     terminal = attach(Terminal())
     assert main(["simulate", str(tmp_path), "--videos", "2", "--frames", "20"]) == 0

@@ -99,6 +99,7 @@ def test_every_matcher_of_the_slot_has_a_row(add):
         match.run(None, only=("nobody",))
 
 
+@pytest.mark.slow
 def test_a_matcher_from_a_file_is_measured_and_not_judged(tmp_path, monkeypatch):
     """Its process learns of the file too. A baseline neither gets nor misses it."""
     (tmp_path / "in_order.py").write_text(PLUGIN)
@@ -133,6 +134,7 @@ def test_every_aligner_and_refiner_of_the_slots_has_a_row(add):
     assert added["mine"][0] == Constant() and added["likelihood scan + unchanged"][1] is unchanged
 
 
+@pytest.mark.slow
 def test_methods_of_others_are_measured_and_not_judged(add, monkeypatch):
     add("aligners", Constant, "mine")
     case = replace(pair_case("boxes", "clean", 0, 5000), offset=0.0)

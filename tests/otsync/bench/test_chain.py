@@ -13,6 +13,7 @@ from otsync.bench import chain, own_frames
 from otsync.bench.chain_worlds import SITUATIONS, world
 
 
+@pytest.mark.slow
 def test_rows_on_two_situations(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(chain, "SITUATIONS", {name: SITUATIONS[name] for name in ("mid", "no depth")})
     monkeypatch.setattr("os.sched_getaffinity", lambda _: {0})  # every worker compiles tslearn's loops anew

@@ -60,6 +60,7 @@ def test_tables_of_made_up_answers():
     assert low == 0 and high == pytest.approx(0.0122, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_a_small_run_writes_tables_and_a_diagram(tmp_path):
     assert run(tmp_path, seeds=1, first_seed=50, only=("mid", "two scenes")) == 0
     rows = json.loads((tmp_path / "trust.json").read_text())["rows"]

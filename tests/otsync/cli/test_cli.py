@@ -150,6 +150,7 @@ def test_reference_is_chosen_by_name(world, tmp_path):
     assert found.reference == 1 and found.seconds[1] == 0
 
 
+@pytest.mark.slow
 def test_workers_change_nothing(world, tmp_path):
     files = [str(p) for p in sorted(world.glob("*.npz"))]
     for n in ("1", "2"):

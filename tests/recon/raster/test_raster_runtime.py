@@ -252,6 +252,7 @@ def test_every_pixel_a_splat_touches_is_in_a_tile_that_lists_it(seed):
     assert len(listed) < 1.35 * len(touched)  # the lists are tight: few tiles are tested in vain
 
 
+@pytest.mark.slow
 def test_the_benchmark_writes_its_files_and_its_gate_closes(tmp_path, monkeypatch, capsys):
     baseline = tmp_path / "baseline.json"
     monkeypatch.setattr(record, "baseline_path", lambda name: baseline)
