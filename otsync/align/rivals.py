@@ -92,7 +92,7 @@ def rival(a: TrackSet, b: TrackSet, matches: Matches, offset: float) -> Rival:
     assert a.features is not None and b.features is not None
     fa, fb = unit_features(a.features, center=True), unit_features(b.features, center=True)
     likely = np.argsort(cosine_distance(fa[some], fb), 1, kind="stable")[:, :PARTNERS]
-    xa, xb = a.positions()[some], b.positions()
+    xa, xb = a.positions(some), b.positions()
     here = _distance(xa, xb, a.times, b.times, likely, offset)
     steps = np.arange(math.ceil(NEAR / STEP), round(REACH / STEP) + 1)
     others = offset + STEP * np.concatenate([-steps, steps])
@@ -104,7 +104,7 @@ def rival(a: TrackSet, b: TrackSet, matches: Matches, offset: float) -> Rival:
     least = float(np.nanmin(ratio))
     if least >= NEARLY:
         return Rival(least, False)
-    every = a.positions()[_moving(a, np.unique(matches.pairs[:, 0]), RESTING)]
+    every = a.positions(_moving(a, np.unique(matches.pairs[:, 0]), RESTING))
     left, left_of_all = (Left.at(x, xb, a.times, b.times, offset) for x in (xa, every))
 
     def suits(at: float, ratio: float) -> bool:
@@ -134,7 +134,7 @@ def _moving(a: TrackSet, index: Int[np.ndarray, " M"], resting: float) -> Int[np
     """Of the tracks of ``index``, up to :data:`TRACKS` of those that move more than a share ``resting`` of them."""
     with np.errstate(invalid="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # of tracks that are never seen
-        moved = np.nan_to_num(np.nanstd(a.positions()[index], 1).sum(1))
+        moved = np.nan_to_num(np.nanstd(a.positions(index), 1).sum(1))
     index = index[moved >= np.quantile(moved, resting)]
     return index[evenly(len(index), TRACKS)]
 

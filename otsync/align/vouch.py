@@ -85,8 +85,7 @@ def vouch(alignment: Alignment, a: TrackSet, b: TrackSet, matches: Matches, alig
 
 def drifts(tracks: TrackSet, index: Int[np.ndarray, " M"]) -> bool:
     """Whether the tracks move as one rigid body, all of them, and by little: evidence of a drift, not of a time."""
-    taken = tracks.positions()[np.unique(index)]
-    body = as_one_body(taken[:, evenly(taken.shape[1], LOOKS)])
+    body = as_one_body(tracks.positions(np.unique(index), evenly(tracks.n_frames, LOOKS)))
     return body is not None and body.share > AS_ONE and body.size < LITTLE
 
 
@@ -102,7 +101,7 @@ def only_drift(a: TrackSet, b: TrackSet, matches: Matches, offset: float) -> boo
     left, seen = [], []
     for tracks, column, t in ((a, 0, times), (b, 1, times - offset)):
         ends = [np.abs(tracks.times[:, None] - (t + s * STEP)[None]).argmin(0) for s in (-1, 1)]
-        body = as_one_body(tracks.positions()[matches.pairs[:, column]][:, np.concatenate(ends)])
+        body = as_one_body(tracks.positions(matches.pairs[:, column], np.concatenate(ends)))
         if body is None or body.size > RATHER_LITTLE:
             return False
         n = len(t)

@@ -6,6 +6,9 @@ Ctrl-C or SIGTERM.
 
 from __future__ import annotations
 
+import os
+import sys
+
 from ..types import Refused
 from .commands import commands
 from .shell import run_command
@@ -13,6 +16,10 @@ from .shell import run_command
 
 def main(args: list[str] | None = None) -> int:
     """Entry point of the ``otsync`` command."""
+    if args is None and not any("device" in word for word in sys.argv):
+        # POT imports every tensor library that is installed: torch costs two seconds and a quarter of a gigabyte
+        for library in ("PYTORCH", "JAX", "CUPY", "TENSORFLOW"):
+            os.environ.setdefault(f"POT_BACKEND_DISABLE_{library}", "1")
     return run_command(
         "otsync",
         commands,

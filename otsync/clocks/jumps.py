@@ -37,6 +37,9 @@ ROUNDING = 1e-6
 ENOUGH_STEPS = 2**20
 """Of all tracks together: how many the usual difference of steps is taken from."""
 
+AT_ONCE = 2**18
+"""Samples that are looked at together."""
+
 
 @dataclass(frozen=True, eq=False)
 class Jumps:
@@ -80,7 +83,7 @@ def find_jumps(x: Float[np.ndarray, "M T 3"]) -> Jumps:
     """
     usual, found = _usual(x), [Jumps(*(np.zeros(0, np.int64),) * 3, np.zeros((0, 3)))]
     if x.shape[1] > 1:
-        found += [_jumps(x[some], some.start, usual) for some in blocks(*x.shape[:2])]
+        found += [_jumps(x[some], some.start, usual) for some in blocks(x.shape[0], x.shape[1], AT_ONCE)]
     parts = zip(*((j.track, j.before, j.after, j.by) for j in found), strict=True)
     return Jumps(*(np.concatenate(part) for part in parts))
 

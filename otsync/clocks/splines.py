@@ -136,6 +136,18 @@ class TrackSplines:
         flat = self._design(self._inside(t), DEGREE - 1) @ slopes
         return flat.reshape(len(t), -1, 3).transpose(1, 0, 2)
 
+    def joined_and_velocity(
+        self, t: Float[np.ndarray, " S"]
+    ) -> tuple[Float[np.ndarray, "M S 3"], Float[np.ndarray, "M S 3"]]:
+        """:meth:`joined` and :meth:`velocity` at few moments of a long clip, whose other coefficients are not read."""
+        first, value, slope = self.basis(t)
+        x, v = np.repeat(self.mean[:, None], len(t), 1), np.zeros((len(self.mean), len(t), 3))
+        for k in range(DEGREE + 1):
+            c = self.by_track[:, first + k]
+            x += value[:, k, None] * c
+            v += slope[:, k, None] * c
+        return x, v
+
     @property
     def by_track(self) -> Float[np.ndarray, "M n 3"]:
         """Coefficients around each track's mean, one block a track: what compiled loops read."""
@@ -194,17 +206,24 @@ class TrackSplines:
 
 
 def sampled(
-    times: Float[np.ndarray, " T"], xyz: Float[np.ndarray, "M T 3"], t: Float[np.ndarray, " S"]
+    times: Float[np.ndarray, " T"],
+    xyz: Float[np.ndarray, "M T 3"],
+    seen: Bool[np.ndarray, "M T"],
+    t: Float[np.ndarray, " S"],
 ) -> Float[np.ndarray, "M S 3"]:
-    """What ``TrackSplines(times, xyz).sample(t)`` has; for few moments of a long clip from the frames near each alone,
-    which needs no curve of an hour. Its knots lie elsewhere: it differs by a tenth of the tracks' noise at most.
+    """What ``TrackSplines(times, xyz).sample(t)`` has, ``xyz`` counting where ``seen``; for few moments of a long clip
+    from the frames near each alone, which needs no curve of an hour, and no copy of it. Its knots lie elsewhere: it
+    differs by a tenth of the tracks' noise at most.
     """
+
+    def curves(part: slice) -> TrackSplines:
+        return TrackSplines(times[part], np.where(seen[:, part, None], xyz[:, part], np.nan).astype(float, copy=False))
+
     if len(times) <= 4 * NEAR * len(t):
-        return TrackSplines(times, xyz).sample(t)
+        return curves(slice(None)).sample(t)
     out = np.full((len(xyz), len(t), 3), np.nan)
     for n, k in enumerate(np.searchsorted(times, t)):
-        near = slice(max(0, k - NEAR), k + NEAR)
-        out[:, n] = TrackSplines(times[near], xyz[:, near]).sample(t[n : n + 1])[:, 0]
+        out[:, n] = curves(slice(max(0, k - NEAR), k + NEAR)).sample(t[n : n + 1])[:, 0]
     return out
 
 

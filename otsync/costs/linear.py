@@ -14,12 +14,15 @@ from ..types import TrackSet
 TRACK_BLOCK = 128
 
 
-def binary_scale(x: np.ndarray) -> float:
-    """The power of two next to the largest finite magnitude of ``x`` (1 when there is none).
+def binary_scale(x: np.ndarray, where: np.ndarray | None = None) -> float:
+    """The power of two next to the largest finite magnitude of ``x``, of those ``where`` (1 when there is none).
 
     Dividing by it is exact, so results do not depend on the unit of length beyond rounding of the input itself.
     """
-    top = float(np.max(np.abs(x), initial=0.0, where=np.isfinite(x)))
+    known = np.isfinite(x)
+    if where is not None:
+        known &= where
+    top = float(max(np.max(x, initial=0.0, where=known), -np.min(x, initial=0.0, where=known)))
     return float(2.0 ** np.clip(np.frexp(top)[1], -1000, 1000)) if top > 0 else 1.0
 
 
@@ -73,31 +76,39 @@ def track_distance(
                 f"{name}: expected (N,{xyz.shape[1]},3) positions with visibility (N,{xyz.shape[1]}); found {x.shape} "
                 f"and {seen.shape}."
             )
-        if not np.isfinite(x[seen]).all():
+        if (seen & ~np.isfinite(x).all(2)).any():
             raise ValueError(f"{name}: expected finite positions in visible samples; found nan or infinity.")
     dtype = np.dtype(np.float32 if xyz.dtype == other.dtype == np.float32 else np.float64)
     gaps = not (visible.all() and other_visible.all())
-    scale = dtype.type(max(binary_scale(xyz[visible]), binary_scale(other[other_visible])))
+    scale = dtype.type(max(binary_scale(x, seen[..., None]) for x, seen in ((xyz, visible), (other, other_visible))))
 
     def columns(x: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        x = np.divide(np.where(seen[..., None], x, 0), scale, dtype=dtype)
-        return np.ascontiguousarray(x.transpose(2, 1, 0)), np.ascontiguousarray(seen.T).astype(dtype)
+        at = np.empty((3, *x.shape[1::-1]), dtype)
+        for d in range(3):
+            np.divide(np.where(seen, x[..., d], 0).T, scale, out=at[d], dtype=dtype)
+        return at, np.ascontiguousarray(seen.T).astype(dtype)
 
-    a, wa = columns(xyz, visible)
-    b, wb = (a, wa) if same else columns(other, other_visible)
-    out = np.empty((len(xyz), len(other)), dtype)
-    blocks = [
+    out = np.full((len(xyz), len(other)), np.nan, dtype)
+    tiles = [
         (i, min(i + TRACK_BLOCK, out.shape[0]), j, min(j + TRACK_BLOCK, out.shape[1]))
         for i in range(0, out.shape[0], TRACK_BLOCK)
         for j in range(i if same else 0, out.shape[1], TRACK_BLOCK)
     ]
 
-    def work(i0: int, i1: int, j0: int, j1: int) -> None:
-        max_distance_block(a, b, wa, wb, gaps, i0, i1, j0, j1, out)
-        if same and j0 > i0:
-            out[j0:j1, i0:i1] = out[i0:i1, j0:j1].T
+    def work(i0: int, i1: int, j0: int, j1: int, *columns_and_out: np.ndarray) -> None:
+        *arrays, into = columns_and_out
+        max_distance_block(*arrays, gaps, i0, i1, j0, j1, into)
 
-    for_each(work, blocks)
+    # a long clip in pieces: columns are copies
+    for part in blocks(xyz.shape[1], max(len(xyz), len(other))):
+        a, wa = columns(xyz[:, part], visible[:, part])
+        b, wb = (a, wa) if same else columns(other[:, part], other_visible[:, part])
+        largest = np.empty_like(out)
+        for_each(work, tiles, a, b, wa, wb, largest)
+        np.fmax(out, largest, out=out)
+    if same:
+        for i0, i1, j0, j1 in tiles:
+            out[j0:j1, i0:i1] = out[i0:i1, j0:j1].T
     return out * scale
 
 

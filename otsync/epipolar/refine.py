@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -12,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from ..clocks.common import in_space, nominal_fps, on_clock
 from ..clocks.splines import TrackSplines
 from ..geometry import fundamentals, seen_pixels
+from ..refine.common_error import FITTED, Sums
 from ..refine.gauss_newton import CLUSTER, GROUPS, jackknife, neighbours
 from ..refine.slot import JUDGED_BY, Refiner
 from ..types import Alignment, Matches, Status, TrackSet, in_order
@@ -95,12 +97,13 @@ class EpipolarRefine(Refiner):
         if problem is None:
             flags = in_order((*alignment.flags, Status.NO_OVERLAP))
             return replace(alignment, flags=flags)
-        offset, sigma = problem.solve(alignment.offset, self.windows[0], self.iterations, self.reach)
+        offset, found = problem.solve(alignment.offset, self.windows[0], self.iterations, self.reach)
+        common = problem.common_error(found, self.windows[0])
         others = [
             problem.solve(offset, w, SPREAD_ITERATIONS, self.reach)[0] for w in self.windows[1:] if np.isfinite(offset)
         ]
         spread = max((abs(o - offset) for o in others if np.isfinite(o)), default=0.0)
-        sigma = float(np.hypot(sigma, spread))
+        sigma = float(np.hypot(max(problem.scatter(found), common), spread))
         raised = list(alignment.flags)
         if not np.isfinite(offset) or abs(offset - alignment.offset) > self.reach:
             offset, sigma = alignment.offset, UNKNOWN_SIGMA / fps
@@ -108,6 +111,7 @@ class EpipolarRefine(Refiner):
         stats = alignment.stats | {
             "moved": abs(offset - alignment.offset),
             "spread": spread,
+            "common_error": common,
             "fitted_matches": float(len(problem.weight)),
         }
         ordered = in_order(raised)
@@ -118,6 +122,15 @@ class EpipolarRefine(Refiner):
             flags=ordered,
             stats=stats,
         )
+
+
+@dataclass(frozen=True, eq=False)
+class _Step:
+    """Residuals in pixels, their slopes in pixels a second of offset, both detrended, and the weights of samples."""
+
+    residual: Float[np.ndarray, "M T"]
+    slope: Float[np.ndarray, "M T"]
+    weight: Float[np.ndarray, "M T"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,10 +177,10 @@ class _Problem:
         norm = np.sqrt(la[..., 0] ** 2 + la[..., 1] ** 2 + lb[..., 0] ** 2 + lb[..., 1] ** 2)
         return (hb * la).sum(2) / np.maximum(norm, 1e-300)
 
-    def solve(self, offset: float, window: float, iterations: int, reach: float) -> tuple[float, float]:
-        """Offset and one sigma, s; nan when nothing overlaps."""
+    def solve(self, offset: float, window: float, iterations: int, reach: float) -> tuple[float, _Step]:
+        """Offset, s, and what its last step saw; nan when nothing overlaps."""
         start, step, half = offset, 0.5 / self.fps, max(LEAST_HALF, round(window * self.fps))
-        sigma = float("nan")
+        found = nothing = _Step(*np.zeros((3, *self.xa.shape[:2])))
         for _ in range(iterations):
             e = self.residual(offset)
             J = (self.residual(offset + step) - self.residual(offset - step)) / (2 * step)
@@ -176,27 +189,33 @@ class _Problem:
             enough = known.sum(1) >= MIN_SEEN * self.fps
             known &= enough[:, None]
             if not known.any():
-                return float("nan"), float("nan")
+                return float("nan"), nothing
             scale = MAD * float(np.median(np.abs(R[known]))) + TINY
             rms = np.sqrt((R**2 * known).sum(1) / np.maximum(known.sum(1), 1))
             level = BY_CANDIDATE * float(np.median(rms[enough])) + TINY
             w = known / (1 + (R / (BY_RESIDUAL * scale)) ** 2) * (self.weight / (1 + (rms / level) ** 2) ** 2)[:, None]
             curvature = float((w * J * J).sum())
             if curvature <= 0:
-                return float("nan"), float("nan")
-            pull = w * J * R
-            move = -float(pull.sum()) / curvature
-            sigma = self._scatter(w * J * J, pull)
+                return float("nan"), nothing
+            move = -float((w * J * R).sum()) / curvature
+            found = _Step(R, J, w)
             offset += float(np.clip(move, -step, step))
             if abs(move) < CONVERGED / self.fps or abs(offset - start) > reach:
                 break
-        return offset, sigma
+        return offset, found
 
-    def _scatter(self, information: Float[np.ndarray, "M T"], pull: Float[np.ndarray, "M T"]) -> float:
+    def common_error(self, found: _Step, window: float) -> float:
+        """One sigma, s, of errors that tracks have in common: see :func:`otsync.refine.common_error.common_error`."""
+        R, J = found.residual[..., None], found.slope[..., None]
+        sums = Sums.of(R, J, found.weight, self.group, 2 * round(window * self.fps))
+        return FITTED * math.sqrt(sums.variance())
+
+    def scatter(self, found: _Step) -> float:
         """One sigma, s: by neighbourhoods of tracks or by blocks of time, whichever is larger."""
-        part = np.zeros((2, GROUPS)), np.zeros((2, -(-pull.shape[1] // self.block)))
-        block = np.arange(pull.shape[1]) // self.block
-        for k, x in enumerate((information, pull)):
+        J = found.slope
+        part = np.zeros((2, GROUPS)), np.zeros((2, -(-J.shape[1] // self.block)))
+        block = np.arange(J.shape[1]) // self.block
+        for k, x in enumerate((found.weight * J * J, found.weight * J * found.residual)):
             np.add.at(part[0][k], self.group, x.sum(1))
             np.add.at(part[1][k], block, x.sum(0))
         return max(float(np.sqrt(jackknife(H[:, None, None], g[:, None])[0, 0])) for H, g in part)

@@ -94,10 +94,11 @@ class SynchronousMatching(Matcher):
         if last <= first:
             return place, motion
         t = np.linspace(first, last, MOMENTS)
-        xa, xb = a.positions(), b.positions()
-        scale = max(binary_scale(xa), binary_scale(xb))
-        at_a = sampled(a.times, xa / scale, t)
-        at_b = sampled(b.times, xb / scale, (t - self.offset) / self.rate)
+        assert a.xyz is not None and b.xyz is not None
+        at_a = sampled(a.times, a.xyz, a.seen, t)
+        at_b = sampled(b.times, b.xyz, b.seen, (t - self.offset) / self.rate)
+        scale = max(binary_scale(at_a), binary_scale(at_b))  # a power of two: what is divided by it stays exact
+        at_a, at_b = at_a / scale, at_b / scale
         extent = 0.5 * (rms_extent(at_a) + rms_extent(at_b))
         if not extent > 0:
             return place, motion

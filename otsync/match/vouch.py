@@ -269,8 +269,7 @@ def moves_mirrored(
     inside = (clock.own(t) >= b.times[0]) & (clock.own(t) <= b.times[-1])
     if inside.sum() <= STEP:
         return False
-    x, y = (tracks.positions()[k] for tracks, k in ((a, i), (b, j)))
-    x, y = x[:, inside], y[:, at[inside]]
+    x, y = a.positions(i, inside), b.positions(j, at[inside])
     scale = max(binary_scale(x), binary_scale(y))
     u, v = (np.diff(z[:, ::STEP] / scale, axis=1).reshape(-1, 3) for z in (x, y))
     known = np.isfinite(u[:, 0]) & np.isfinite(v[:, 0])

@@ -7,12 +7,14 @@ sign of the offset and changes nothing else.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.special import stdtrit
 
 from ..clocks.splines import TrackSplines
+from ..compute.indices import blocks
 from ..types import Clock
 
 ROBUST = 2.0
@@ -219,29 +221,88 @@ def _linearise(
     sides: tuple[Side, Side], clock: Clock, centre: float, fit_rate: bool, prior: np.ndarray | None = None
 ) -> System | None:
     """Residuals, robust weights and normal equations at ``clock``."""
-    from . import kernels
+    P, M = 2 if fit_rate else 1, len(sides[0].at)
+    reads = [Read.of(side, clock, centre) for side in sides]
+    # of long clips few matches at a time: once for the size of residuals, which weights depend on, once for the sums
+    parts = list(blocks(M, 2 * max(len(side.own.times) for side in sides)))
+    kept: list[Any] = []
+    size: list[list[np.ndarray]] = [[] for _ in sides]
+    used: list[list[np.ndarray]] = [[] for _ in sides]
+    for part in parts:
+        found = [read.residuals(part, P) for read in reads]
+        for n, (rr, _, _, ok) in enumerate(found):
+            size[n].append(np.sqrt(rr))
+            used[n].append(ok)
+        kept = [found] if len(parts) == 1 else []
+    sizes, known = [np.concatenate(x) for x in size], [np.concatenate(x) for x in used]
+    seen = np.sum([ok.sum(1) for ok in known], axis=0)
+    if not seen.any():
+        return None
+    noise = 1.4826 / 1.5 * float(np.median(np.concatenate([s[ok] for s, ok in zip(sizes, known, strict=True)])))
+    squares = np.sum([np.einsum("mt,mt->m", s, s) for s in sizes], axis=0)
+    rms = np.sqrt(squares / np.maximum(seen, 1))
+    typical = float(np.median(rms[seen > 0]))
+    weight = np.where(seen > 0, 1 / (1 + (rms / max(OUTLYING * typical, 1e-300)) ** 2) ** 2, 0.0)
+    if prior is not None:
+        weight *= prior
+    start = max(sides[0].own.times[0], float(clock.world(sides[1].own.times[0])))
+    block = [read.blocks_from(start, clock) for read in reads]
+    count = max(int(b.max(initial=0)) for b in block) + 1
+    H_match, g_match = np.zeros((M, P, P)), np.zeros((M, P))
+    H_time, g_time = np.zeros((count, P, P)), np.zeros((count, P))
+    speed = 0.0
+    for part in parts:
+        found = kept[0] if kept else [read.residuals(part, P) for read in reads]
+        for n, (_, g, h, _) in enumerate(found):
+            at_most = max(ROBUST * noise, 1e-300)
+            w = np.where(known[n][part], weight[part, None] / (1 + (sizes[n][part] / at_most) ** 2), 0.0)
+            H_match[part] += np.einsum("pqmt,mt->mpq", h, w)
+            g_match[part] += np.einsum("pmt,mt->mp", g, w)
+            np.add.at(H_time, block[n], np.einsum("pqmt,mt->tpq", h, w))
+            np.add.at(g_time, block[n], np.einsum("pmt,mt->tp", g, w))
+            speed += float(weight[part] @ h[0, 0].sum(1))
+    H_group, g_group = np.zeros((GROUPS, P, P)), np.zeros((GROUPS, P))
+    group = neighbours(sides[0].own.mean + sides[1].own.mean, GROUPS)
+    np.add.at(H_group, group, H_match)
+    np.add.at(g_group, group, g_match)
+    blur = np.sqrt(float(weight @ squares) / speed) if speed > 0 else np.inf
+    return System(H_match.sum(0), g_match.sum(0), (H_group, g_group), (H_time, g_time), weight, float(blur))
 
-    P = 2 if fit_rate else 1
-    M = len(sides[0].at)
-    parts = []
-    for side in sides:
-        T = len(side.own.times)
-        there, t_b = side.there(clock), side.time_b(clock)
-        ok = side.own.support(side.own.times) & side.other.support(there)
+
+@dataclass(frozen=True, eq=False)
+class Read:
+    """One side at a clock: where its frames fall on the other's curves."""
+
+    side: Side
+    there: Float[np.ndarray, " T"]
+    from_centre: Float[np.ndarray, " T"]
+    basis: tuple[np.ndarray, np.ndarray, np.ndarray]
+    ok: Bool[np.ndarray, "M T"]
+
+    @classmethod
+    def of(cls, side: Side, clock: Clock, centre: float) -> Read:
+        there = side.there(clock)
         first, value, slope = side.other.basis(there)
         # d(other curve's argument)/d offset: t_b = (t_a - offset) / rate from a's frames, t_a = rate t_b + offset from
         # b's
         sign = 1 / clock.rate if side.forward else -1.0
-        rr, g, h = np.empty((M, T)), np.empty((P, M, T)), np.empty((P, P, M, T))
+        ok = side.own.support(side.own.times) & side.other.support(there)
+        return cls(side, there, side.time_b(clock) - centre, (first, value, sign * slope), ok)
+
+    def residuals(self, part: slice, P: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """|R|² (m,T), J·R (P,m,T), J·J (P,P,m,T) of some matches, and where they count."""
+        from . import kernels
+
+        side = self.side
+        ok = np.ascontiguousarray(self.ok[part])
+        rr, g, h = (np.empty((*leading, *ok.shape)) for leading in ((), (P,), (P, P)))
         least = MIN_FRAMES / side.own.frame
         kernels.shift_residuals(
-            side.at,
-            side.other.by_track,
-            side.other.mean,
-            first,
-            value,
-            sign * slope,
-            t_b - centre,
+            side.at[part],
+            side.other.by_track[part],
+            side.other.mean[part],
+            *self.basis,
+            self.from_centre,
             ok,
             side.lo,
             side.hi,
@@ -250,42 +311,13 @@ def _linearise(
             g,
             h,
         )
-        used = ok & (ok.sum(1) >= least - 1e-6)[:, None]
-        parts.append((rr, g, h, used))
-    seen = sum(p[3].sum(1) for p in parts)
-    if not seen.any():
-        return None
-    size = [np.sqrt(rr) for rr, _, _, _ in parts]
-    noise = 1.4826 / 1.5 * float(np.median(np.concatenate([s[p[3]] for s, p in zip(size, parts, strict=True)])))
-    rms = np.sqrt(sum(p[0].sum(1) for p in parts) / np.maximum(seen, 1))
-    typical = float(np.median(rms[seen > 0]))
-    weight = np.where(seen > 0, 1 / (1 + (rms / max(OUTLYING * typical, 1e-300)) ** 2) ** 2, 0.0)
-    if prior is not None:
-        weight *= prior
-    start = max(sides[0].own.times[0], float(clock.world(sides[1].own.times[0])))
-    H_match, g_match = np.zeros((M, P, P)), np.zeros((M, P))
-    blocks = []
-    for side, (_, g, h, used), s in zip(sides, parts, size, strict=True):
-        w = np.where(used, weight[:, None] / (1 + (s / max(ROBUST * noise, 1e-300)) ** 2), 0.0)
-        H_match += np.einsum("pqmt,mt->mpq", h, w)
-        g_match += np.einsum("pmt,mt->mp", g, w)
-        t_a = side.own.times if side.forward else clock.world(side.own.times)
-        block = np.maximum(np.floor((t_a - start) / CLUSTER + 1e-9), 0).astype(np.int64)
-        blocks.append((block, np.einsum("pqmt,mt->tpq", h, w), np.einsum("pmt,mt->tp", g, w)))
-    count = max(int(b.max(initial=0)) for b, _, _ in blocks) + 1
-    H_time, g_time = np.zeros((count, P, P)), np.zeros((count, P))
-    for block, by_frame_H, by_frame_g in blocks:
-        np.add.at(H_time, block, by_frame_H)
-        np.add.at(g_time, block, by_frame_g)
-    H_group, g_group = np.zeros((GROUPS, P, P)), np.zeros((GROUPS, P))
-    group = neighbours(sides[0].own.mean + sides[1].own.mean, GROUPS)
-    np.add.at(H_group, group, H_match)
-    np.add.at(g_group, group, g_match)
-    noise_power, speed = (
-        sum(float(weight @ x.sum(1)) for x in xs) for xs in ((p[0] for p in parts), (p[2][0, 0] for p in parts))
-    )
-    blur = np.sqrt(noise_power / speed) if speed > 0 else np.inf
-    return System(H_match.sum(0), g_match.sum(0), (H_group, g_group), (H_time, g_time), weight, float(blur))
+        return rr, g, h, ok & (ok.sum(1) >= least - 1e-6)[:, None]
+
+    def blocks_from(self, start: float, clock: Clock) -> Int[np.ndarray, " T"]:
+        """Which block of time every frame lies in."""
+        own = self.side.own.times
+        t_a = own if self.side.forward else clock.world(own)
+        return np.maximum(np.floor((t_a - start) / CLUSTER + 1e-9), 0).astype(np.int64)
 
 
 def neighbours(x: Float[np.ndarray, "M 3"], groups: int) -> Int[np.ndarray, " M"]:

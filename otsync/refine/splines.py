@@ -17,7 +17,8 @@ from ..costs.linear import binary_scale
 from ..types import Alignment, Clock, Matches, Status, TrackSet, in_order
 from ..types.checks import positive
 from ..types.trust import Trust
-from .gauss_newton import Fit, fit_clock, overlap_seconds, velocity_correlation
+from .common_error import common_error
+from .gauss_newton import GROUPS, Fit, fit_clock, neighbours, overlap_seconds, velocity_correlation
 from .slot import JUDGED_BY, Rate, Refiner
 
 LEAST_SIGMA = 0.012 / 30
@@ -104,6 +105,9 @@ class SplineRefine(Refiner):
         spread = max((self._apart(o, fit, curves) for o in others), default=0.0)
         fps = min(nominal_fps(a), nominal_fps(b))
         shared = spread**2 / 2 + (fit.blur**2 / COMMON_ERRORS) ** 2 + LEAST_SIGMA**2
+        together = neighbours(curves[0].mean + curves[1].mean, GROUPS)
+        common = common_error(*curves, fit.clock, fit.weights, together, self.windows[0])
+        shared += max(0.0, common**2 - float(fit.covariance[0, 0]))
         unsettled = unsettled_rate(rate_stats, fit.clock.rate)
         ends = self._ends(curves, fit, free, shared, unsettled, rate_stats.get("rate_sigma"))
         stats = (
@@ -116,6 +120,7 @@ class SplineRefine(Refiner):
                 "spread": spread,
                 "blur": fit.blur,
                 "wander": fit.wander,
+                "common_error": common,
                 "correlation": velocity_correlation(*curves, fit, VELOCITY),
                 "overlap": overlap_seconds(*curves, fit.clock),
                 "iterations": float(fit.iterations),

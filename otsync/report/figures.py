@@ -97,22 +97,34 @@ def score_figure(pair: Alignment, path: np.ndarray | None, origin: float, truth:
     return svg(figure, "score over offsets")
 
 
-def cost_figure(pair: Alignment, cost: np.ndarray, path: np.ndarray | None, origin: float, truth: float | None) -> str:
-    """The frame-to-frame cost with the chosen offset, and the warping path where the pair has one."""
+def frames_a_pixel(frames: int) -> int:
+    """Every how many of so many frames a map of costs shows."""
+    return max(1, -(-frames // MAP_PIXELS))
+
+
+def cost_figure(
+    pair: Alignment, cost: np.ndarray, every: int, path: np.ndarray | None, origin: float, truth: float | None
+) -> str:
+    """The frame-to-frame cost with the chosen offset, and the warping path where the pair has one.
+
+    Args:
+        cost: of every ``every``-th frame of a (rows) and of b.
+    """
     figure, ax = framed()
-    step = max(1, -(-max(cost.shape) // MAP_PIXELS))
-    extent = (-0.5, cost.shape[1] - 0.5, cost.shape[0] - 0.5, -0.5)
+    step = frames_a_pixel(max(cost.shape))
+    high, wide = (every * n - 0.5 for n in cost.shape)
+    extent = (-0.5, wide, high, -0.5)
     known = cost[np.isfinite(cost)]
     top = float(np.quantile(known, 0.95)) if known.size else 1.0
     ax.imshow(cost[::step, ::step], extent=extent, cmap="cividis", vmax=top, aspect="auto", interpolation="none")
     if path is not None:
         ax.plot(path[:, 1], path[:, 0], color="#3fb9f0", lw=1.2, label="DTW path")
-    j = np.array([0, cost.shape[1] - 1])
+    j = np.array([0, wide - 0.5])
     for offset, color, name in ((pair.offset, "#ff8c2b", "chosen"), (truth, "#e07be0", "true")):
         if offset is not None and np.isfinite(offset):
             i = j + (offset - origin) * pair.fps
             ax.plot(j, i, color=color, lw=1.4, ls="-" if name == "chosen" else ":", label=name)
-    ax.set(xlim=(-0.5, cost.shape[1] - 0.5), ylim=(cost.shape[0] - 0.5, -0.5), xlabel="frame of b", ylabel="frame of a")
+    ax.set(xlim=(-0.5, wide), ylim=(high, -0.5), xlabel="frame of b", ylabel="frame of a")
     if ax.get_legend_handles_labels()[0]:
         ax.legend(fontsize=6.5, loc="lower left", bbox_to_anchor=(0, 1), ncols=3, frameon=False, borderaxespad=0)
     return svg(figure, "cost of frames against each other")

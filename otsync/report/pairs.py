@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 
 import numpy as np
 
 from ..align.warping import geometric_cost
-from ..clocks.common import common_clock
+from ..clocks.common import common_clock, readable, strongest
 from ..types import Alignment, Matches, Offsets, TrackSet, Video
 from ..types.drawing import shared_moment
 from . import figures
@@ -88,11 +88,11 @@ def _detail(
     costs: bool,
 ) -> str:
     i, j = key
-    cost, path, origin = _cost_map(pair, key, offsets.matches, tracks if costs else None)
+    cost, every, path, origin = _cost_map(pair, key, offsets.matches, tracks if costs else None)
     true = None if truth is None else float(truth[j] - truth[i])
     drawn = [figures.score_figure(pair, path, origin, true)]
     if cost is not None:
-        drawn.append(figures.cost_figure(pair, cost, path, origin, true))
+        drawn.append(figures.cost_figure(pair, cost, every, path, origin, true))
     seen = None if tracks is None else both_seen(offsets, key, tracks)
     pictures = ""
     if seen is not None and tracks is not None:
@@ -119,7 +119,10 @@ class Seen:
     def places(self, tracks: Sequence[TrackSet]) -> tuple[np.ndarray, np.ndarray]:
         """(M,3) positions of the matched tracks then, in the first video and in the second."""
         (i, j), (k, m) = self.key, self.frames
-        return tracks[i].positions()[self.matches[:, 0], k], tracks[j].positions()[self.matches[:, 1], m]
+        first, second = (
+            tracks[v].positions(t, [at])[:, 0] for v, t, at in zip((i, j), self.matches.T, (k, m), strict=True)
+        )
+        return first, second
 
 
 def both_seen(offsets: Offsets, key: tuple[int, int], tracks: Sequence[TrackSet]) -> Seen | None:
@@ -165,19 +168,24 @@ def _on_frames(seen: Seen, tracks: Sequence[TrackSet], videos: Sequence[Video]) 
 
 def _cost_map(
     pair: Alignment, key: tuple[int, int], matches: Mapping[tuple[int, int], Matches], tracks: Sequence[TrackSet] | None
-) -> tuple[np.ndarray | None, np.ndarray | None, float]:
-    """The pair's own cost map and path, or D_geo made from tracks and matches; and the offset of lag 0.
+) -> tuple[np.ndarray | None, int, np.ndarray | None, float]:
+    """The pair's own cost map and path, or D_geo made from tracks and matches, of every how many frames; and the offset
+    of lag 0. D_geo is of the frames that are drawn: of an hour's all it would have 87 GB.
 
     No path is made where the pair has none: it did not tell the answer, and tslearn compiles for seconds.
     """
     if tracks is None or key not in matches or len(matches[key]) == 0:
-        return pair.cost, pair.path, 0.0
+        return pair.cost, 1, pair.path, 0.0
     if pair.transform is not None:  # positions are in two frames
-        return None, None, 0.0
+        return None, 1, None, 0.0
     i, j = key
     origin = float(tracks[i].times[0] - tracks[j].times[0])
     if pair.cost is not None:
-        return pair.cost, pair.path, origin
+        return pair.cost, 1, pair.path, origin
     if tracks[i].xyz is None or tracks[j].xyz is None:  # D_geo is of positions
-        return None, None, origin
-    return geometric_cost(common_clock(tracks[i], tracks[j], matches[key]), "position"), None, origin
+        return None, 1, None, origin
+    a, b = tracks[i], tracks[j]
+    both = common_clock(a, b, strongest(matches[key], readable(BEST, a, b)))
+    every = figures.frames_a_pixel(max(both.a.shape[1], both.b.shape[1]))
+    drawn = replace(both, a=both.a[:, ::every], b=both.b[:, ::every])
+    return geometric_cost(drawn, "position"), every, None, origin

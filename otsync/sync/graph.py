@@ -5,7 +5,7 @@ Offsets here are world seconds: an edge (a, b) measures ``x[b] - x[a]``.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -74,6 +74,7 @@ class Edge:
         a, b: videos. offset: world seconds, of b relative to a. sigma: seconds.
         trusted: whether the pair itself vouches for it.
         curve: (K,2) offset in seconds and score, or None.
+        common: seconds, the part of sigma that is known to be the two videos' own, as far as the pair tells.
     """
 
     a: int
@@ -82,6 +83,7 @@ class Edge:
     sigma: float
     trusted: bool
     curve: Float[np.ndarray, "K 2"] | None = None
+    common: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +120,7 @@ def solve(n: int, edges: Sequence[Edge], anchor: int, start: np.ndarray | None =
 
     Videos that no edge links to ``anchor`` stay at nan. ``shared``: of an edge's variance, the share that is its two
     videos' own, each half of it: what is wrong with a video's tracks is in all its edges alike, fits into every cycle,
-    and no number of edges averages it out.
+    and no number of edges averages it out. What an edge tells of that (``Edge.common``) counts where it is more.
     """
     near = components(n, edges) if edges else np.arange(n)
     inside = near == near[anchor]
@@ -142,19 +144,22 @@ def solve(n: int, edges: Sequence[Edge], anchor: int, start: np.ndarray | None =
     y, normal = _reweighted(A, d, s, first, _cauchy)
     x[free] = y
     alone = np.diag(np.linalg.inv(normal))  # as if no two edges had anything in common
-    own = _own_variance(n, used)
-    together = (1 - shared) * alone + shared * (own[free] + own[anchor])
+    # a flagged edge's sigma is an outlier; a common error is found with few degrees of freedom, of which none is lost
+    own = np.maximum(shared * _halves(n, used, "sigma", np.median), _halves(n, used, "common", np.mean))
+    together = (1 - shared) * alone + own[free] + own[anchor]
     sigma[free] = np.sqrt(np.maximum(alone, together))
     return Solution(x, sigma, np.array([x[e.b] - x[e.a] - e.offset for e in edges]))
 
 
-def _own_variance(n: int, edges: Sequence[Edge]) -> Float[np.ndarray, " V"]:
-    """Half of the median variance of every video's edges; 0 without one."""
+def _halves(
+    n: int, edges: Sequence[Edge], what: str, middle: Callable[[Sequence[float]], Any]
+) -> Float[np.ndarray, " V"]:
+    """Half of the ``middle`` variance of every video's edges; 0 without one."""
     around: list[list[float]] = [[] for _ in range(n)]
     for e in edges:
         for v in (e.a, e.b):
-            around[v].append(e.sigma**2 / 2)
-    return np.array([np.median(v) if v else 0.0 for v in around])
+            around[v].append(getattr(e, what) ** 2 / 2)
+    return np.array([middle(v) if v else 0.0 for v in around])
 
 
 def _l1(r: np.ndarray) -> np.ndarray:

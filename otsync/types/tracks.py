@@ -126,11 +126,12 @@ class TrackSet:
         assert self.visible is not None
         return self.visible
 
-    def positions(self) -> Float[np.ndarray, "N T 3"]:
-        """``xyz`` as float64 with nan where not visible; a copy."""
+    def positions(self, tracks: Any = slice(None), frames: Any = slice(None)) -> Float[np.ndarray, "n t 3"]:
+        """``xyz`` as float64 with nan where not visible, of some tracks and frames; a copy."""
         if self.xyz is None:
             raise ValueError("xyz: expected 3D positions; this track set holds pixels only. Lift it with depth first.")
-        return np.where(self.seen[..., None], self.xyz, np.nan).astype(float, copy=False)
+        seen, xyz = (x[:, frames][tracks] for x in (self.seen, self.xyz))
+        return np.where(seen[..., None], xyz, np.nan).astype(float, copy=False)
 
     def take(self, index: Any) -> TrackSet:
         """The tracks at ``index`` (integers, a slice or a mask), in that order."""

@@ -294,8 +294,8 @@ BREAKS = (
     Break(
         "match-synchronous-offset-sign",
         "otsync/match/synchronous.py",
-        "sampled(b.times, xb / scale, (t - self.offset) / self.rate)",
-        "sampled(b.times, xb / scale, (t + self.offset) / self.rate)",
+        "sampled(b.times, b.xyz, b.seen, (t - self.offset) / self.rate)",
+        "sampled(b.times, b.xyz, b.seen, (t + self.offset) / self.rate)",
         SYNC,
         "matching at known times reads b with the offset's wrong sign",
     ),
