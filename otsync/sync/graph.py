@@ -146,7 +146,8 @@ def solve(n: int, edges: Sequence[Edge], anchor: int, start: np.ndarray | None =
     alone = np.diag(np.linalg.inv(normal))  # as if no two edges had anything in common
     # a flagged edge's sigma is an outlier; a common error is found with few degrees of freedom, of which none is lost
     own = np.maximum(shared * _halves(n, used, "sigma", np.median), _halves(n, used, "common", np.mean))
-    together = (1 - shared) * alone + own[free] + own[anchor]
+    told = float(np.median([min(e.common / e.sigma, 1.0) ** 2 for e in used]))
+    together = (1 - max(shared, told)) * alone + own[free] + own[anchor]
     sigma[free] = np.sqrt(np.maximum(alone, together))
     return Solution(x, sigma, np.array([x[e.b] - x[e.a] - e.offset for e in edges]))
 

@@ -100,7 +100,9 @@ def reconstructed(
         )
     parts = [out / name for name in ("scene.npz", "offsets.json", "metrics.json", "report.html")]
     wrote = f"wrote {', '.join(map(str, parts))} and {out / SCENE_PAGE}, which plays the scene in a browser"
-    doubtful = [n for n, s in zip(outcome.coarse.names, outcome.coarse.status, strict=True) if not s.ok]
+    # a start that is only coarse is what a fit is for: its own answer is judged by its own sigma
+    ends = outcome.coarse.names, outcome.coarse.status, outcome.fitted.offsets.status
+    doubtful = [name for name, start, end in zip(*ends, strict=True) if not start.ok and not end.ok]
     if as_json:
         figures = metrics_of(outcome.views, outcome.fitted.stats, outcome.lpips_reason)
         told = {"out": str(out), "offsets": offset_rows(outcome), "doubtful": doubtful, "metrics": figures}

@@ -8,7 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from otsync import Cosine, TrackSet, track_distance
+from otsync.compute.indices import blocks
 from otsync.compute.threads import get_threads, set_threads
+from otsync.costs import linear
 from otsync.costs.linear import (
     binary_scale,
     cosine_distance,
@@ -150,3 +152,23 @@ def test_weights_are_checked(weight):
     a = TrackSet(np.zeros((2, 2, 3)), features=np.eye(2), fps=30)
     with pytest.raises(ValueError, match="expected weights >= 0"):
         total_cost((Cosine(weight=weight),), a, a)
+
+
+@pytest.mark.parametrize("share", [1.0, 0.02])
+def test_a_long_clip_is_looked_at_in_pieces(share, monkeypatch):
+    """Two tracks may meet in one piece only, or never."""
+    rng = np.random.default_rng(4)
+    x, y = rng.standard_normal((9, 120, 3)), rng.standard_normal((7, 120, 3))
+    seen, seen_y = rng.random((9, 120)) < share, rng.random((7, 120)) < share
+    x[~seen] = np.nan
+    found = [track_distance(x, seen), track_distance(x, seen, y, seen_y)]
+    monkeypatch.setattr(linear, "blocks", lambda rows, columns: blocks(rows, columns, 9 * 25))
+    for whole, pieces in zip(found, [track_distance(x, seen), track_distance(x, seen, y, seen_y)], strict=True):
+        np.testing.assert_array_equal(whole, pieces)
+
+
+def test_a_scale_is_of_what_counts():
+    x = np.array([3.0, -900.0, np.nan, np.inf])
+    assert binary_scale(x) == 1024
+    assert binary_scale(x, np.array([True, False, True, True])) == 4
+    assert binary_scale(np.full(3, np.nan)) == binary_scale(np.zeros((0, 3))) == 1

@@ -9,6 +9,8 @@ import pytest
 
 from otsync import Alignment, Matches, Refused, SplineRefine, Status, TrackSet, Unrefined, align, refine
 from otsync.clocks.splines import TrackSplines
+from otsync.compute.indices import blocks
+from otsync.refine import gauss_newton
 from otsync.refine.gauss_newton import Side, _linearise, fit_clock, neighbours, wider
 from otsync.refine.splines import COMMON_ERRORS, LEAST_SIGMA, unsettled_rate
 from otsync.simulate import simulate
@@ -323,3 +325,20 @@ def test_one_sigma_of_few_clusters_holds_68_percent():
     assert wider(np.ones(400)) == pytest.approx(1, abs=0.005)
     # one cluster that holds nearly everything: as little is known as of two
     assert wider(np.array([1.0, 1e-3, 1e-3])) == pytest.approx(wider(np.ones(2)))
+
+
+@pytest.mark.parametrize("fit_rate", [False, True])
+def test_a_fit_of_few_matches_at_a_time_is_the_same(fit_rate, monkeypatch):
+    rng = np.random.default_rng(5)
+    t = np.arange(200) / 30
+    x = np.cumsum(0.02 * rng.standard_normal((12, 200, 3)), 1)
+    x[:4, 60:90] = np.nan
+    a, b = (TrackSplines(t - shift, x + 0.01 * rng.standard_normal(x.shape)) for shift in (0, 0.11))
+    whole = fit_clock(a, b, Clock(0.1, 1.0), 14 / 30, fit_rate=fit_rate)
+    monkeypatch.setattr(gauss_newton, "blocks", lambda rows, columns: blocks(rows, columns, 5 * columns))
+    parts = fit_clock(a, b, Clock(0.1, 1.0), 14 / 30, fit_rate=fit_rate)
+    assert whole.clock.offset == pytest.approx(0.11, abs=0.01)
+    np.testing.assert_allclose(parts.clock.offset, whole.clock.offset, atol=1e-12)
+    np.testing.assert_allclose(parts.covariance, whole.covariance, rtol=1e-8)
+    np.testing.assert_allclose(parts.weights, whole.weights, rtol=1e-9)
+    assert (parts.blur, parts.wander) == pytest.approx((whole.blur, whole.wander), rel=1e-9)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
+import tracemalloc
 from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
 
-from otsync import DTW, ConstantShift, Matches, Offsets, Status, synchronize
+from otsync import DTW, Alignment, ConstantShift, Matches, Offsets, Status, TrackSet, synchronize
 from otsync.report import write_report
 from otsync.report.page import late_starts
 from tests.otsync.align.test_align import films
@@ -97,3 +98,22 @@ def test_many_pairs_stay_small_and_show_residuals(tmp_path):
         and "10 further pairs" in page
         and len(page) < 400_000
     )
+
+
+def test_a_long_clip_costs_its_picture_alone(tmp_path):
+    """The map of costs of all frames against all would have 3 GB here, and 87 GB of an hour."""
+    rng, frames = np.random.default_rng(0), 20_000
+    x = np.cumsum(0.01 * rng.standard_normal((6, frames, 3)), 1)
+    tracks = [TrackSet(x + 0.01 * rng.standard_normal(x.shape), fps=30.0, name=n, frame="world") for n in "ab"]
+    matches = Matches(np.stack([np.arange(6)] * 2, 1), np.ones(6))
+    offsets = Offsets.known(("a", "b"), [0.0, 0.0], 30.0)
+    pair = Alignment(0.0, sigma=0.01, fps=30.0)
+    offsets = replace(offsets, alignments={(0, 1): pair}, matches={(0, 1): matches})
+    tracemalloc.start()
+    try:
+        write_report(tmp_path / "report.html", offsets, tracks)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert "cost of frames against each other" in (tmp_path / "report.html").read_text()
+    assert peak < 100e6

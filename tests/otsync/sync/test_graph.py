@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -152,6 +153,21 @@ def test_sigma_is_that_of_errors_which_pairs_of_a_video_share(shared):
         each = rng.normal(size=len(pairs)) * sigma * np.sqrt(1 - shared)
         noise = [own[b] - own[a] + e for (a, b), e in zip(pairs, each, strict=True)]
         solved = solve(n, edges_of(np.zeros(n), pairs, sigma, noise), 0, shared=shared)
+        z += (solved.x[1:] / solved.sigma[1:]).tolist()
+    assert np.sqrt(np.mean(np.square(z))) == pytest.approx(1.0, abs=0.12)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+def test_sigma_is_that_of_errors_which_edges_tell_of(share):
+    """The same, where every edge knows how much of its sigma is its videos' own."""
+    rng, n, sigma = np.random.default_rng(4), 6, 0.01
+    pairs, z = all_pairs(n), []
+    for _ in range(300):
+        own = rng.normal(size=n) * sigma * np.sqrt(share / 2)
+        each = rng.normal(size=len(pairs)) * sigma * np.sqrt(1 - share)
+        noise = [own[b] - own[a] + e for (a, b), e in zip(pairs, each, strict=True)]
+        edges = [replace(e, common=sigma * np.sqrt(share)) for e in edges_of(np.zeros(n), pairs, sigma, noise)]
+        solved = solve(n, edges, 0)
         z += (solved.x[1:] / solved.sigma[1:]).tolist()
     assert np.sqrt(np.mean(np.square(z))) == pytest.approx(1.0, abs=0.12)
 

@@ -435,6 +435,22 @@ def test_offsets_that_are_not_to_be_trusted_end_in_one(world, tmp_path, capsys):
     assert load_result(tmp_path / "r").offsets.names == ("cam0", "cam2")
 
 
+@pytest.mark.parametrize("refined", [True, False])
+def test_a_start_that_is_only_coarse_is_judged_by_the_fit(world, tmp_path, capsys, refined):
+    """Its sigma after the fit is below a third of a frame, or as before where clocks are held."""
+    document = json.loads((world / "start.json").read_text())
+    for video in document["videos"][1:]:
+        video |= {"sigma_seconds": 0.5 / 30, "status": "coarse", "flags": ["coarse"]}
+    (tmp_path / "o.json").write_text(json.dumps(document))
+    args = ["fit", str(world), "--offsets", str(tmp_path / "o.json"), "--out", str(tmp_path / "r"), "--width", "96"]
+    args += ["--backdrop-steps", "9", "--steps", "60", "--held-out", "held0"]
+    code = main(args if refined else [*args, "--freeze", "offsets"])
+    told = capsys.readouterr().err
+    offsets = load_result(tmp_path / "r").offsets
+    assert offsets.ok == refined
+    assert (code, "not to be trusted" in told) == ((0, False) if refined else (1, True))
+
+
 def test_simulate_writes_a_recording_that_the_printed_command_fits(tmp_path, capsys):
     args = [
         "simulate",
