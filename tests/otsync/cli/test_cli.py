@@ -384,3 +384,20 @@ def test_a_write_that_fails_keeps_the_old_file_and_names_it(monkeypatch, tmp_pat
     with pytest.raises(OSError, match=r"cannot be written \(No space left on device\).*a\.json"):
         write_json(tmp_path / "a.json", [1])
     assert [path.name for path in tmp_path.iterdir()] == ["a.json"] and (tmp_path / "a.json").read_text() == "old"
+
+
+@pytest.mark.parametrize(("words", "lean"), [(["--version"], True), (["--device", "cuda", "--version"], False)])
+def test_the_command_leaves_tensor_libraries_out_unless_a_device_is_named(monkeypatch, words, lean):
+    """As a library, and where the environment already says otherwise, nothing is changed."""
+    keys = [f"POT_BACKEND_DISABLE_{library}" for library in ("PYTORCH", "JAX", "CUPY", "TENSORFLOW")]
+    for key in keys:
+        monkeypatch.delenv(key, raising=False)
+    monkeypatch.setattr("sys.argv", ["otsync", *words])
+    monkeypatch.setattr("otsync.cli.run_command", lambda *args, **options: 0)
+    main(["--version"])
+    assert not any(key in os.environ for key in keys)
+    monkeypatch.setenv(keys[1], "")
+    main()
+    assert [os.environ.get(key) for key in keys] == (["1", "", "1", "1"] if lean else [None, "", None, None])
+    for key in keys:
+        os.environ.pop(key, None)
