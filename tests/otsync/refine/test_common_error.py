@@ -3,10 +3,15 @@
 import numpy as np
 import pytest
 
+from otsync import Alignment, Matches, SplineRefine, Status, TrackSet, refine
 from otsync.clocks.splines import TrackSplines
+from otsync.epipolar import EpipolarRefine
+from otsync.epipolar.refine import _Problem
 from otsync.refine import common_error as module
 from otsync.refine.common_error import Sums, autocorrelation, common_error
+from otsync.refine.gauss_newton import fit_clock
 from otsync.types import Clock
+from tests.recording_world import ring
 
 WINDOW, FPS = 14 / 30, 30.0
 GROUPS, EACH, FRAMES = 6, 8, 90
@@ -115,3 +120,41 @@ def test_autocorrelation_is_the_sum_that_it_says():
     direct = [float((x[:, : 20 - k] * x[:, k:]).sum()) for k in range(6)]
     np.testing.assert_allclose(autocorrelation(x, 6), direct)
     assert autocorrelation(x, 30).shape == (30,)
+
+
+def test_the_refiner_says_no_less():
+    """Two videos whose tracks all err alike: neighbourhoods and seconds may scatter less than that by chance."""
+    clip, matches = np.arange(FRAMES) / FPS, Matches(np.stack([np.arange(30)] * 2, 1), np.ones(30))
+    below = 0
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        x = smooth(rng, 30, FRAMES, 3) + smooth(rng, 1, FRAMES, 3)
+        a = TrackSet(x, timestamps=clip, frame="world")
+        b = TrackSet(x + 0.05 * smooth(rng, 1, FRAMES, 3), timestamps=clip, frame="world")
+        found = refine(a, b, matches, Alignment(0.0, fps=FPS), SplineRefine())
+        scatter = fit_clock(*SplineRefine().splines(a, b, matches), Clock(found.offset, 1.0), WINDOW).covariance[0, 0]
+        assert found.sigma > found.stats["common_error"] > 0
+        below += np.sqrt(scatter) < 0.7 * found.stats["common_error"]
+    assert below
+
+
+def test_pixels_say_no_less():
+    """Points that all move alike, and whose pixels all err alike in one video."""
+    below = 0
+    cameras = ring(4, width=640, height=360)[:2]
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        x = 0.3 * smooth(rng, 1, 120, 3) + 0.1 * smooth(rng, 30, 120, 3) + rng.uniform(-0.4, 0.4, (30, 1, 3))
+        wrong = 2 * smooth(rng, 1, 120, 2)
+        a, b = (
+            TrackSet(None, uv=camera.project(x) + e, camera=camera, fps=FPS, frame="world", features=np.eye(30))
+            for camera, e in zip(cameras, (0.0, wrong), strict=True)
+        )
+        matches = Matches(np.stack([np.arange(30)] * 2, 1), np.ones(30))
+        refiner = EpipolarRefine()
+        found = refiner(a, b, matches, Alignment(0.0, fps=FPS))
+        problem = _Problem.of(refiner, a, b, matches, 0.0, FPS)
+        step = problem.solve(0.0, refiner.windows[0], 12, refiner.reach)[1]
+        assert found.sigma >= found.stats["common_error"] >= 0 or Status.MOVED in found.flags
+        below += Status.MOVED not in found.flags and problem.scatter(step) < 0.8 * found.stats["common_error"]
+    assert below
