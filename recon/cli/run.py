@@ -14,6 +14,9 @@ from otsync.cli.method import MethodOptions
 from otsync.cli.recordings import RecordingOptions
 from recon.pipeline.plan import Plan
 
+WORTH_TELLING = 1.0
+"""Seconds of a budget from which on it is said where they went."""
+
 
 @dataclass
 class Run:
@@ -77,6 +80,9 @@ class Run:
                 )
         threads, method, deadline = self.recording.threads(), self.slots.chosen(), deadline_of(self.plan)
         doubts = prepared(self.scene, allow_outside=self.allow_outside or self.recording.allow_outside)
+        if deadline is not None and deadline.seconds - deadline.left > WORTH_TELLING:
+            spent = f"finding cameras took {deadline.seconds - deadline.left:.0f} s of the budget"
+            tell(f"{spent} of {deadline.seconds:g} s; {deadline.left:.0f} s are left for all else")
         scene = opened(self.scene, self.allow_outside or self.recording.allow_outside)
         if self.recording.cameras:
             scene = scene.take(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -945,3 +946,10 @@ def test_run_goes_from_a_recording_to_a_scene_and_better_offsets(tmp_path, capsy
     assert "route tracks" in told.err and (out / "sync.html").exists() and (out / "report.html").exists()
     assert otsync(args) in (0, 1)  # everything is there: the same again, at once
     assert json.loads((out / "metrics.json").read_text()) == metrics
+
+
+def test_what_a_budget_went_into_before_anything_else_is_said(world, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("recon.cli.run.WORTH_TELLING", 0.0)
+    nobody = ["run", str(world), "--out", str(tmp_path / "r"), "--budget", "60", "--held-out", "nobody"]
+    assert otsync(nobody) == 2
+    assert re.search(r"finding cameras took 0 s of the budget of 60 s; (59|60) s are left", capsys.readouterr().err)
