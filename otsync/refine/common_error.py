@@ -30,8 +30,9 @@ ROBUST = 2.0
 
 FITTED = 2.5
 """Factor on the error found. Partners are chosen by how well they agree at the answer, and the fit has moved to where
-they agree best, so that residuals show less of a common error than there is. Eight simulated recordings (two smooth
-bodies that turn and walk; seeds 1 to 11 and 101 to 104) err by 2.1 times what residuals show, real people by 1.0."""
+they agree best, so that residuals show less of a common error than there is. Eight recordings that `recon simulate`
+films (two smooth bodies that turn and walk; seeds 1 to 11 and 101 to 104) err by 2.1 times what residuals show, real
+people by 1.0; with 2.2, 86 % of forty offsets more (seeds 2001 to 2014) lie within two sigmas."""
 
 
 def common_error(
