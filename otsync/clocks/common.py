@@ -70,7 +70,7 @@ def common_clock(a: TrackSet, b: TrackSet, matches: Matches) -> CommonClock:
     """
     i, j = matches.pairs.T
     fps = min(nominal_fps(a), nominal_fps(b))
-    xa, xb = (on_clock(tracks, tracks.positions(), fps) for tracks in (a.take(i), b.take(j)))
+    xa, xb = (on_clock(tracks, tracks.positions(some), fps) for tracks, some in ((a, i), (b, j)))
     return CommonClock(xa, xb, fps, float(a.times[0] - b.times[0]), float(a.times[0]))
 
 

@@ -130,8 +130,12 @@ def _candidates(
 def _usual(x: Float[np.ndarray, "M T 3"]) -> float:
     """Median difference of consecutive steps; infinite where none is known."""
     at = np.arange(1, x.shape[1] - 1, max(1, x.shape[0] * x.shape[1] // ENOUGH_STEPS))
-    change = np.linalg.norm((x[:, at + 1] - x[:, at]) - (x[:, at] - x[:, at - 1]), axis=2)
-    change = change[np.isfinite(change)]
+    known = [np.zeros(0)]
+    for some in blocks(x.shape[0], x.shape[1], AT_ONCE):
+        one = x[some]
+        change = np.linalg.norm((one[:, at + 1] - one[:, at]) - (one[:, at] - one[:, at - 1]), axis=2)
+        known.append(change[np.isfinite(change)])
+    change = np.concatenate(known)
     if not len(change):
         return np.inf
-    return max(float(np.median(change)), ROUNDING * float(np.nanmax(np.abs(x))))
+    return max(float(np.median(change)), ROUNDING * max(float(np.nanmax(x)), -float(np.nanmin(x))))

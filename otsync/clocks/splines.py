@@ -73,18 +73,17 @@ class TrackSplines:
         self.step = span / intervals
         self.knots = times[0] + self.step * np.arange(-DEGREE, intervals + DEGREE + 1)
         self.n = intervals + DEGREE
-        self._by_track: np.ndarray | None = None
         self.jumps = find_jumps(xyz)
-        #: (n, M*3) coefficients around each track's own mean, which keeps them small
-        self.mean, self.coefficients = self._fit(self._joined(xyz), smoothing * max(1.0, 1 / (30 * self.frame)))
+        #: (M,n,3) coefficients around each track's own mean, which keeps them small; one block a track
+        self.mean, self.by_track = self._fit(self._joined(xyz), smoothing * max(1.0, 1 / (30 * self.frame)))
 
     def _fit(self, xyz: np.ndarray, penalty: float) -> tuple[np.ndarray, np.ndarray]:
-        """(M,3) means, and (n, M*3) coefficients around them. Memory grows with T + n, not with its square."""
+        """(M,3) means, and (M,n,3) coefficients around them. Memory grows with T + n, not with its square."""
         count, basis = len(xyz), self._design(self.times, DEGREE)
         # by diagonal: what turns the weights of samples into a band of the normal equations
         products = [basis[:, : self.n - d].multiply(basis[:, d:]).T.tocsr() for d in range(DEGREE + 1)]
         transposed, regular = basis.T.tocsr(), _penalty_bands(self.n, penalty)
-        mean, coefficients = np.zeros((count, 3)), np.zeros((self.n, count, 3))
+        mean, coefficients = np.zeros((count, 3)), np.zeros((count, self.n, 3))
         for part in blocks(count, len(self.times) + self.n):
             seen = self.seen[part]
             weight = seen.astype(float)
@@ -96,17 +95,16 @@ class TrackSplines:
             for d in range(DEGREE + 1):
                 bands[:, DEGREE - d, d:] += (products[d] @ weight.T).T
             for m in range(len(values)):
-                coefficients[:, part.start + m] = solveh_banded(bands[m], right[:, m], check_finite=False)
-        return mean, coefficients.reshape(self.n, -1)
+                coefficients[part.start + m] = solveh_banded(bands[m], right[:, m], check_finite=False)
+        return mean, coefficients
 
     def take(self, index: np.ndarray) -> TrackSplines:
         """The splines of the tracks at ``index`` (repeats allowed), without fitting anew."""
         part = object.__new__(TrackSplines)
         part.__dict__ |= self.__dict__
-        part._by_track = None
         part.seen, part.mean = self.seen[index], self.mean[index]
         part.jumps = self.jumps.take(index) if len(self.jumps) else self.jumps
-        part.coefficients = self.coefficients.reshape(self.n, -1, 3)[:, index].reshape(self.n, -1)
+        part.by_track = self.by_track[index]
         return part
 
     def within(self, begin: float, end: float) -> TrackSplines:
@@ -149,11 +147,9 @@ class TrackSplines:
         return x, v
 
     @property
-    def by_track(self) -> Float[np.ndarray, "M n 3"]:
-        """Coefficients around each track's mean, one block a track: what compiled loops read."""
-        if self._by_track is None:
-            self._by_track = np.ascontiguousarray(self.coefficients.reshape(self.n, -1, 3).transpose(1, 0, 2))
-        return self._by_track
+    def coefficients(self) -> Float[np.ndarray, "n M*3"]:
+        """Coefficients around each track's mean, one row a knot; a copy."""
+        return self.by_track.transpose(1, 0, 2).reshape(self.n, -1)
 
     def basis(
         self, t: Float[np.ndarray, " S"]

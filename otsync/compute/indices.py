@@ -21,12 +21,15 @@ def evenly(count: int, most: int) -> Int[np.ndarray, " n"]:
 
 
 def blocks(rows: int, columns: int, at_once: int = 2**20) -> Iterator[slice]:
-    """Slices of rows, each of about ``at_once`` entries, one row at least: what is copied of them stays small.
+    """Slices of rows, one row at least: all at once where that is at most ``at_once`` entries, else pieces of a quarter
+    of that, so that what is copied of long clips stays small.
 
     Example:
-        >>> [(s.start, s.stop) for s in blocks(5, 10, at_once=20)]
-        [(0, 2), (2, 4), (4, 5)]
+        >>> [(s.start, s.stop) for s in blocks(2, 10, at_once=20)]
+        [(0, 2)]
+        >>> [(s.start, s.stop) for s in blocks(5, 10, at_once=80)], len(list(blocks(5, 10, at_once=40)))
+        ([(0, 5)], 5)
     """
-    many = max(1, at_once // max(columns, 1))
-    for first in range(0, rows, many):
+    many = rows if rows * columns <= at_once else max(1, at_once // 4 // max(columns, 1))
+    for first in range(0, rows, max(many, 1)):
         yield slice(first, min(first + many, rows))

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..clocks.common import CommonClock, common_clock, readable, strongest
+from ..compute.indices import blocks
 from ..types import Matches, TrackSet
 from .linear import velocity
 
@@ -33,7 +34,10 @@ def apart(a: TrackSet, b: TrackSet, matches: Matches, offset: float) -> float:
         return float("nan")
     x, y = x[supporting], y[supporting]
     with np.errstate(invalid="ignore"):
-        distance = np.nanmedian(np.nanmedian(np.linalg.norm(x - y, axis=2), axis=1))
+        parts = list(blocks(*x.shape[:2]))
+        distance = np.nanmedian(
+            np.concatenate([np.nanmedian(np.linalg.norm(x[p] - y[p], axis=2), axis=1) for p in parts])
+        )
     sizes = [size(z) for z in (x, y)]
     scale = float(np.mean(sizes))
     return float(distance / scale) if scale > 0 else float("nan")
@@ -49,18 +53,21 @@ def in_common(pair: CommonClock, lag: int) -> tuple[Float[np.ndarray, "M T 3"], 
 
 def moves_alike(x: Float[np.ndarray, "M T 3"], y: Float[np.ndarray, "M T 3"], half: int) -> Bool[np.ndarray, " M"]:
     """Which matches' velocities over ±``half`` frames correlate at equal times."""
-    u, v = velocity(x, half), velocity(y, half)
-    known = np.isfinite(u[..., 0]) & np.isfinite(v[..., 0])
-    u, v = (np.where(known[..., None], w, 0.0) for w in (u, v))
-    uv, uu, vv = ((p * q).sum((1, 2)) for p, q in ((u, v), (u, u), (v, v)))
-    power = np.sqrt(uu * vv)
-    return (power > 0) & (uv > SUPPORTS * power)
+    alike = np.zeros(len(x), bool)
+    for some in blocks(*x.shape[:2]):
+        u, v = velocity(x[some], half), velocity(y[some], half)
+        known = np.isfinite(u[..., 0]) & np.isfinite(v[..., 0])
+        u, v = (np.where(known[..., None], w, 0.0) for w in (u, v))
+        uv, uu, vv = ((p * q).sum((1, 2)) for p, q in ((u, v), (u, u), (v, v)))
+        power = np.sqrt(uu * vv)
+        alike[some] = (power > 0) & (uv > SUPPORTS * power)
+    return alike
 
 
 def size(x: Float[np.ndarray, "M T 3"]) -> float:
     """Median distance between the tracks' median positions."""
     from scipy.spatial.distance import pdist
 
-    medians = np.nanmedian(x, axis=1)
+    medians = np.array([np.nanmedian(track, axis=0) for track in x]).reshape(-1, 3)
     distance = pdist(medians[np.isfinite(medians[:, 0])])
     return float(np.median(distance)) if len(distance) else 0.0

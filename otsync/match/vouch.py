@@ -367,5 +367,5 @@ def poses(xyz: Float[np.ndarray, "M T 3"], seen: Bool[np.ndarray, "M T"], frames
     T = seen.shape[1]
     at = evenly(T, frames)
     away = np.abs(np.arange(T)[None] - at[:, None])
-    nearest = np.where(seen[:, None], away[None], 2 * T).argmin(2)
+    nearest = np.array([np.where(own, away, 2 * T).argmin(1) for own in seen], int).reshape(len(seen), len(at))
     return np.take_along_axis(xyz, nearest[..., None], 1)

@@ -156,10 +156,11 @@ class SplineRefine(Refiner):
         sides = []
         for tracks, column in ((a, matches.pairs[:, 0]), (b, matches.pairs[:, 1])):
             used, index = np.unique(column, return_inverse=True)
-            sides.append((tracks.times, tracks.take(used).positions(), index))
+            sides.append((tracks.times, tracks.positions(used), index))
         scale = max(binary_scale(x) for _, x, _ in sides)
         first, second = (
-            TrackSplines(times, x / scale, smoothing=self.smoothing).take(index) for times, x, index in sides
+            TrackSplines(times, np.divide(x, scale, out=x), smoothing=self.smoothing).take(index)
+            for times, x, index in sides
         )
         return first, second
 
