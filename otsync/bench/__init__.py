@@ -9,7 +9,7 @@ panoptic.py  the paper's protocol on a truly synchronised recording
 own_frames.py  clock and pose without a common frame, on worlds and on a truly synchronised recording
 calibrate.py  cameras from videos alone, against simulated and given ones
 rig/  a synchronised recording with one camera moved: which one, and by how much
-trust/  whether "ok" is right: classes of worlds, claims and errors
+trust/  whether "ok" is right: classes of worlds, claims and errors; thresholds.py: the limits behind the flags
 record.py  tables on disk, machine and versions, the gate against a committed baseline
 """
 
@@ -32,6 +32,7 @@ OWN = {
     "chain": "chain",
     "own-frames": "own_frames",
     "trust": "trust.run",
+    "thresholds": "trust.thresholds",
     "calibrate": "calibrate",
     "audit": "rig.audit",
 }

@@ -45,7 +45,7 @@ class Bench:
     """
 
     suite: tyro.conf.Positional[suite_names()]
-    """Which benchmark; "all": every one that needs no recording."""
+    """Which benchmark; "all": every one that needs no recording, but for thresholds, which takes hours."""
     scene: tyro.conf.Positional[Path | None] = None
     """A truly synchronised recording (its folder or scene.json): of panoptic and audit; if you like, of chain,
     own-frames and calibrate."""
@@ -56,14 +56,17 @@ class Bench:
     rebase: bool = False
     """Make the figures of this run the baseline that --gate compares with."""
     promises: bool = False
-    """For sync and match: measure what is promised, on fresh seeds, instead of the tables."""
+    """For sync and match: measure what is promised, on fresh seeds, instead of the tables; for trust: exit code 1 where
+    it is not kept."""
     first_seed: int | None = None
-    """For core, match, sync, panoptic, chain, own-frames, calibrate and audit: where they begin; default: the suite's
-    own."""
+    """For core, match, sync, panoptic, chain, own-frames, trust, thresholds, calibrate and audit: where they begin;
+    default: the suite's own."""
     seeds: int | None = None
-    """For core, match, sync, chain, own-frames, calibrate and audit: how many; default: the suite's own."""
+    """For core, match, sync, chain, own-frames, trust, thresholds, calibrate and audit: how many; default: the suite's
+    own."""
     only: tuple[str, ...] = ()
-    """For match, hard-cases and chain: names of the solvers to run; for calibrate of the worlds; default: all."""
+    """For match, hard-cases and chain: names of the solvers to run; for calibrate of the worlds, for trust of the
+    classes, for thresholds of the limits; default: all."""
     sizes: tuple[int, ...] = ()
     """For match: numbers of tracks; default: 200 to 50,000."""
     limit: float | None = None
@@ -82,7 +85,9 @@ class Bench:
         if self.suite != "all":
             return self._run(self.suite, every[self.suite](), given)
         loaded = {name: load() for name, load in every.items()}
-        alone = {name: suite for name, suite in loaded.items() if not needs_more(suite)}
+        alone = {
+            n: suite for n, suite in loaded.items() if not needs_more(suite) and not getattr(suite, "APART", False)
+        }
         return max(self._run(name, suite, given) for name, suite in alone.items())
 
     def _run(self, name: str, suite: Any, given: dict[str, Any]) -> int:

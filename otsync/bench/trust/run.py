@@ -79,11 +79,15 @@ def measured(jobs: Sequence[tuple[str, str, int]]) -> Iterator[Row]:
             yield from rows
 
 
-def one(job: tuple[str, str, int]) -> list[dict[str, Any]]:
-    """Answers and errors of one world, a row a video."""
+def one(job: tuple[str, str, int], changed: Method | None = None) -> list[dict[str, Any]]:
+    """Answers and errors of one world, a row a video.
+
+    Args:
+        job: class, name of the method, and seed. changed: a method that is none of :data:`METHODS`.
+    """
     name, method, seed = job
     world = CLASSES[name](seed)
-    offsets = synchronize(list(world.tracks), method=METHODS[method], **world.options)
+    offsets = synchronize(list(world.tracks), method=METHODS.get(method, changed), **world.options)
     ends, worst = world.errors(offsets)
     rows = []
     for v in range(1, len(world.tracks)):

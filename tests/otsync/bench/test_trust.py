@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 
+from otsync.bench.trust import thresholds
 from otsync.bench.trust.diagram import reliability
 from otsync.bench.trust.run import acceptance, interval, run, summarise, wrong
 from otsync.bench.trust.worlds import CLASSES, FPS, World
@@ -67,3 +68,45 @@ def test_a_small_run_writes_tables_and_a_diagram(tmp_path):
     assert {r["class"] for r in rows} == {"mid", "two scenes"} and (tmp_path / "trust.png").stat().st_size > 5000
     with pytest.raises(ValueError, match="expected classes among"):
         run(tmp_path, only=("nothing",))
+
+
+def test_a_limit_is_set_where_it_is_read_and_set_back():
+    from otsync.sync import ends
+
+    with thresholds.limit_set("blur", 0.1) as method:
+        assert method is not None and method.aligner is None and method.refiner.trust.blur == 0.1
+    now = ends.SUITS_BETTER
+    with thresholds.limit_set("sync.ends.SUITS_BETTER", 0.4) as method:
+        assert method is None and ends.SUITS_BETTER == 0.4
+    assert now == ends.SUITS_BETTER
+
+
+@pytest.mark.parametrize("name", ["blurr", "sync.ends.NOTHING", "sync.nowhere.X", "sync.ends.LENGTHS", "os.path.sep"])
+def test_a_limit_that_there_is_not_is_refused(name, tmp_path):
+    with pytest.raises(ValueError, match=f"--only: .*found {name}"):
+        thresholds.run(tmp_path, only=(name,))
+
+
+def test_limits_are_not_chosen_on_seeds_that_measure(tmp_path):
+    with pytest.raises(ValueError, match="--first-seed"):
+        thresholds.run(tmp_path, first_seed=19_999, seeds=2)
+
+
+def test_the_limit_chosen_trusts_most_while_hardly_any_is_wrong():
+    rows = [
+        {"limit": "blur", "now": 2.0, "value": v, "right": right, "wrong": wrong}
+        for v, right, wrong in ((1.0, 900, 0), (2.0, 1100, 1), (2.4, 1100, 1), (4.0, 1300, 9))
+    ]
+    told = thresholds.chosen(rows)
+    assert told["chosen"] == 2.0 and told["right now"] == 1100
+    assert thresholds.chosen([r | {"wrong": r["wrong"] + 20} for r in rows])["chosen"] == 2.0
+
+
+@pytest.mark.slow
+def test_a_sweep_writes_what_each_value_trusts(tmp_path, monkeypatch):
+    monkeypatch.setattr(thresholds, "CLASSES", {"hard": CLASSES["hard"]})
+    monkeypatch.setattr(thresholds, "FACTORS", (0.01, 1.0))
+    assert thresholds.run(tmp_path, seeds=2, only=("blur",)) == 0
+    strict, now = json.loads((tmp_path / "thresholds.json").read_text())["rows"]
+    assert strict["right"] == 0 and strict["wrong"] == 0 and strict["answers"] == now["answers"] == 2
+    assert json.loads((tmp_path / "thresholds_chosen.json").read_text())["rows"][0]["chosen"] == now["value"]
