@@ -65,6 +65,9 @@ of the answer is the best (46 worlds of mid noise); beside a slow motion that is
 MOST = 4
 """Breaks that are mended, at most."""
 
+GAP = 2.5
+"""Frames beyond which what lies between two samples is a gap in a clock, of which nothing is known."""
+
 
 @dataclass(frozen=True)
 class Suspect:
@@ -168,6 +171,12 @@ class Raw:
         x = (1 - share) * self.x[:, right - 1] + share * self.x[:, right]
         outside = (t < self.times[0]) | (t > self.times[-1])
         return np.where(outside[None, :, None], np.nan, x)
+
+    def sampled(self, t: np.ndarray) -> np.ndarray:
+        """(S,) whether a moment lies between two samples that are no gap apart (:data:`GAP`)."""
+        right = np.clip(np.searchsorted(self.times, t), 1, len(self.times) - 1)
+        steps = np.diff(self.times)
+        return np.asarray(steps[right - 1] < GAP * np.median(steps))
 
     @cached_property
     def _bends(self) -> np.ndarray:

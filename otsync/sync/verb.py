@@ -27,11 +27,11 @@ from ..refine.slot import Rate, Refiner, RefinerLike
 from ..refine.splines import SplineRefine
 from ..types import Alignment, Break, Clock, Matches, Offsets, Status, TrackSet, in_order
 from .breaks import MOST, Seen, Suspect, culprit, mended, remeasured, runs_on, suspects
-from .ends import broken_end, unvouched
 from .graph import Graph, Pair
 from .method import Method, with_costs
 from .own_frames import Frames, refuse_common, solver_from, synchronize_own
 from .pairs import Job, Refit, run, run_refit, with_rate
+from .parts import broken_part, unvouched
 from .verdict import NOTHING_COMMON, Answer, Verdict, judge
 
 
@@ -128,20 +128,20 @@ def synchronize(
         if breaking:
             verdict = judged([_doubted(a) if breaking & set(a.pair) else a for a in verdict.answers])
     else:
-        verdict = with_ends_checked(verdict, tracks, judged)
+        verdict = with_parts_checked(verdict, tracks, judged)
     return to_offsets(original, verdict, time.perf_counter() - started, broken)
 
 
-def with_ends_checked(
+def with_parts_checked(
     verdict: Verdict, tracks: Sequence[TrackSet], judged: Callable[[Sequence[Answer]], Verdict]
 ) -> Verdict:
-    """The verdict, with pairs doubted whose answer does not hold at an end of what both videos share."""
-    ends = {}
+    """The verdict, with pairs doubted whose answer does not hold in a part of what both videos share."""
+    parts = {}
     for a in verdict.answers:
         first, second = (tracks[v] for v in a.pair)
         if a.refined.status.ok and a.finite and first.xyz is not None and second.xyz is not None:
-            ends[a.pair] = broken_end(a, first, second)
-    broken = {pair: end for pair, end in ends.items() if end is not None}
+            parts[a.pair] = broken_part(a, first, second)
+    broken = {pair: part for pair, part in parts.items() if part is not None}
     if not broken:
         return verdict
     unsure = unvouched(broken, verdict.answers, tracks)

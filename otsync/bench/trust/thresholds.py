@@ -51,7 +51,7 @@ def run(out: Path, *, seeds: int = 3, first_seed: int = TUNED_ON, only: tuple[st
     Args:
         seeds: worlds a class and a value. first_seed: where they begin.
         only: limits; default: all of :class:`otsync.Trust`. A field of it (``blur``) or a number that stands in a
-            module (``sync.ends.SUITS_BETTER``).
+            module (``sync.parts.SUITS_BETTER``).
 
     Raises:
         ValueError: for a limit that there is not, or seeds that limits are not chosen on.
@@ -89,7 +89,7 @@ def value_of(name: str) -> float:
     if not isinstance(value, (int, float)) or isinstance(value, bool) or value == 0:
         raise ValueError(
             f"--only: expected a limit among {', '.join(LIMITS)}, or a number other than 0 in a module of otsync such "
-            f"as sync.ends.SUITS_BETTER; found {name}."
+            f"as sync.parts.SUITS_BETTER; found {name}."
         )
     return float(value)
 

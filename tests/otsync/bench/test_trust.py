@@ -71,17 +71,17 @@ def test_a_small_run_writes_tables_and_a_diagram(tmp_path):
 
 
 def test_a_limit_is_set_where_it_is_read_and_set_back():
-    from otsync.sync import ends
+    from otsync.sync import parts
 
     with thresholds.limit_set("blur", 0.1) as method:
         assert method is not None and method.aligner is None and method.refiner.trust.blur == 0.1
-    now = ends.SUITS_BETTER
-    with thresholds.limit_set("sync.ends.SUITS_BETTER", 0.4) as method:
-        assert method is None and ends.SUITS_BETTER == 0.4
-    assert now == ends.SUITS_BETTER
+    now = parts.SUITS_BETTER
+    with thresholds.limit_set("sync.parts.SUITS_BETTER", 0.4) as method:
+        assert method is None and parts.SUITS_BETTER == 0.4
+    assert now == parts.SUITS_BETTER
 
 
-@pytest.mark.parametrize("name", ["blurr", "sync.ends.NOTHING", "sync.nowhere.X", "sync.ends.LENGTHS", "os.path.sep"])
+@pytest.mark.parametrize("name", ["blurr", "sync.parts.NOTHING", "sync.nowhere.X", "sync.parts.LENGTHS", "os.path.sep"])
 def test_a_limit_that_there_is_not_is_refused(name, tmp_path):
     with pytest.raises(ValueError, match=f"--only: .*found {name}"):
         thresholds.run(tmp_path, only=(name,))

@@ -1,4 +1,4 @@
-"""Ends of overlaps: breaks there are doubted, and right answers are not."""
+"""Parts of overlaps in which an answer does not hold are doubted, and right answers are not."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from otsync import synchronize
 from otsync.bench.trust.worlds import CLASSES, plain
 from otsync.simulate import simulate
 from otsync.simulate.effects import Drop, In
-from otsync.sync.ends import broken_end, unvouched
+from otsync.sync.parts import broken_part, unvouched
 from otsync.sync.verdict import Answer
 from otsync.types import Alignment, Matches, Status, TrackSet
 
@@ -65,7 +65,7 @@ def pair(late: float = 0.3, breaks: float | None = None, hidden: float = 0.0, se
 @pytest.mark.parametrize("late", [-0.4, 0.3])
 @pytest.mark.parametrize("seed", range(3))
 def test_one_offset_holds_to_both_ends(late, seed):
-    assert broken_end(*pair(late, seed=seed)) is None
+    assert broken_part(*pair(late, seed=seed)) is None
 
 
 @pytest.mark.parametrize("turned", [False, True])
@@ -75,7 +75,7 @@ def test_the_end_behind_a_break_is_named(turned):
     if turned:
         back = Alignment(-0.3, fps=FPS)
         answer, a, b = replace(answer, scanned=back, refined=back), b, a
-    found = broken_end(answer, a, b)
+    found = broken_part(answer, a, b)
     assert found is not None
     last = a.times[-1] if not turned else b.times[-1] - 0.3
     assert found[1] == pytest.approx(last) and 0.3 < found[1] - found[0] < 0.6
@@ -89,9 +89,40 @@ def test_where_another_offset_cannot_be_seen_positions_that_do_not_agree_tell():
     assert ends.max() > 9 and Status.BROKEN_CLOCK in found.flags[1]
 
 
+@pytest.mark.parametrize(
+    ("name", "seed"),
+    [
+        ("ten frames dropped, hard", 34002),
+        ("halves exchanged", 34009),
+        ("halves exchanged", 507),
+        ("played backwards", 34006),
+    ],
+)
+def test_an_answer_that_a_part_of_the_clip_does_not_share_is_not_trusted(name, seed):
+    """Trusted before, 10 and 150 frames wrong, and with no true answer: half a second and more agrees with nothing."""
+    world = CLASSES[name](seed)
+    found = synchronize(world.tracks)
+    assert not world.errors(found)[0].max() < 1 and Status.BROKEN_CLOCK in found.flags[1]
+
+
+def test_a_part_within_the_clip_that_does_not_agree_is_named():
+    answer, a, b = pair()
+    x = b.xyz.copy()
+    x[:, 50:75] += np.linspace(0, 2, 25)[:, None] * np.random.default_rng(1).normal(size=(20, 1, 3))
+    found = broken_part(answer, a, replace(b, xyz=x))
+    assert found is not None and 50 / FPS - 0.3 < found[0] - 0.3 < found[1] - 0.3 < 75 / FPS + 0.3
+
+
+def test_a_gap_in_a_clock_is_not_asked_about():
+    """Frames that a mended clock lost: what lies between is not known, and no part that does not hold."""
+    answer, a, b = pair()
+    keep = np.r_[0:50, 75 : len(b.times)]
+    assert broken_part(answer, a, TrackSet(b.xyz[:, keep], timestamps=b.times[keep], name="b")) is None
+
+
 def test_overlaps_too_short_to_judge_are_left_alone():
     answer, a, b = pair(late=3.0)  # one second in common
-    assert broken_end(answer, a, b) is None
+    assert broken_part(answer, a, b) is None
 
 
 def test_who_is_doubted_where_others_see_the_end():
