@@ -22,7 +22,8 @@ from dataclasses import fields, is_dataclass
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Any, TypeVar
+from types import UnionType
+from typing import Any, TypeVar, get_args, get_type_hints
 
 T = TypeVar("T")
 
@@ -127,10 +128,31 @@ def made(text: str, choices: Mapping[str, Any], what: str) -> Any:
         fields[field.strip().replace("-", "_")] = _value(value.strip())
     if not isinstance(thing, type) and not fields:
         return thing
+    _refuse_other_types(thing, fields, f"{what}: {name}")
     try:
         return thing(**fields)
     except TypeError as error:
         raise ValueError(f"{what}: {text!r} cannot be made: {error}") from None
+
+
+WORDS = {int: "a whole number", float: "a number", bool: "True or False", str: "text", type(None): "None"}
+"""How errors name the types of simple fields."""
+
+
+def _refuse_other_types(thing: Any, fields: Mapping[str, Any], what: str) -> None:
+    """ValueError for a value that is not of the simple types of its field, where the field declares some."""
+    try:
+        hints = get_type_hints(thing if is_dataclass(thing) else thing.__init__)
+    except (NameError, TypeError, AttributeError):  # a stranger's, whose annotations do not resolve
+        return
+    for field, value in fields.items():
+        hint = hints.get(field)
+        kinds = get_args(hint) if isinstance(hint, UnionType) else (hint,)
+        if not all(kind in WORDS for kind in kinds):
+            continue
+        if type(value) not in kinds and not (type(value) is int and float in kinds):
+            expected = " or ".join(WORDS[kind] for kind in kinds)
+            raise ValueError(f"{what}:{field}: expected {expected}; found {value!r}.")
 
 
 def _value(text: str) -> Any:

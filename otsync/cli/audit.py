@@ -34,14 +34,20 @@ class Audit:
     """Print the content of audit.json instead of the table."""
 
     def run(self) -> int:
+        from ..files.claim import claimed
+
+        if not 0 < self.tolerance < 1e6:
+            raise ValueError(f"--tolerance: expected frames above 0; found {self.tolerance:g}.")
+        with claimed(self.out, "otsync audit"):
+            return self._run()
+
+    def _run(self) -> int:
         from ..files.arrays import write_json
         from ..files.cache import Cache
         from ..io import open_scene
         from ..recordings.audit import REMEDIES, audit_scene
         from .tables import print_json
 
-        if not 0 < self.tolerance < 1e6:
-            raise ValueError(f"--tolerance: expected frames above 0; found {self.tolerance:g}.")
         scene = open_scene(self.scene, allow_outside=self.allow_outside)
         if self.cameras:
             scene = scene.take(self.cameras)

@@ -11,6 +11,7 @@ from typing import Any, Literal
 import tyro
 
 from ..bench import suites
+from ..files.claim import refuse_others
 
 BENCH_OPTIONS = (
     "scene",
@@ -79,6 +80,7 @@ class Bench:
 
     def run(self) -> int:
         self._check()
+        refuse_others(self.out, "otsync bench")
         defaults = {field.name: field.default for field in dataclasses.fields(self)}
         given = {n: getattr(self, n) for n in BENCH_OPTIONS if getattr(self, n) != defaults[n]}
         every = suites()

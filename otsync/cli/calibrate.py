@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -87,11 +88,21 @@ def calibrate_folder(folder: Path, out: Path, options: CalibrateOptions, *, forc
     return found
 
 
-def prepared(path: Path, *, allow_outside: bool = False) -> int:
+def prepared(
+    path: Path,
+    *,
+    allow_outside: bool = False,
+    named: Mapping[str, Sequence[str]] | None = None,
+    truth: Path | None = None,
+) -> int:
     """Make a folder of videos that nobody calibrated ready to be synchronised: init, calibrate, check; 1 for doubts.
 
     A folder with a scene.json, or whose reader knows the cameras, stays as it is: 0. What is done is printed on stderr.
-    ValueError where fewer than two cameras can be found.
+
+    Args:
+        named: videos that options name. truth: a file that must be read later. Both are looked at before the work.
+
+    ValueError where fewer than two cameras can be found, or an option names what is not there.
     """
     if not path.is_dir():
         return 0
@@ -101,6 +112,7 @@ def prepared(path: Path, *, allow_outside: bool = False) -> int:
     from ..files.claim import claimed
     from ..io.scene import read_document
     from ..recordings.check import check_scene
+    from ..types import Offsets
 
     document, _ = read_document(path)
     if all((video.get("camera") or {}).get("w2c") is not None for video in document["videos"]):
@@ -110,6 +122,12 @@ def prepared(path: Path, *, allow_outside: bool = False) -> int:
         raise ValueError(
             f"{path}: still missing: {'; '.join(clockless)}. Give it first: otsync init {quoted(path)} --fps 30."
         )
+    there = [video["name"] for video in document["videos"]]
+    for option, names in (named or {}).items():
+        if absent := [name for name in names if name not in there]:
+            raise ValueError(f"{option}: expected some of {', '.join(there)}; found {absent[0]!r}.")
+    if truth is not None:
+        Offsets.load(truth)
     tell(f"{path}: no scene.json and no cameras: looking for them (otsync calibrate {quoted(path)})")
     with claimed(path / "calibration", "otsync calibrate") as out:
         found = calibrate_folder(path, out, CalibrateOptions())

@@ -50,6 +50,7 @@ class Export:
 
     def run(self) -> int:
         from ..export import aligned
+        from ..files.claim import claimed
         from ..io import open_scene
         from ..types import Offsets
 
@@ -75,11 +76,13 @@ class Export:
         there = [path for e in chosen for path in e.targets(videos, self.out) if path.exists()]
         if there and not self.force:
             raise ValueError(f"{there[0]}: exists already. Pass --force to replace it, or --out for another place.")
-        for export in chosen:
-            notes = export.write(videos, self.out, width=self.width or WIDTH, fps=self.fps or videos.fps)
-            for note in notes:
-                tell(f"note: {note}")
-            written = [path for path in export.targets(videos, self.out) if path.exists()]
-            if written:
-                print(f"wrote {written[0] if len(written) == 1 else f'{len(written)} files to {written[0].parent}'}")
+        with claimed(self.out, "otsync export", keep=False):
+            for export in chosen:
+                notes = export.write(videos, self.out, width=self.width or WIDTH, fps=self.fps or videos.fps)
+                for note in notes:
+                    tell(f"note: {note}")
+                written = [path for path in export.targets(videos, self.out) if path.exists()]
+                if written:
+                    files = written[0] if len(written) == 1 else f"{len(written)} files to {written[0].parent}"
+                    print(f"wrote {files}")
         return 0

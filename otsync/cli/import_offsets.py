@@ -36,6 +36,7 @@ class ImportOffsets:
     """Let the scene name files outside its folder."""
 
     def run(self) -> int:
+        from ..files.claim import claimed, refuse_others
         from ..io.imports import filmed
         from ..io.scene import read_document
         from ..sync.prior import from_told, with_told
@@ -46,6 +47,7 @@ class ImportOffsets:
             raise ValueError(f"--sigma: expected seconds above 0; found {self.sigma:g}.")
         if not self.source.exists():
             raise ValueError(f"{self.source}: expected a file or folder with offsets; found none. Check the path.")
+        refuse_others(self.out, "otsync import-offsets")
         claiming = [i for i in IMPORTERS if (i.claims(self.source) if self.kind is None else i.name == self.kind)]
         if not claiming:
             kinds = "; ".join(f"{each.name}: {each.looks_for}" for each in IMPORTERS)
@@ -71,7 +73,8 @@ class ImportOffsets:
             if len(kept) < len(told):
                 print(f"note: {len(told) - len(kept)} of {len(told)} edges are of videos that {self.offsets} lacks")
             answer, contradictions = with_told(found, kept)
-        answer.save(self.out / "offsets.json")
+        with claimed(self.out, "otsync import-offsets"):
+            answer.save(self.out / "offsets.json")
         print(table(answer, None))
         for each in contradictions:
             print(f"contradiction: {each}")

@@ -19,6 +19,8 @@ from ..types import TrackSet
 from .slots import slot
 from .tables import finite, print_json, refusal
 
+HEADER = "a,b,score\n"
+
 
 @dataclass
 class Match:
@@ -41,6 +43,8 @@ class Match:
     """Default: by size, fused Gromov-Wasserstein below 200 tracks and its anchored form above."""
 
     def run(self) -> int:
+        if self.out is not None:
+            refuse_what_is_no_table_of_pairs(self.out)
         a, b = TrackSet.load(self.a), TrackSet.load(self.b)
         matcher = with_costs(self.matcher, self.costs) if self.costs else self.matcher
         if sys.stderr.isatty():  # one solve has no steps to count
@@ -60,7 +64,20 @@ class Match:
             from ..files.arrays import atomic_write
 
             with atomic_write(self.out, "w") as stream:
-                stream.write("a,b,score\n")
+                stream.write(HEADER)
                 stream.writelines(f"{i},{j},{s:.9g}\n" for (i, j), s in zip(matches.pairs, matches.score, strict=True))
             tell(f"wrote {self.out}")
         return refusal("match", matches.status, matches.flags)
+
+
+def refuse_what_is_no_table_of_pairs(out: Path) -> None:
+    """ValueError for a file that is there and was not written by this command."""
+    if not out.exists():
+        return
+    if out.is_file():
+        with out.open("rb") as stream:
+            if stream.read(len(HEADER)) in (HEADER.encode(), b""):
+                return
+    raise ValueError(
+        f"--out: expected a new file, or a table that otsync match wrote; {out} is something else. Choose another name."
+    )

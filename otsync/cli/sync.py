@@ -16,7 +16,7 @@ from ..sync.verb import unique_names
 from ..types import TrackSet
 from .method import MethodOptions
 from .recordings import RecordingOptions, reference_among, sync_recording
-from .tables import refuse_unused, report, true_offsets, with_progress
+from .tables import naming_files, refuse_unused, report, true_offsets, with_progress
 
 
 @dataclass
@@ -68,7 +68,14 @@ class Sync:
             if self.frames == "common":
                 from .calibrate import prepared
 
-                doubts = prepared(self.tracks[0], allow_outside=self.recording.allow_outside)
+                self.recording.stages(), self.recording.threads()  # options first: finding cameras takes minutes
+                given = [] if self.reference in (None, "auto") else [self.reference]
+                doubts = prepared(
+                    self.tracks[0],
+                    allow_outside=self.recording.allow_outside,
+                    named={"--reference": given, "--recording.cameras": self.recording.cameras},
+                    truth=self.truth,
+                )
             code = sync_recording(
                 self.tracks[0],
                 self.out,
@@ -98,13 +105,14 @@ class Sync:
         names = unique_names(tracks)
         reference = reference_among(names, self.reference)
         known = None if self.truth is None else true_offsets(self.truth, names)
-        offsets = with_progress(
-            tracks,
-            "synchronising",
-            self.workers,
-            reference=reference,
-            method=method,
-            frames=self.frames,
-        )
+        with naming_files(self.tracks):
+            offsets = with_progress(
+                tracks,
+                "synchronising",
+                self.workers,
+                reference=reference,
+                method=method,
+                frames=self.frames,
+            )
         truth = None if known is None else known - known[offsets.component]
         return report(offsets, tracks, truth, self.out, "Synchronisation report", as_json=self.json)

@@ -5,8 +5,10 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import re
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -49,6 +51,18 @@ def with_progress(tracks: list[TrackSet], what: str, workers: int = 1, **options
         return synchronize(tracks, map=progress(map), **options)
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
         return synchronize(tracks, map=progress(pool.map), **options)
+
+
+@contextmanager
+def naming_files(paths: Sequence[Path]) -> Iterator[None]:
+    """An error about ``tracks[1]`` names the file that these were read from."""
+    try:
+        yield
+    except ValueError as error:
+        said = re.match(r"tracks\[(\d+)\][.:]? *", str(error))
+        if said is None:
+            raise
+        raise ValueError(f"{paths[int(said[1])]}: {str(error)[said.end() :]}") from None
 
 
 def refuse_unused(options: Any, names: Iterable[str], why: str) -> None:

@@ -29,6 +29,10 @@ class Cache:
 
     root: Path | None = None
 
+    def __post_init__(self) -> None:
+        if self.root is not None:
+            object.__setattr__(self, "root", Path(self.root))  # from a script, a str
+
     def arrays(self, stage: str, key: tuple[Any, ...], compute: Callable[[], dict[str, np.ndarray]]) -> dict:
         """``compute()``, or what it returned when it was last called with the same ``key``.
 

@@ -24,6 +24,9 @@ MARKS = {
     "otsync demo": ("demo.json",),
     "otsync calibrate": ("calibration.html",),
     "otsync film": ("cameras.json",),
+    "otsync audit": ("audit.json",),
+    "otsync import-offsets": ("offsets.json",),
+    "otsync export": ("timeline.otio", "frames.csv", "mosaic.mp4"),
     "recon export": ("frames.json",),
     "recon render": ("00000.png",),
 }

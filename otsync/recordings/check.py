@@ -64,6 +64,9 @@ DEPTH_RATIO = (0.2, 5.0)
 PARALLEL = np.radians(1.0)
 """Angle between optical axes below which where they meet is a matter of rounding: 57 times their distance away."""
 
+BLANK = " \t\u00a0\u200b\u200c\u200d\u2060\ufeff"
+"""Characters beside a name that nobody sees."""
+
 BEYOND = 0.5
 """Images beside an image where the common target may still lie."""
 
@@ -98,7 +101,7 @@ def check_scene(
     document = {**document, "videos": entries}
     for item in document.get("missing") or ():
         findings.append(Finding("error", "", f"still missing: {item}.", "Fill it in, then delete 'missing'."))
-    if len(entries) < 2:
+    if len(every) < 2:
         findings.append(Finding("error", "", "one video only.", "Add at least a second one."))
     findings += _twice(entries, Paths(root, allow_outside))
     unmirrored = _unmirrored(entries)
@@ -171,6 +174,15 @@ def _layout(document: dict[str, Any], file: Path) -> tuple[list[Finding], list[d
     return findings, sound
 
 
+def _rounded(w2c: Any) -> Any:
+    """A pose as something to look up: 1 and 1.0 are one number, and files round to a few digits."""
+    try:
+        x = np.asarray(w2c, float)
+    except (ValueError, TypeError, OverflowError):
+        return str(w2c)
+    return x.shape, (np.round(x, 6) + 0.0).tobytes()
+
+
 def _twice(entries: Sequence[dict[str, Any]], paths: Paths) -> Iterable[Finding]:
     """Names that occur twice, poses that two cameras share, files that two videos are made of."""
     names: dict[str, int] = {}
@@ -180,7 +192,7 @@ def _twice(entries: Sequence[dict[str, Any]], paths: Paths) -> Iterable[Finding]
         name = entry["name"]
         names[name] = names.get(name, 0) + 1
         w2c = (entry.get("camera") or {}).get("w2c")
-        first = poses.setdefault(str(w2c), name)
+        first = poses.setdefault(_rounded(w2c), name)
         if w2c is not None and first != name:
             yield Finding(
                 "error",
@@ -192,6 +204,15 @@ def _twice(entries: Sequence[dict[str, Any]], paths: Paths) -> Iterable[Finding]
         for other in sorted(sharing):
             yield Finding(
                 "error", name, f"it is made of files that {other} is made of.", "Name the files of each camera once."
+            )
+    if blank := [name for name in names if not name.strip(BLANK)]:
+        yield Finding("error", blank[0], "its name is blank.", "Name it: names stand in tables and in file names.")
+    alike: dict[str, str] = {}
+    for name in names:
+        first = alike.setdefault(name.strip(BLANK).casefold(), name)
+        if first != name:
+            yield Finding(
+                "warning", name, f"its name reads like {first!r}.", "Rename it: on some disks their files are one."
             )
     for name, count in names.items():
         if count > 1:

@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from ..types.checks import check_whole
+
 Pair = tuple[int, int]
 
 CAUCHY = 2.5
@@ -42,8 +44,7 @@ class Graph:
 
     def __post_init__(self) -> None:
         for name in ("extra", "complete", "starts"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"Graph.{name}: expected a number >= 0; found {getattr(self, name)}.")
+            check_whole(f"Graph.{name}", getattr(self, name), 0)
         for name, switch, off in (("complete", "extra", 0), ("starts", "curves", False)):
             if getattr(self, switch) == off and getattr(self, name) != type(self).__dataclass_fields__[name].default:
                 raise ValueError(

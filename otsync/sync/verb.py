@@ -26,6 +26,7 @@ from ..match.unbalanced import UnbalancedOT
 from ..refine.slot import Rate, Refiner, RefinerLike
 from ..refine.splines import SplineRefine
 from ..types import Alignment, Break, Clock, Matches, Offsets, Status, TrackSet, in_order
+from ..types.checks import check_whole
 from .breaks import MOST, Seen, Suspect, culprit, mended, remeasured, runs_on, suspects
 from .graph import Graph, Pair
 from .method import Method, with_costs
@@ -78,12 +79,13 @@ def synchronize(
 
     A pair that fails gets a status and nan; the others live. Wrong input raises ValueError before any work.
     """
+    if method is not None and not isinstance(method, Method):
+        raise ValueError(f"method: expected a Method such as otsync.PAPER; found {method!r}.")
     chosen_method = (method or Method()).but(
         matcher=matcher, aligner=aligner, refiner=refiner, graph=graph, rematch=rematch, rate=rate
     )
     times = 1 if chosen_method.rematch is None else chosen_method.rematch
-    if times < 0:
-        raise ValueError(f"rematch: expected 0 or more; found {times}.")
+    check_whole("rematch", times, 0)
     if matches is not None and matcher is not None:
         raise ValueError("matcher, matches: expected one of them; found both. Matches of your own need no matcher.")
     matching = None if chosen_method.matcher is None else Matcher.of(chosen_method.matcher)
@@ -396,6 +398,8 @@ def check_tracks(
             )
         chosen = reference % len(tracks)
     for v, t in enumerate(tracks):
+        if not isinstance(t, TrackSet):
+            raise ValueError(f"tracks[{v}]: expected a TrackSet; found {type(t).__name__}.")
         t.check(f"tracks[{v}]", xyz=xyz)
     frames = {t.frame for t in tracks if t.frame is not None}
     if len(frames) > 1 and not own:

@@ -10,8 +10,10 @@ import numpy as np
 
 
 def positive(name: str, value: float, *, zero: bool = False) -> None:
-    if not (np.isfinite(value) and (value > 0 or (zero and value == 0))):
-        raise ValueError(f"{name}: expected a number {'>=' if zero else '>'} 0; found {value}.")
+    real = isinstance(value, numbers.Real) and not isinstance(value, bool | np.bool_)
+    if not (real and np.isfinite(value) and (value > 0 or (zero and value == 0))):
+        found = f"{value}" if real else repr(value)
+        raise ValueError(f"{name}: expected a number {'>=' if zero else '>'} 0; found {found}.")
 
 
 def check_number(name: str, value: Any, above: float = 0.0, below: float = math.inf) -> None:

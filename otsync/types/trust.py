@@ -13,8 +13,8 @@ from dataclasses import dataclass, fields
 class Trust:
     """Limits beyond which an alignment is flagged.
 
-    Calibrated on simulated pairs of the moving classes, mid to brutal, and on the odd cases (static, unrelated, without
-    overlap), seeds 1000-1999; ``otsync bench sync --promises`` tests them from seed 5000 on.
+    Chosen on simulated worlds of seeds below 10,000 (each note names its own); ``otsync bench thresholds`` says what
+    other values would do on them, and ``otsync bench trust`` measures from seed 20,000 on.
 
     Args:
         evidence: WEAK below this rise of the score's peak over its median, in nats a match. Right answers that no other
@@ -62,8 +62,8 @@ class Trust:
         """
         for field in fields(self):
             value = getattr(self, field.name)
-            if not math.isfinite(value):
-                raise ValueError(f"{owner}.{field.name}: expected a finite number; found {value}.")
+            if not isinstance(value, (int, float)) or isinstance(value, bool) or not math.isfinite(value):
+                raise ValueError(f"{owner}.{field.name}: expected a finite number; found {value!r}.")
             if field.name not in reads and value != field.default:
                 raise ValueError(
                     f"{owner}.{field.name}: expected one of {', '.join(reads)}, which are what it reads; found "

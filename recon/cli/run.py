@@ -79,7 +79,16 @@ class Run:
                     f"{getattr(self.recording, name)}. Synchronise with otsync sync, then reconstruct with recon fit."
                 )
         threads, method, deadline = self.recording.threads(), self.slots.chosen(), deadline_of(self.plan)
-        doubts = prepared(self.scene, allow_outside=self.allow_outside or self.recording.allow_outside)
+        doubts = prepared(
+            self.scene,
+            allow_outside=self.allow_outside or self.recording.allow_outside,
+            named={
+                "--held-out": self.held_out,
+                "--reference": [] if self.reference is None else [self.reference],
+                "--recording.cameras": self.recording.cameras,
+            },
+            truth=self.truth,
+        )
         if deadline is not None and deadline.seconds - deadline.left > WORTH_TELLING:
             spent = f"finding cameras took {deadline.seconds - deadline.left:.0f} s of the budget"
             tell(f"{spent} of {deadline.seconds:g} s; {deadline.left:.0f} s are left for all else")

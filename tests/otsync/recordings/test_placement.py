@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -131,3 +132,22 @@ def test_a_calibration_that_is_none_is_left_to_its_reader(tmp_path, told):
     assert came_later(tmp_path) == () and prepared(tmp_path) == 0
     with pytest.raises(ValueError, match="calibration"):
         open_scene(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("given", "field"),
+    [
+        ({"named": {"--held-out": ["cam1", "nope"]}}, "--held-out: .*cam0, cam1; found 'nope'"),
+        ({"named": {"--reference": ["nope"]}}, "--reference: "),
+        ({"truth": Path("nothere.json")}, "nothere.json"),
+    ],
+)
+def test_options_are_read_before_cameras_are_looked_for(tmp_path, monkeypatch, given, field):
+    write_recording(tmp_path, [0.0, 2.0], frames=3)
+    document = json.loads((tmp_path / "scene.json").read_text())
+    (tmp_path / "scene.json").unlink()
+    bare = [{k: v for k, v in video.items() if k != "camera"} for video in document["videos"]]
+    monkeypatch.setattr("otsync.io.scene.read_document", lambda path: ({**document, "videos": bare}, path))
+    monkeypatch.setattr("otsync.cli.calibrate.calibrate_folder", lambda *_: pytest.fail("the work began"))
+    with pytest.raises((ValueError, OSError), match=field):
+        prepared(tmp_path, **given)
