@@ -158,6 +158,9 @@ COARSE_FRAMES = 1 / 3
 sigmas are one. Of recordings that ``recon simulate`` films (seeds 30-41), 5 of the 47 offsets from pixels that nothing
 else flagged were off by more than a frame, at sigmas of .38 to 1.3."""
 
+UNEVEN = 0.75
+"""Sigma at one end of an overlap over that at the other below which tables and reports tell both."""
+
 _NO_PEAKS = np.zeros((0, 2))
 
 
@@ -326,13 +329,41 @@ class Offsets:
         shown, tells = mended_times(own, self.breaks[v])
         return np.where(tells, self.clock(v).world(shown), np.nan)
 
+    @property
+    def sigma_ends(self) -> Float[np.ndarray, "V 2"]:
+        """One standard deviation, s, of what each video shows at the beginning and at the end of what it shares.
+
+        ``sigma`` is the larger one. The other is smaller by as much as it is in the video's pairs (``sigma_begin`` and
+        ``sigma_end`` in their statistics), in the middle of these; the same where no pair tells.
+        """
+        ends = np.repeat(self.sigma[:, None], 2, 1)
+        for v in range(len(self)):
+            told = [
+                [alignment.stats["sigma_begin"], alignment.stats["sigma_end"]]
+                for pair, alignment in self.alignments.items()
+                if v in pair and {"sigma_begin", "sigma_end"} <= set(alignment.stats)
+            ]
+            pairs = np.array([pair for pair in told if np.isfinite(pair).all() and max(pair) > 0]).reshape(-1, 2)
+            if len(pairs):
+                share = np.median(pairs / pairs.max(1, keepdims=True), 0)
+                ends[v] *= share / share.max()
+        return ends
+
     def clock_notes(self) -> list[str]:
-        """In words what is unusual about the videos' clocks: rates that are not the declared ones, and breaks."""
+        """In words what is unusual about the videos' clocks: rates that are not the declared ones, breaks, and one end
+        that is known much better than the other.
+        """
         notes = [
             f"{name}: a second of its clock lasts {rate:.5f} s of the reference's; its declared frame rate is wrong"
             for name, rate in zip(self.names, self.rates, strict=True)
             if np.isfinite(rate) and rate != 1
         ]
+        for v, (begin, end) in enumerate(self.sigma_ends * self.fps[self.component][:, None]):
+            if min(begin, end) < UNEVEN * max(begin, end):
+                notes.append(
+                    f"{self.names[v]}: one sigma is {begin:.3f} frames at the beginning of what it shares with others, "
+                    f"{end:.3f} at the end"
+                )
         return notes + [f"{n}: {b}" for n, breaks in zip(self.names, self.breaks, strict=True) for b in breaks]
 
     @property

@@ -75,7 +75,8 @@ def test_an_export_goes_into_no_result(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("costs", "field"), [("cosine:weight=abc", "weight"), ("cosine:center=3", "center"), ("cosine:weight=True", "weight")]
+    ("costs", "field"),
+    [("cosine:weight=abc", "weight"), ("cosine:center=3", "center"), ("cosine:weight=True", "weight")],
 )
 def test_a_value_of_another_type_is_refused_before_the_work(tracks, capsys, costs, field):
     with pytest.raises(SystemExit) as stopped:

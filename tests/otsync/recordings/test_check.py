@@ -110,6 +110,13 @@ def set_camera(videos, key, value):
     videos[1]["camera"][key] = value
 
 
+def in_whole_numbers(videos):
+    """The first video's pose, both made whole numbers: as an int here, as a float there."""
+    pose = [[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]]
+    videos[0]["camera"]["w2c"] = np.array(pose, float).tolist()
+    return pose
+
+
 @pytest.mark.parametrize(
     ("change", "severity", "words"),
     [
@@ -123,6 +130,9 @@ def set_camera(videos, key, value):
         (lambda v: v[1].update(range=[0, 20], depth=None), "warning", "few"),
         (lambda v: v[1].update(name="c0"), "error", "2 videos have this name"),
         (lambda v: set_camera(v, "w2c", v[0]["camera"]["w2c"]), "error", "stands where that of c0 stands"),
+        (lambda v: set_camera(v, "w2c", in_whole_numbers(v)), "error", "stands where that of c0 stands"),
+        (lambda v: v[1].update(name=" \u200b"), "error", "blank"),
+        (lambda v: v[1].update(name="C0"), "warning", "reads like 'c0'"),
         (lambda v: v[1].update(frames="c0/*.jpg"), "error", "made of files that c0 is made of"),
         (lambda v: set_camera(v, "width", 160.9), "error", "videos[1].camera.width (of 'c1'): expected a whole number"),
         (lambda v: v[1].update(nmae="x"), "error", "Did you mean 'name'?"),

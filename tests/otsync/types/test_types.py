@@ -388,3 +388,17 @@ def test_coarse_is_what_three_sigmas_leave_open_by_a_frame_of_the_slower_video()
     assert found.flags == ((), (), (Status.WEAK, Status.COARSE), (), ())
     lost = dataclasses.replace(known, sigma=np.full(5, np.nan)).judged_by_sigma()
     assert lost.ok, "what has no answer has a flag of its own"
+
+
+def test_sigma_at_both_ends_is_that_of_the_pairs_and_tells_where_it_is_uneven(tmp_path):
+    stats = {"sigma_begin": 0.01, "sigma_end": 0.04}
+    known = Offsets.known(("a", "b", "c"), np.array([0.0, 1.0, 2.0]), 30.0)
+    pairs = {(0, 1): Alignment(1.0, sigma=0.04, stats=stats), (0, 2): Alignment(2.0, sigma=0.05)}
+    offsets = dataclasses.replace(known, sigma=np.array([0.0, 0.02, 0.05]), alignments=pairs)
+    np.testing.assert_allclose(offsets.sigma_ends, [[0, 0], [0.005, 0.02], [0.05, 0.05]])
+    assert (offsets.sigma_ends.max(1) == offsets.sigma).all()
+    offsets.save(tmp_path / "offsets.json")
+    again = Offsets.load(tmp_path / "offsets.json")
+    np.testing.assert_allclose(again.sigma_ends, offsets.sigma_ends)
+    (note,) = again.clock_notes()
+    assert note.startswith("b: one sigma is 0.150 frames at the beginning") and "0.600 at the end" in note
