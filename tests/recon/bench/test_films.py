@@ -1,0 +1,56 @@
+"""``otsync bench films``: what is told of the routes is what they answered."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from otsync.types import Offsets, Status
+from recon.bench import films
+
+
+def row(error, sigma, trusted=True):
+    return {"route": "depth", "error": error, "sigma": sigma, "trusted": trusted}
+
+
+def test_a_route_is_summed_up_over_what_it_answered():
+    rows = [row(0.1, 0.2), row(0.3, 0.2), row(1.5, 0.2), row(2.0, 3.0, False), row(None, None, False)]
+    told = films.summary("depth", rows)
+    assert (told["videos"], told["answers"], told["trusted"], told["wrong"], told["over a frame"]) == (5, 4, 3, 1, 2)
+    assert told["1 sigma"] == pytest.approx(0.5) and told["2 sigma"] == pytest.approx(0.75)
+    assert films.summary("stereo", [])["1 sigma"] is None
+
+
+def test_answers_are_held_against_the_truth_and_kept(tmp_path, monkeypatch):
+    """The routes are replaced: what they say of a filmed scene is known."""
+    asked = []
+
+    def answered(scene, folder, route, map):
+        asked.append(route)
+        if route == "stereo":
+            return None
+        truth = Offsets.load(folder / "recording" / "truth.json")
+        found = Offsets.known(scene.names, truth.seconds + np.array([0, 0.5 / 30]), 30.0)
+        return Offsets(**{**vars(found), "sigma": np.array([0, 0.01]), "flags": ((), (Status.COARSE,))})
+
+    monkeypatch.setattr(films, "_answer", answered)
+    for _ in range(2):
+        rows = list(films.answers(tmp_path, 3, (12, 2), ("pixels", "stereo"), map))
+        assert [r["error"] for r in rows] == [pytest.approx(0.5), None]
+        assert rows[0]["sigma"] == pytest.approx(0.3) and rows[0]["flags"] == "coarse" and not rows[0]["trusted"]
+        assert rows[1]["flags"] == "refused"
+    assert asked == ["pixels", "stereo"]
+
+
+def test_a_route_that_there_is_not_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="--only: expected routes among depth, pixels, stereo, fit; found deep"):
+        films.run(tmp_path, only=("deep",))
+
+
+@pytest.mark.slow
+def test_one_film_through_all_routes(tmp_path):
+    assert films.run(tmp_path, seeds=1, first_seed=7) == 0
+    told = {r["route"]: r for r in json.loads((tmp_path / "films_routes.json").read_text())["rows"]}
+    assert set(told) == {"depth", "pixels", "stereo", "fit"} and told["fit"]["median error"] < 0.3
