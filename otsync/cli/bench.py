@@ -46,7 +46,7 @@ class Bench:
     """
 
     suite: tyro.conf.Positional[suite_names()]
-    """Which benchmark; "all": every one that needs no recording, but for thresholds, which takes hours."""
+    """Which benchmark; "all": every one that needs no recording, but for films and thresholds, which take hours."""
     scene: tyro.conf.Positional[Path | None] = None
     """A truly synchronised recording (its folder or scene.json): of panoptic and audit; if you like, of chain,
     own-frames and calibrate."""
