@@ -8,7 +8,7 @@ answer, so that those which the other offset needs are not among the matches.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,12 +37,14 @@ AGREES, USUALLY = 0.35, 0.1
 270, .49 in all but one of 57 real pairs. Of 17 answers that were wrong behind a break .2 to 1.2 s from an end
 and trusted without this module (seeds 500-549: ten frames lost or twelve frozen), the limits together catch 11."""
 
-HOLDS, TELLING = 0.5, 0.7
+HOLDS, FEWER, TELLING = 0.5, 0.75, 0.7
 """Share of the samples that agree in one of any two windows in a row, over the median of the clip: less, and the answer
-does not hold there. The median must be that high: of people who turn, half of the samples agree (.38 to .54 in pairs of
-basketball), more and fewer by turns, which tells nothing. Of 325 right answers that are trusted (mid to brutal, few
-tracks, like people, flocks, mended breaks; seeds 500-549) the least has .65. Answers that were wrong and trusted before
-have 0 to .49: ten lost frames (seed 34002), exchanged halves (507, 34009), a film that is played backwards (34006)."""
+does not hold there; nor below the second one where another offset suits one of the two windows clearly better. The
+median must be that high: of people who turn, half of the samples agree (.38 to .54 in pairs of basketball), more and
+fewer by turns, which tells nothing. Of 325 right answers that are trusted (mid to brutal, few tracks, like people,
+flocks, mended breaks; seeds 500-549) the least has .65, and of those below .75 none a gain above .16. Answers that were
+wrong and trusted before have 0 to .49: ten lost frames (seed 34002), exchanged halves (507, 34009), a film that is
+played backwards (34006); one has .66 and a gain of .25 (35009)."""
 
 WITNESSES, ENOUGH = 5, 5
 """Matches that must be seen at both offsets, and frames that tell the constant differences."""
@@ -112,22 +114,25 @@ def broken_part(answer: Answer, a: TrackSet, b: TrackSet) -> tuple[float, float]
 
 def suits_another(matched: _Matched) -> bool:
     """Whether another offset clearly suits the end better, by the samples that are seen at both."""
+    return any(
+        gain > SUITS_BETTER and suits > SUITS for length in LENGTHS for gain, suits in _others(matched, 0.0, length)
+    )
+
+
+def _others(matched: _Matched, begin: float, length: float) -> Iterator[tuple[float, float]]:
+    """Of every other offset that enough matches are seen at in a window: how much better it suits it, and how well."""
+    if (window := matched.window(begin, length)) is None:
+        return
+    here = matched.levels(*window)
     steps = np.arange(-round(OTHERS * 30), round(OTHERS * 30) + 1) / 30
-    for length in LENGTHS:
-        if (window := matched.window(0.0, length)) is None:
-            continue
-        here = matched.levels(*window)
-        for step in steps[np.abs(steps) > OFF]:
-            there = matched.levels(*window, step)
-            gain = there - here
-            witnesses = np.isfinite(gain).sum(0)
-            told = witnesses >= WITNESSES
-            if told.sum() < LEAST_BESIDE:
-                continue
+    for step in steps[np.abs(steps) > OFF]:
+        there = matched.levels(*window, step)
+        gain = there - here
+        witnesses = np.isfinite(gain).sum(0)
+        told = witnesses >= WITNESSES
+        if told.sum() >= LEAST_BESIDE:
             better = float((np.nansum(gain[:, told], 0) / witnesses[told]).mean())
-            if better > SUITS_BETTER and float(np.nanmean(there[:, told])) > SUITS:
-                return True
-    return False
+            yield better, float(np.nanmean(there[:, told]))
 
 
 def does_not_agree(matched: _Matched) -> float | None:
@@ -148,9 +153,14 @@ def does_not_agree(matched: _Matched) -> float | None:
     if shares[0] < AGREES * float(np.quantile(told, USUALLY)):
         return 0.0
     usual = float(np.median(told))
-    few = shares < (HOLDS * usual if usual > TELLING else 0.0)  # nan is not
-    both = np.flatnonzero(few[:-1] & few[1:])
-    return float(begins[both[0]]) if len(both) else None
+    if usual <= TELLING:
+        return None
+    lower = np.maximum(shares[:-1], shares[1:])  # nan where one is not known
+    for k in np.flatnonzero(lower < FEWER * usual):
+        gains = (gain for begin in begins[k : k + 2] for gain, _ in _others(matched, begin, length))
+        if lower[k] < HOLDS * usual or max(gains, default=0.0) > SUITS_BETTER:
+            return float(begins[k])
+    return None
 
 
 def _share(matched: _Matched, begin: float, length: float) -> float:

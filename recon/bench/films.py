@@ -24,7 +24,6 @@ from otsync.files.arrays import atomic_write
 from otsync.files.cache import Cache
 from otsync.io import open_scene
 from otsync.io.scene import Scene
-from otsync.priors.stereo import EmptyHull
 from otsync.progress import Progress, tell
 from otsync.recordings.routes import synchronize_scene
 from otsync.types import Offsets
@@ -126,7 +125,10 @@ def _answer(scene: Scene, folder: Path, route: str, map: MapLike) -> Offsets | N
     if route != FIT:
         try:
             return synchronize_scene(scene, route=ROUTES[route], cache=cache, map=map).offsets
-        except EmptyHull:
+        except ValueError as error:
+            if route != "stereo":
+                raise
+            tell(f"stereo refuses: {error}")
             return None
     start = _kept(folder / "depth.json", partial(_answer, scene, folder, "depth", map))
     assert start is not None
