@@ -26,7 +26,7 @@ MARKS = {
     "otsync film": ("cameras.json",),
     "otsync audit": ("audit.json",),
     "otsync import-offsets": ("offsets.json",),
-    "otsync export": ("timeline.otio", "frames.csv", "mosaic.mp4"),
+    "otsync export": ("timeline.otio",),
     "recon export": ("frames.json",),
     "recon render": ("00000.png",),
 }

@@ -7,11 +7,9 @@ begins from the answer with depth. An answer is wrong where it is off by more th
 
 from __future__ import annotations
 
-import dataclasses
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +18,6 @@ import numpy as np
 from otsync.bench.record import Row, table, write_rows
 from otsync.bench.sync_acceptance import WRONG
 from otsync.compute.threads import MapLike
-from otsync.files.arrays import atomic_write
 from otsync.files.cache import Cache
 from otsync.io import open_scene
 from otsync.io.scene import Scene
@@ -61,11 +58,12 @@ def run(
 ) -> int:
     """Measure, print and write a row a video and a row a route; 1 where a trusted answer is wrong.
 
-    What is done is kept in ``cache``: a run that was killed goes on from there.
+    Films, stages and fits are kept in ``cache``: a run that was killed goes on from there. Where the code of a stage or
+    of the fit has changed, give another folder.
 
     Args:
         seeds: scenes. first_seed: where they begin. only: routes, of depth, pixels, stereo and fit; default: all.
-        cache: folder for recordings and stages; default: ``films`` in ``out``.
+        cache: default: ``films`` in ``out``.
 
     Raises:
         ValueError: for a route that there is not.
@@ -81,10 +79,10 @@ def run(
                 rows.append(row)
     about = {"seeds": seeds, "first_seed": first_seed}
     write_rows(out, "films", rows, about)
-    told = [summary(route, [r for r in rows if r["route"] == route]) for route in only or known]
-    write_rows(out, "films_routes", told, about)
-    print(table(told), flush=True)
-    return 1 if any(row["wrong"] for row in told) else 0
+    routes = [summary(route, [r for r in rows if r["route"] == route]) for route in only or known]
+    write_rows(out, "films_routes", routes, about)
+    print(table(routes), flush=True)
+    return 1 if any(row["wrong"] for row in routes) else 0
 
 
 def answers(home: Path, seed: int, film: tuple[int, int], routes: Sequence[str], map: MapLike) -> Iterator[Row]:
@@ -96,59 +94,54 @@ def answers(home: Path, seed: int, film: tuple[int, int], routes: Sequence[str],
         capture = synthetic(seed, cameras=cameras, held_out=0, frames=frames, offsets=MAX_OFFSET)
         write_capture(capture, folder / "recording")
     scene, truth = open_scene(folder / "recording"), Offsets.load(folder / "recording" / "truth.json")
+    cache = Cache(folder / "stages")
+    found: Offsets | None = None
+    depth: Offsets | None = None
     for route in routes:
         tell(f"film {seed}: {route}")
-        found = _kept(folder / f"{route}.json", partial(_answer, scene, folder, route, map))
-        for v, name in enumerate(scene.names):
-            if v == (0 if found is None else found.reference):
-                continue
-            row: dict[str, Any] = {
-                "route": route,
-                "seed": seed,
-                "video": name,
-                "error": None,
-                "sigma": None,
-                "trusted": False,
-            }
-            if found is not None and np.isfinite(found.seconds[v]) and found.component[v] == found.reference:
-                known = truth.seconds[truth.names.index(name)] - truth.seconds[truth.names.index(scene.names[0])]
-                row["error"] = float(abs(found.seconds[v] - known) * found.fps[0])
-                row["sigma"] = float(found.sigma[v] * found.fps[0])
-                row["trusted"] = found.status[v].ok
-            row["flags"] = "refused" if found is None else " ".join(flag.code for flag in found.flags[v])
-            yield row
+        if route == FIT:
+            found = fitted(scene, depth or synchronized(scene, "depth", cache, map), folder / "result", cache, map)
+        else:
+            found = synchronized(scene, route, cache, map)
+        depth = found if route == "depth" else depth
+        yield from told(route, seed, scene.names, found, truth)
 
 
-def _answer(scene: Scene, folder: Path, route: str, map: MapLike) -> Offsets | None:
-    """None where a route refuses a scene: stereo needs five cameras around it."""
-    cache = Cache(folder / "stages")
-    if route != FIT:
-        try:
-            return synchronize_scene(scene, route=ROUTES[route], cache=cache, map=map).offsets
-        except ValueError as error:
-            if route != "stereo":
-                raise
-            tell(f"stereo refuses: {error}")
-            return None
-    start = _kept(folder / "depth.json", partial(_answer, scene, folder, "depth", map))
+def synchronized(scene: Scene, route: str, cache: Cache, map: MapLike) -> Offsets | None:
+    """None where stereo refuses a scene: it needs five cameras around it."""
+    try:
+        return synchronize_scene(scene, route=ROUTES[route], cache=cache, map=map).offsets
+    except ValueError as error:
+        if route != "stereo":
+            raise
+        tell(f"stereo refuses: {error}")
+        return None
+
+
+def fitted(scene: Scene, start: Offsets | None, out: Path, cache: Cache, map: MapLike) -> Offsets:
+    """The clocks of the photometric fit."""
     assert start is not None
-    done = reconstruct(
-        scene, start, folder / "result", plan=PLAN, cache=cache, map=map, progress=Progress(lambda _: None)
-    )
-    return done.fitted.offsets
+    quiet = Progress(lambda _: None)
+    return reconstruct(scene, start, out, plan=PLAN, cache=cache, map=map, progress=quiet).fitted.offsets
 
 
-def _kept(path: Path, answer: Callable[[], Offsets | None]) -> Offsets | None:
-    """What ``path`` holds; where there is none, the answer, which it then holds. An empty file is a refusal."""
-    if path.exists():
-        return Offsets.load(path) if path.stat().st_size else None
-    found = answer()
-    if found is not None:
-        dataclasses.replace(found, matches={}).save(path)
-    else:
-        with atomic_write(path, "w"):
-            pass
-    return found
+def told(route: str, seed: int, names: Sequence[str], found: Offsets | None, truth: Offsets) -> Iterator[Row]:
+    """A row for every video but the first, which is the reference; without error and sigma where there is no answer."""
+    for v, name in list(enumerate(names))[1:]:
+        answered = found is not None and np.isfinite(found.seconds[v]) and found.component[v] == 0
+        error = sigma = None
+        if found is not None and answered:
+            known = truth.between(truth.names.index(names[0]), truth.names.index(name))
+            error, sigma = abs(found.between(0, v) - known) * found.fps[0], found.sigma[v] * found.fps[0]
+        yield {
+            "route": route,
+            "seed": seed,
+            "video": name,
+            "error": None if error is None else float(error),
+            "sigma": None if sigma is None else float(sigma),
+            "trusted": found is not None and answered and found.status[v].ok,
+            "flags": "refused" if found is None else " ".join(flag.code for flag in found.flags[v]),
+        }
 
 
 def summary(route: str, rows: Sequence[Row]) -> Row:

@@ -17,6 +17,7 @@ ALIGN = ("tests/otsync/align",)
 CLOCKS = ("tests/otsync/clocks/test_splines.py",)
 REFINE = ("tests/otsync/refine",)
 EPIPOLAR = ("tests/otsync/epipolar",)
+PARTS = ("tests/otsync/sync/test_parts.py",)
 FRAMES = ("tests/otsync/frames/test_fit.py",)
 GRAPH = ("tests/otsync/sync/test_graph.py",)
 SYNC = (*GRAPH, "tests/otsync/sync/test_verdict.py", "tests/otsync/sync/test_sync.py")
@@ -49,6 +50,39 @@ class Break:
 
 
 BREAKS = (
+    # --- parts of clips in which an answer does not hold ----------------------------------------------------------------
+    Break(
+        "parts-few-agree",
+        "otsync/sync/parts.py",
+        "if lower[k] < HOLDS * usual or max(gains, default=0.0) > SUITS_BETTER:",
+        "if max(gains, default=0.0) > SUITS_BETTER:",
+        PARTS,
+        "a part in which hardly any position agrees passes, unless another offset is seen to suit it",
+    ),
+    Break(
+        "parts-another-suits",
+        "otsync/sync/parts.py",
+        "if lower[k] < HOLDS * usual or max(gains, default=0.0) > SUITS_BETTER:",
+        "if lower[k] < HOLDS * usual:",
+        PARTS,
+        "a part in which fewer positions agree and another offset suits better passes",
+    ),
+    Break(
+        "parts-gap-asked",
+        "otsync/sync/parts.py",
+        "known = raw[1].sampled(clock.own(a.times))",
+        "known = np.ones(len(a.times), bool)",
+        PARTS,
+        "what lies in the gap of a mended clock is asked about, and does not agree",
+    ),
+    Break(
+        "parts-jump-exact",
+        "otsync/sync/verb.py",
+        "(b.sigma if np.isfinite(b.sigma) else UNMEASURED / nominal_fps(t)) ** 2",
+        "(b.sigma if np.isfinite(b.sigma) else 0.0) ** 2",
+        PARTS,
+        "a jump that could not be measured counts as exact",
+    ),
     # --- costs ------------------------------------------------------------------------------------------------------
     Break(
         "costs-trimmed-largest",

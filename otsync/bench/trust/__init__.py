@@ -3,4 +3,5 @@
 worlds.py   the classes, each a function of a seed
 run.py      answers, errors and claims; tables; the diagram
 diagram.py  claimed against found
+thresholds.py  what other values of the limits behind the flags would trust
 """

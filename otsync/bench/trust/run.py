@@ -7,7 +7,7 @@ more than a frame at either end of what two videos share; where there is no true
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -53,7 +53,7 @@ def run(
     jobs = [(name, "default", first_seed + k) for name in chosen for k in range(seeds)]
     if not only:
         jobs += [(n, m, first_seed + k) for n in SHORT for m in METHODS if m != "default" for k in range(seeds)]
-    rows = list(measured(jobs))
+    rows = list(measured(jobs, one, "trust"))
     about = {"seeds": seeds, "first_seed": first_seed}
     write_rows(out, "trust", [written(r) for r in rows], about)
     summary = summarise(rows)
@@ -69,13 +69,13 @@ def run(
     return 0 if all(c.met for c in checks) or not promises else 1
 
 
-def measured(jobs: Sequence[tuple[str, str, int]]) -> Iterator[Row]:
-    """A row a video; the jobs are done by a process a core."""
+def measured(jobs: Sequence[Any], answer: Callable[[Any], list[dict[str, Any]]], what: str) -> Iterator[dict[str, Any]]:
+    """A row a video; the jobs are done by a process a core. what: is counted, in the progress bar."""
     import multiprocessing
 
     workers = len(os.sched_getaffinity(0))
     with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
-        for rows in counted(pool.map(one, jobs, chunksize=2), "trust", "world", total=len(jobs)):
+        for rows in counted(pool.map(answer, jobs, chunksize=2), what, "world", total=len(jobs)):
             yield from rows
 
 
@@ -83,11 +83,11 @@ def one(job: tuple[str, str, int], changed: Method | None = None) -> list[dict[s
     """Answers and errors of one world, a row a video.
 
     Args:
-        job: class, name of the method, and seed. changed: a method that is none of :data:`METHODS`.
+        job: class, name of the method, and seed. changed: stands in for the named method.
     """
     name, method, seed = job
     world = CLASSES[name](seed)
-    offsets = synchronize(list(world.tracks), method=METHODS.get(method, changed), **world.options)
+    offsets = synchronize(list(world.tracks), method=changed or METHODS[method], **world.options)
     ends, worst = world.errors(offsets)
     rows = []
     for v in range(1, len(world.tracks)):

@@ -9,25 +9,26 @@ from __future__ import annotations
 
 import contextlib
 import importlib
-import os
+import inspect
+import re
 import sys
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import fields, replace
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 
 from ...align.likelihood import READS as SCANNED
 from ...align.likelihood import LikelihoodScan
-from ...progress import counted
 from ...refine.slot import JUDGED_BY
 from ...refine.splines import READS as FITTED
 from ...refine.splines import SplineRefine
 from ...sync.method import Method
 from ...types.trust import Trust
 from ..record import Row, table, write_rows
-from .run import FIRST_SEED, interval, one, written, wrong
+from .run import FIRST_SEED, interval, measured, one, written, wrong
 from .worlds import CLASSES
 
 FACTORS = (0.5, 0.7, 0.85, 1.0, 1.2, 1.4, 2.0)
@@ -61,12 +62,21 @@ def run(out: Path, *, seeds: int = 3, first_seed: int = TUNED_ON, only: tuple[st
             f"--first-seed: expected seeds below {FIRST_SEED}; found {first_seed} to {first_seed + seeds - 1}. What is "
             "measured from there on must be new to every limit."
         )
-    now = {name: value_of(name) for name in only or LIMITS}
-    tried = [(name, factor * value) for name, value in now.items() for factor in FACTORS]
-    jobs = [(name, value, world, first_seed + k) for name, value in tried for world in CLASSES for k in range(seeds)]
-    answers = list(measured(jobs))
-    rows = [summary(name, value, now[name], [r for r in answers if (r["limit"], r["value"]) == (name, value)])
-            for name, value in tried]  # fmt: skip
+    now = {name: value_of(name) for name in dict.fromkeys(only or LIMITS)}
+    tried = {name: values(value) for name, value in now.items()}
+    others = [(name, value) for name, each in tried.items() for value in each if value != now[name]]
+    worlds = [(world, first_seed + k) for world in CLASSES for k in range(seeds)]
+    # the limits as they are answer once, for all
+    jobs = [(*limit, *world) for limit in [(None, 0.0), *others] for world in worlds]
+    answers = list(measured(jobs, answered, "thresholds"))
+    of: dict[tuple[str | None, float], list[Row]] = {}
+    for row in answers:
+        of.setdefault((row["limit"], row["value"]), []).append(row)
+    rows = [
+        summary(name, value, now[name], of[(None, 0.0) if value == now[name] else (name, value)])
+        for name, each in tried.items()
+        for value in each
+    ]
     about = {"seeds": seeds, "first_seed": first_seed}
     write_rows(out, "thresholds_answers", [written(r) for r in answers], about)
     write_rows(out, "thresholds", rows, about)
@@ -77,10 +87,15 @@ def run(out: Path, *, seeds: int = 3, first_seed: int = TUNED_ON, only: tuple[st
     return 0
 
 
+def values(now: float) -> list[float]:
+    """The values that are tried of a limit; of a whole number whole ones."""
+    return list(dict.fromkeys(type(now)(round(now * f)) if isinstance(now, int) else now * f for f in FACTORS))
+
+
 def value_of(name: str) -> float:
     """What a limit is now. ValueError where there is none of that name."""
     if name in LIMITS:
-        return float(getattr(Trust(), name))
+        return getattr(Trust(), name)
     place, _, constant = name.rpartition(".")
     try:
         value = getattr(importlib.import_module(f"otsync.{place}"), constant)
@@ -91,7 +106,7 @@ def value_of(name: str) -> float:
             f"--only: expected a limit among {', '.join(LIMITS)}, or a number other than 0 in a module of otsync such "
             f"as sync.parts.SUITS_BETTER; found {name}."
         )
-    return float(value)
+    return value
 
 
 @contextlib.contextmanager
@@ -106,8 +121,10 @@ def limit_set(name: str, value: float) -> Iterator[Method | None]:
         )
         return
     place, _, constant = name.rpartition(".")
-    now = getattr(importlib.import_module(f"otsync.{place}"), constant)
-    holders = [m for key, m in list(sys.modules.items()) if key.startswith("otsync") and vars(m).get(constant) is now]
+    owner = importlib.import_module(f"otsync.{place}")
+    now = getattr(owner, constant)
+    ours = [module for name, module in list(sys.modules.items()) if name.startswith("otsync.")]
+    holders = [m for m in ours if vars(m).get(constant) is now and (m is owner or not defines(m, constant))]
     try:
         for module in holders:
             setattr(module, constant, value)
@@ -117,21 +134,17 @@ def limit_set(name: str, value: float) -> Iterator[Method | None]:
             setattr(module, constant, now)
 
 
-def answered(job: tuple[str, float, str, int]) -> list[Row]:
-    """Answers to one world at one value of a limit, a row a video."""
+def defines(module: ModuleType, constant: str) -> bool:
+    """Whether a module gives the name a value of its own, which may be the same number by chance."""
+    assigned = rf"^(\w+, )*{re.escape(constant)}\b[^=\n]*= "
+    return re.search(assigned, inspect.getsource(module), re.MULTILINE) is not None
+
+
+def answered(job: tuple[str | None, float, str, int]) -> list[dict[str, Any]]:
+    """Answers to one world at one value of a limit, a row a video; None: all limits as they are."""
     name, value, world, seed = job
-    with limit_set(name, value) as method:
-        return [{"limit": name, "value": value, **row} for row in one((world, name, seed), method)]
-
-
-def measured(jobs: Sequence[tuple[str, float, str, int]]) -> Iterator[Row]:
-    """A row a video; the jobs are done by a process a core."""
-    import multiprocessing
-
-    workers = len(os.sched_getaffinity(0))
-    with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
-        for rows in counted(pool.map(answered, jobs, chunksize=2), "thresholds", "world", total=len(jobs)):
-            yield from rows
+    with limit_set(name, value) if name else contextlib.nullcontext() as method:
+        return [{"limit": name, "value": value, **row} for row in one((world, "default", seed), method)]
 
 
 def summary(name: str, value: float, now: float, answers: Sequence[Row]) -> Row:

@@ -66,7 +66,10 @@ class Linear:
         """The same in fewer dimensions."""
         if basis.shape[0] == basis.shape[1]:
             return self
-        return Linear(self.ua @ basis, self.ub @ basis, self.offset, self.others, self.a, self.b)
+        # summed in float64: on some processors BLAS's float32 sums depend on how many threads share them
+        exact = basis.astype(float)
+        ua, ub = ((u.astype(float) @ exact).astype(np.float32) for u in (self.ua, self.ub))
+        return Linear(ua, ub, self.offset, self.others, self.a, self.b)
 
     def cost(self, i: Int[np.ndarray, " P"], j: Int[np.ndarray, " P"]) -> Float[np.ndarray, " P"]:
         """M of the pairs."""

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
-from threadpoolctl import threadpool_limits
 
 from ...costs.linear import Cosine, Cost, memberships, total_cost
 from ...types import Matches, Status, TrackSet
@@ -84,10 +83,9 @@ class AnchoredFGW(StructuralMatcher):
         for cost in self.costs:  # refuse what they cannot use while a is a and b is b
             cost.pairs(a, b, np.zeros(1, int), np.zeros(1, int))
         cloud_a, cloud_b = clouds(*common_labels(a, b))
-        with threadpool_limits(1, user_api="blas"):  # on some processors its sums depend on how many threads share them
-            if not comes_first(cloud_a, cloud_b):
-                return self._match(cloud_b, cloud_a, len(b), len(a)).swapped()
-            return self._match(cloud_a, cloud_b, len(a), len(b))
+        if not comes_first(cloud_a, cloud_b):
+            return self._match(cloud_b, cloud_a, len(b), len(a)).swapped()
+        return self._match(cloud_a, cloud_b, len(a), len(b))
 
     def _match(self, a: Cloud, b: Cloud, n_a: int, n_b: int) -> Matches:
         if not len(a) or not len(b):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -87,6 +88,33 @@ def test_a_limit_that_there_is_not_is_refused(name, tmp_path):
         thresholds.run(tmp_path, only=(name,))
 
 
+def test_a_number_is_changed_where_it_is_imported_and_not_where_another_has_its_name():
+    """GAP of breaks and GAP of another module are two limits, even where they are equal."""
+    from types import ModuleType
+
+    from otsync.sync import breaks
+
+    for name, source in (
+        ("otsync.importer", "from otsync.sync.breaks import LIMIT"),
+        ("otsync.namesake", "LIMIT = 200"),
+    ):
+        module = ModuleType(name)
+        exec(source, vars(module))
+        sys.modules[name] = module
+    try:
+        with pytest.MonkeyPatch.context() as patch:
+            sources = {"otsync.importer": "from otsync.sync.breaks import LIMIT", "otsync.namesake": "LIMIT = 200\n"}
+            real = thresholds.inspect.getsource
+            patch.setattr(thresholds.inspect, "getsource", lambda m: sources.get(m.__name__) or real(m))
+            with thresholds.limit_set("sync.breaks.LIMIT", 100):
+                assert breaks.LIMIT == 100 and sys.modules["otsync.importer"].LIMIT == 100
+                assert sys.modules["otsync.namesake"].LIMIT == 200
+        assert breaks.LIMIT == sys.modules["otsync.importer"].LIMIT == 200
+    finally:
+        for name in ("otsync.importer", "otsync.namesake"):
+            del sys.modules[name]
+
+
 def test_limits_are_not_chosen_on_seeds_that_measure(tmp_path):
     with pytest.raises(ValueError, match="--first-seed"):
         thresholds.run(tmp_path, first_seed=19_999, seeds=2)
@@ -109,4 +137,5 @@ def test_a_sweep_writes_what_each_value_trusts(tmp_path, monkeypatch):
     assert thresholds.run(tmp_path, seeds=2, only=("blur",)) == 0
     strict, now = json.loads((tmp_path / "thresholds.json").read_text())["rows"]
     assert strict["right"] == 0 and strict["wrong"] == 0 and strict["answers"] == now["answers"] == 2
+    assert len(json.loads((tmp_path / "thresholds_answers.json").read_text())["rows"]) == 4
     assert json.loads((tmp_path / "thresholds_chosen.json").read_text())["rows"][0]["chosen"] == now["value"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -23,25 +24,28 @@ def test_a_route_is_summed_up_over_what_it_answered():
     assert films.summary("stereo", [])["1 sigma"] is None
 
 
-def test_answers_are_held_against_the_truth_and_kept(tmp_path, monkeypatch):
+def test_answers_are_held_against_the_truth(tmp_path, monkeypatch):
     """The routes are replaced: what they say of a filmed scene is known."""
     asked = []
 
-    def answered(scene, folder, route, map):
+    def answered(scene, route, cache, map):
         asked.append(route)
         if route == "stereo":
             return None
-        truth = Offsets.load(folder / "recording" / "truth.json")
+        truth = Offsets.load(tmp_path / "3-12-2" / "recording" / "truth.json")
         found = Offsets.known(scene.names, truth.seconds + np.array([0, 0.5 / 30]), 30.0)
-        return Offsets(**{**vars(found), "sigma": np.array([0, 0.01]), "flags": ((), (Status.COARSE,))})
+        return replace(found, sigma=np.array([0, 0.01]), flags=((), (Status.COARSE,)))
 
-    monkeypatch.setattr(films, "_answer", answered)
-    for _ in range(2):
-        rows = list(films.answers(tmp_path, 3, (12, 2), ("pixels", "stereo"), map))
-        assert [r["error"] for r in rows] == [pytest.approx(0.5), None]
-        assert rows[0]["sigma"] == pytest.approx(0.3) and rows[0]["flags"] == "coarse" and not rows[0]["trusted"]
-        assert rows[1]["flags"] == "refused"
-    assert asked == ["pixels", "stereo"]
+    monkeypatch.setattr(films, "synchronized", answered)
+    monkeypatch.setattr(
+        films, "fitted", lambda scene, start, *_: replace(start, sigma=np.array([0, 0.02]), flags=((),) * 2)
+    )
+    rows = list(films.answers(tmp_path, 3, (12, 2), ("depth", "stereo", "fit"), map))
+    assert [r["error"] for r in rows] == [pytest.approx(0.5), None, pytest.approx(0.5)]
+    assert [r["sigma"] for r in rows] == [pytest.approx(0.3), None, pytest.approx(0.6)]
+    assert [r["flags"] for r in rows] == ["coarse", "refused", ""]
+    assert [r["trusted"] for r in rows] == [False, False, True]
+    assert asked == ["depth", "stereo"]  # the fit begins from the answer with depth that is there already
 
 
 def test_a_route_that_there_is_not_is_refused(tmp_path):
