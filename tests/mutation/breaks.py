@@ -50,7 +50,7 @@ class Break:
 
 
 BREAKS = (
-    # --- parts of clips in which an answer does not hold ----------------------------------------------------------------
+    # --- parts of clips in which an answer does not hold ------------------------------------------------------------
     Break(
         "parts-few-agree",
         "otsync/sync/parts.py",
