@@ -31,7 +31,7 @@ from recon.simulate.capture import synthetic
 from recon.simulate.recording import write_capture
 
 APART = True
-"""Takes an hour and a half: no part of ``otsync bench all``."""
+"""Takes long (a fit a scene): no part of ``otsync bench all``."""
 
 FIRST_SEED = 120
 """Seeds below were looked at while sigma was built."""
