@@ -7,7 +7,7 @@ moving thing, e is not zero but nearly constant over a second: its variance drop
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -18,6 +18,7 @@ from ..align.slot import Aligner
 from ..clocks.common import nominal_fps, on_clock
 from ..geometry import fundamentals, seen_pixels
 from ..types import Alignment, Matches, Status, TrackSet, in_order
+from .residuals import MAD, Residuals, broken
 
 MIXTURE_CAP = 80.0
 """Nats that one candidate counts at most: beyond them the exponential says nothing more, and could overflow."""
@@ -50,8 +51,8 @@ matches: .5; right answers with 80 % wrong matches 1.3, on basketball from 1.1 o
 LEAST_TRACKS, LEAST_OVERLAP = 5, 40 / 30
 """Tracks, and seconds in common, below which an answer is flagged: the limits of :class:`otsync.Trust`."""
 
-MAD = 1.4826
-"""Standard deviation of normal noise over its median absolute deviation."""
+DETREND, STEPS = 20 / 30, 3
+"""Half the window, s, and Gauss-Newton steps, by which the seconds of an answer are asked for offsets of their own."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,8 @@ class EpipolarScan(Aligner):
     candidate: with a mixture for each, 8 of 630 pairs (fresh seeds) were off by more than 2 frames, with one for both
     2.
 
-    A single pair cannot be certified (an alias of 65 frames kept a high margin): solve the graph of all pairs.
+    A single pair cannot be certified (an alias of 65 frames kept a high margin): solve the graph of all pairs. Where
+    the seconds of the overlap say different offsets, as of motion that comes back nearly alike, it is BROKEN_CLOCK.
 
     Args:
         window: seconds. motion_scale, position_scale: s in pixels at 640 of width.
@@ -109,7 +111,22 @@ class EpipolarScan(Aligner):
         if np.ptp(total) == 0:
             return _nothing(fps, Status.NO_OVERLAP)
         overlap = np.minimum(xa.shape[1], xb.shape[1] + lags) - np.maximum(0, lags)
-        return self._answer(lags, total, overlap / fps, origin, fps, matches)
+        found = self._answer(lags, total, overlap / fps, origin, fps, matches)
+        residuals = self.residuals(a, b, matches, found.offset, fps)
+        if residuals is None:
+            return found
+        _, last = residuals.solve(found.offset, DETREND, STEPS, 1 / fps)
+        flags = (Status.BROKEN_CLOCK,) if broken(*residuals.wander(last)) else ()
+        return replace(found, flags=in_order((*found.flags, *flags)))
+
+    def residuals(self, a: TrackSet, b: TrackSet, matches: Matches, offset: float, fps: float) -> Residuals | None:
+        """Of the matches that have most of their tracks' evidence at ``offset``, s; None where there are too few."""
+        assert a.camera is not None and b.camera is not None
+        xa, xb = (on_clock(tracks, seen_pixels(tracks), fps) for tracks in (a, b))
+        F = fundamentals(a.camera, b.camera)
+        lag = round((offset - float(a.times[0] - b.times[0])) * fps)
+        share = self.support(xa, xb, F, matches.pairs, lag, fps, unit_of(a, b))
+        return Residuals.of(a, b, xa, F, matches.pairs, share, fps)
 
     def evidence(
         self,

@@ -27,12 +27,14 @@ class Cloud:
     Args:
         tracks: at most ``limit`` of the video's, without a declared frame. index: where they stand in the video's.
         unit: of the scene, in the video's own units. curves: of all of them, in units.
+        sight: unit vectors from the camera to the tracks, in the video's frame; None where no camera is known.
     """
 
     tracks: TrackSet
     index: Int[np.ndarray, " N"]
     unit: float
     curves: TrackSplines
+    sight: Float[np.ndarray, "N 3"] | None
 
     def __len__(self) -> int:
         return len(self.index)
@@ -60,8 +62,18 @@ def clouds(a: TrackSet, b: TrackSet, limit: int) -> tuple[Cloud, Cloud] | None:
     for tracks, index, unit in zip(parts, chosen, units, strict=True):
         x = tracks.positions() / unit
         scaled = replace(tracks, xyz=np.where(tracks.seen[..., None], x, 0.0), frame=None, camera=None, sigma=None)
-        made.append(Cloud(scaled, index, unit, TrackSplines(tracks.times, x)))
+        made.append(Cloud(scaled, index, unit, TrackSplines(tracks.times, x), line_of_sight(tracks)))
     return made[0], made[1]
+
+
+def line_of_sight(tracks: TrackSet) -> Float[np.ndarray, "N 3"] | None:
+    """Where the camera saw each track, on average: unit vectors in the video's frame."""
+    if tracks.camera is None:
+        return None
+    away = tracks.positions() - tracks.camera.center
+    away /= np.maximum(np.linalg.norm(away, axis=2, keepdims=True), 1e-300)
+    mean = np.where(tracks.seen[..., None], np.nan_to_num(away), 0.0).sum(1)
+    return mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-300)
 
 
 def sizes(tracks: TrackSet) -> tuple[float, float]:

@@ -4,6 +4,9 @@ The residual of a match has two parts. Its mean over a second or so is where the
 which differs by centimetres and says little of the clock; what is left is motion, the same for both points, and sharp.
 Each part is weighted by its own noise: motion finds the clock, the rotation and the scale, places the translation.
 
+Depth errs more than the rest. Where the cameras are known, residuals count by how far they lie along the two lines of
+sight (:mod:`otsync.frames.noise`).
+
 Everything is symmetric in the two videos: residuals are read at the frames of both, in the unit midway between the two
 frames of reference, so that exchanging them inverts the answer and changes nothing else.
 """
@@ -13,12 +16,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ..clocks.splines import TrackSplines
 from ..refine.gauss_newton import CLUSTER, GROUPS, MIN_FRAMES, MOST_LEVERAGE, OUTLYING, ROBUST, neighbours
 from ..types import Clock, Similarity
 from ..types.similarity import cross_matrix, rotation_of
+from .noise import Metric, Noise, Sight
 
 LONGEST_STEP = 2.0 / 30
 """Seconds by which one iteration may move the offset."""
@@ -28,6 +32,9 @@ LONGEST_TURN = 0.2
 
 SHORTEST_CORRELATION = 4 / 30
 """Seconds over which the fast part of a residual is one error: the spline smooths a tracker's jitter."""
+
+READ_EVERY = 2 / 30
+"""Seconds between the moments at which residuals are read: half of what is one error, and as far apart as knots."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,33 +71,38 @@ def fit_jointly(
     transform: Similarity,
     window: float,
     *,
+    sight: Sight | None = None,
     iterations: int = 15,
     tolerance: float = 1e-5,
+    every: float = READ_EVERY,
 ) -> Joint | None:
     """Minimise robustly the differences of matched curves over offset, rotation, scale and translation.
 
     Args:
         a, b: curves of the matched tracks, m-th to m-th, each in its own frame. clock, transform: where to begin; the
             rate of the clock stays. window: s, half the length of the moving mean that splits the residual.
+        sight: along which depth errs; None: errors are taken to be alike in all directions.
         tolerance: frames, radians and relative scale; smaller steps end the iteration.
+        every: seconds between the moments at which residuals are read.
 
     Returns None when no match is seen long enough in both.
     """
     state = State.of(a, b, clock, transform)
-    own = a.value(a.times), b.value(b.times)
+    own = read(a, every), read(b, every)
+    noise: Noise | None = None
     n = 0
     while True:
         n += 1
-        system = linearise(a, b, own, state, window)
+        system = linearise(a, b, own, state, window, sight, noise)
         if system is None:
             return None
-        step = system.step()
+        step, noise = system.step(), system.noise
         step[0] = np.clip(step[0], -LONGEST_STEP, LONGEST_STEP)
         step[1:5] *= min(1.0, LONGEST_TURN / max(float(np.abs(step[1:5]).max()), 1e-300))
         state = state.stepped(step)
         if n >= iterations or (abs(step[0]) / a.frame < tolerance and np.abs(step[1:5]).max() < tolerance):
             break
-    final = linearise(a, b, own, state, window, clusters=True)
+    final = linearise(a, b, own, state, window, sight, noise, clusters=True)
     if final is None:
         return None
     covariance = final.covariance()
@@ -149,7 +161,7 @@ class State:
 
 @dataclass(frozen=True, eq=False)
 class System:
-    """Weighted normal equations, by match and by block of time; see :class:`Joint`."""
+    """Weighted normal equations, by match and by block of time; see :class:`Joint`. noise: that the residuals show."""
 
     H: Float[np.ndarray, "8 8"]
     g: Float[np.ndarray, " 8"]
@@ -159,6 +171,7 @@ class System:
     blur: float
     place: float
     misfit: Float[np.ndarray, " M"]
+    noise: Noise | None
 
     def step(self) -> Float[np.ndarray, " 8"]:
         return -np.linalg.solve(regular(self.H), self.g)
@@ -196,67 +209,83 @@ def schur(H: np.ndarray, index: list[int]) -> np.ndarray:
     return H[np.ix_(index, index)] - H[np.ix_(index, rest)] @ inner
 
 
+Reading = tuple[Float[np.ndarray, " S"], Float[np.ndarray, "M S 3"], float]
+
+
+def read(curves: TrackSplines, every: float = READ_EVERY) -> Reading:
+    """The moments at which residuals are read in one video, its curves there, and the seconds from one to the next."""
+    step = max(1, round(every / curves.frame))
+    t = curves.times[::step]
+    return t, curves.value(t), step * curves.frame
+
+
 def linearise(
     a: TrackSplines,
     b: TrackSplines,
-    own: tuple[np.ndarray, np.ndarray],
+    own: tuple[Reading, Reading],
     state: State,
     window: float,
+    sight: Sight | None = None,
+    noise: Noise | None = None,
     *,
     clusters: bool = False,
 ) -> System | None:
     """Residuals, robust weights and normal equations.
 
     Args:
-        own: the curves of a at a's frames, and of b at b's. clusters: whether groups of matches are told apart.
+        own: both videos as they are read. noise: along the lines of ``sight``; None: alike in all directions.
+        clusters: whether groups of matches are told apart.
     """
     from . import kernels_fit as kernels
 
     root, clock = np.sqrt(state.scale), state.clock
     turned = root * state.R.T
+    M = len(a.mean)
+    common = None if sight is None else (sight[0], sight[1] @ state.R.T)
+    even = Metric.even(M)
+    metric = even if common is None or noise is None else noise.metric(common)
     parts = []
-    for curves, forward in ((a, True), (b, False)):
-        t = curves.times
+    for (t, values, frame), forward in zip(own, (True, False), strict=True):
         there = clock.own(t) if forward else clock.world(t)
         t_a, t_b = (t, there) if forward else (there, t)
         ok = a.support(t_a) & b.support(t_b)
-        u = ((own[0] if forward else a.value(t_a)) - state.middle_a) / root
-        y = ((b.value(t_b) if forward else own[1]) - state.middle_b) @ turned
+        u = ((values if forward else a.value(t_a)) - state.middle_a) / root
+        y = ((b.value(t_b) if forward else values) - state.middle_b) @ turned
         # t_b = (t_a - offset) / rate at a's frames; t_a = rate t_b + offset at b's
         v = (b.velocity(t_b) @ turned) / clock.rate if forward else a.velocity(t_a) / root
-        slack = 1e-6 * curves.frame
+        slack = 1e-6 * frame
         lo = np.searchsorted(t, t - window - slack)
         hi = np.searchsorted(t, t + window + slack, side="right")
-        least = MIN_FRAMES / curves.frame
+        least = MIN_FRAMES / frame
         slow = np.zeros((*ok.shape, 9))
         u, y, v = (np.ascontiguousarray(x) for x in (u, y, v))
         kernels.split(u, y, v, ok, lo, hi, least - 1e-6, slow)
         used = ok & (ok.sum(1) >= least - 1e-6)[:, None]
-        squares = np.zeros(ok.shape), np.zeros(ok.shape)
-        kernels.residual_squares(u, y, slow, state.tau, used, *squares)
-        parts.append((curves.frame, t_a, u, y, v, slow, used, *squares))
-    count = np.sum([np.sum(p[6], axis=1) for p in parts], axis=0)
+        parts.append(Part(frame, t_a, u, y, v, slow, used))
+    count = np.sum([p.used.sum(1) for p in parts], axis=0)
     seen = count > 0
     if seen.sum() < 3:
         return None
-    quick, place = (_noise(parts, k) for k in (7, 8))
-    often = np.maximum(count, 1)
-    rms_quick, rms_slow = (np.sqrt(np.sum([np.sum(p[k], axis=1) for p in parts], axis=0) / often) for k in (7, 8))
-    weight = np.where(seen, _match_weight(rms_quick, seen) * _match_weight(rms_slow, seen), 0.0)
-    M = len(weight)
+    sizes = Sizes.of(parts, state.tau, metric, count)
+    weight = np.where(seen, _match_weight(sizes.quick, seen) * _match_weight(sizes.slow, seen), 0.0)
     H_match, g_match = np.zeros((M, 8, 8)), np.zeros((M, 8))
     start = max(a.times[0], float(clock.world(b.times[0])))
-    blocks = [np.maximum(np.floor((p[1] - start) / CLUSTER + 1e-9), 0).astype(np.int64) for p in parts]
+    blocks = [np.maximum(np.floor((p.t_a - start) / CLUSTER + 1e-9), 0).astype(np.int64) for p in parts]
     n = max(int(x.max(initial=0)) for x in blocks) + 1
     H_time, g_time = np.zeros((n, 8, 8)), np.zeros((n, 8))
-    for (frame, _, u, y, v, slow, used, rr_quick, rr_slow), block in zip(parts, blocks, strict=True):
+    products, weights = np.zeros((M, 2, 3, 3)), np.zeros((M, 2))
+    for p, rr, block in zip(parts, sizes.squares, blocks, strict=True):
+        w_quick, w_slow = (
+            weight[:, None] / (1 + r / (ROBUST * typical) ** 2) for r, typical in zip(rr, sizes.typical, strict=True)
+        )
+        if common is not None:
+            kernels.scatter(p.u, p.y, p.slow, state.tau, p.used, w_quick, w_slow, products, weights)
         # a second of samples holds some seven independent errors of motion, and one of place
-        share_quick = min(1.0, frame / SHORTEST_CORRELATION)
-        share_slow = min(1.0, frame / (2 * window))
-        w_quick = weight[:, None] * share_quick / quick**2 / (1 + rr_quick / (ROBUST * quick) ** 2)
-        w_slow = weight[:, None] * share_slow / place**2 / (1 + rr_slow / (ROBUST * place) ** 2)
+        w_quick *= min(1.0, p.frame / SHORTEST_CORRELATION) / sizes.typical[0] ** 2
+        w_slow *= min(1.0, p.frame / (2 * window)) / sizes.typical[1] ** 2
         kernels.normal_equations(
-            u, y, v, slow, state.tau, used, w_quick, w_slow, block, H_match, g_match, H_time, g_time
+            *(p.u, p.y, p.v, p.slow, state.tau, p.used, metric.inverse, metric.of_a, metric.of_b, w_quick, w_slow),
+            *(block, H_match, g_match, H_time, g_time),
         )
     for H in (H_match, H_time):
         H += np.tril(H, -1).swapaxes(1, 2)
@@ -266,8 +295,10 @@ def linearise(
         group = neighbours(where, GROUPS)
         np.add.at(H_group, group, H_match)
         np.add.at(g_group, group, g_match)
-    power = sum(float(weight @ p[7].sum(1)) for p in parts)
-    speed = sum(float(weight @ (((p[4] - p[5][..., 6:]) ** 2).sum(2) * p[6]).sum(1)) for p in parts)
+        # what is told of the residuals is of their length
+        sizes = sizes if metric is even else Sizes.of(parts, state.tau, even, count)
+    power = sum(float(weight @ rr[0].sum(1)) for rr in sizes.squares)
+    speed = sum(float(weight @ (((p.v - p.slow[..., 6:]) ** 2).sum(2) * p.used).sum(1)) for p in parts)
     return System(
         H_match.sum(0),
         g_match.sum(0),
@@ -275,14 +306,59 @@ def linearise(
         (H_time, g_time),
         weight,
         float(np.sqrt(power / speed)) if speed > 0 else np.inf,
-        place,
-        np.where(seen, np.hypot(rms_quick, rms_slow), np.inf),
+        sizes.typical[1],
+        np.where(seen, np.hypot(sizes.quick, sizes.slow), np.inf),
+        None if common is None else Noise.of(common, products, weights),
     )
 
 
-def _noise(parts: list[tuple], k: int) -> float:
-    """Robust scale of one part of the residual, of a vector of three."""
-    size = np.concatenate([np.sqrt(p[k][p[6]]) for p in parts])
+@dataclass(frozen=True, eq=False)
+class Part:
+    """What one video's moments say: u, y, v (M,S,3) of either video and the speed; slow (M,S,9) their moving means."""
+
+    frame: float
+    t_a: Float[np.ndarray, " S"]
+    u: Float[np.ndarray, "M S 3"]
+    y: Float[np.ndarray, "M S 3"]
+    v: Float[np.ndarray, "M S 3"]
+    slow: Float[np.ndarray, "M S 9"]
+    used: Bool[np.ndarray, "M S"]
+
+
+@dataclass(frozen=True, eq=False)
+class Sizes:
+    """Sizes of the fast and the slow part of the residuals.
+
+    Args:
+        squares: of both parts, (M,S), for the moments of either video. typical: robust scale of both.
+        quick, slow: rms of each match.
+    """
+
+    squares: list[tuple[np.ndarray, np.ndarray]]
+    typical: tuple[float, float]
+    quick: Float[np.ndarray, " M"]
+    slow: Float[np.ndarray, " M"]
+
+    @classmethod
+    def of(cls, parts: list[Part], tau: np.ndarray, metric: Metric, count: np.ndarray) -> Sizes:
+        from . import kernels_fit as kernels
+
+        squares = []
+        for p in parts:
+            rr = np.zeros(p.used.shape), np.zeros(p.used.shape)
+            kernels.residual_squares(p.u, p.y, p.slow, tau, p.used, metric.inverse, *rr)
+            squares.append(rr)
+        often = np.maximum(count, 1)
+        quick, slow = (np.sqrt(np.sum([rr[k].sum(1) for rr in squares], axis=0) / often) for k in range(2))
+        typical = [
+            _scale(np.concatenate([np.sqrt(rr[k][p.used]) for rr, p in zip(squares, parts, strict=True)]))
+            for k in range(2)
+        ]
+        return cls(squares, (typical[0], typical[1]), quick, slow)
+
+
+def _scale(size: np.ndarray) -> float:
+    """Robust scale of residuals with three coordinates, of their lengths."""
     return max(1.4826 / 1.5 * float(np.median(size)), 1e-12)
 
 

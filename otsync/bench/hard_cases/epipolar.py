@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...types import Alignment, Camera, Matches, TrackSet
-from .case import FLAGGED, REFUSED, RIGHT, SOUND, TRUST, Case, near
+from .case import FLAGGED, REFUSED, RIGHT, SOUND, Case, near
 
 N, FRAMES, LATE = 40, 150, 15
 K = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
@@ -243,7 +243,6 @@ CASES: tuple[Case, ...] = (
         "flagged",
         comes_back,
         (FLAGGED,),
-        open=TRUST,
     ),
     Case(
         "ten frames in common, pixels",

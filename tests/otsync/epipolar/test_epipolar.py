@@ -13,7 +13,8 @@ from otsync import Alignment, Matches, Status, TrackSet, synchronize
 from otsync.align.peaks import separate_peaks
 from otsync.costs.positions import CurveDistance, MedianPosition, SynchronousDistance, capped, scene_scale
 from otsync.epipolar.kernels import epipolar_evidence
-from otsync.epipolar.refine import EpipolarRefine, _Problem, _Step, detrended
+from otsync.epipolar.refine import EpipolarRefine
+from otsync.epipolar.residuals import Residuals, Step, detrended
 from otsync.epipolar.scan import TRACK_CAP, EpipolarScan, mixture
 from otsync.geometry import common_target, fundamental, fundamentals, sampson, undistort, view_angle
 from otsync.match.candidates import Candidates
@@ -342,9 +343,9 @@ def test_tracks_of_one_limb_are_not_independent():
         own = rng.normal(0, 0.3, places)
         middle = np.repeat(rng.uniform(0, 640, (places, 2)), each, 0) + rng.normal(0, 2, (places * each, 2))
         xa = np.repeat(middle[:, None], frames, 1)
-        problem = _Problem(xa, None, np.arange(frames) / 30, None, 0.0, 30.0, np.ones(places * each))
+        problem = Residuals(xa, None, np.arange(frames) / 30, None, 0.0, 30.0, np.ones(places * each))
         ones = np.ones((places * each, frames))
         residual = np.repeat(own, each)[:, None] + rng.normal(0, 1, ones.shape)
         wrong.append(residual.sum() / ones.sum())
-        asked.append(problem.scatter(_Step(residual, ones, ones)))
+        asked.append(problem.scatter(Step(residual, ones, ones)))
     assert 0.6 < np.sqrt(np.mean(np.square(wrong))) / np.sqrt(np.mean(np.square(asked))) < 1.1

@@ -10,7 +10,7 @@ from otsync import TrackSet
 from otsync.clocks.splines import TrackSplines
 from otsync.frames import kernels
 from otsync.frames.clouds import clouds, sizes
-from otsync.frames.fit import State, fit_jointly, linearise
+from otsync.frames.fit import State, fit_jointly, linearise, read
 from otsync.types import Clock, Similarity
 
 
@@ -77,7 +77,7 @@ def test_one_step_goes_nearly_all_the_way():
     """Near the answer the problem is linear: with a wrong Jacobian much would be left after a Gauss-Newton step."""
     f = draw(1)
     a, b = curves(0.2, f, noise=0.02)
-    own = a.value(a.times), b.value(b.times)
+    own = read(a), read(b)
     state = State.of(a, b, Clock(0.2031), f.moved(np.full(7, 0.01)))
     first = linearise(a, b, own, state, 14 / 30).step()
     second = linearise(a, b, own, state.stepped(first), 14 / 30).step()

@@ -6,7 +6,6 @@ import pytest
 from otsync import Alignment, Matches, SplineRefine, Status, TrackSet, refine
 from otsync.clocks.splines import TrackSplines
 from otsync.epipolar import EpipolarRefine
-from otsync.epipolar.refine import _Problem
 from otsync.refine import common_error as module
 from otsync.refine.common_error import Sums, autocorrelation, common_error
 from otsync.refine.gauss_newton import fit_clock
@@ -153,7 +152,7 @@ def test_pixels_say_no_less():
         matches = Matches(np.stack([np.arange(30)] * 2, 1), np.ones(30))
         refiner = EpipolarRefine()
         found = refiner(a, b, matches, Alignment(0.0, fps=FPS))
-        problem = _Problem.of(refiner, a, b, matches, 0.0, FPS)
+        problem = refiner.scan.residuals(a, b, matches, 0.0, FPS)
         step = problem.solve(0.0, refiner.windows[0], 12, refiner.reach)[1]
         assert found.sigma >= found.stats["common_error"] >= 0 or Status.MOVED in found.flags
         below += Status.MOVED not in found.flags and problem.scatter(step) < 0.8 * found.stats["common_error"]
