@@ -18,7 +18,7 @@ CLOCKS = ("tests/otsync/clocks/test_splines.py",)
 REFINE = ("tests/otsync/refine",)
 EPIPOLAR = ("tests/otsync/epipolar",)
 PARTS = ("tests/otsync/sync/test_parts.py",)
-FRAMES = ("tests/otsync/frames/test_fit.py",)
+FRAMES = ("tests/otsync/frames/test_fit.py", "tests/otsync/frames/test_noise.py")
 GRAPH = ("tests/otsync/sync/test_graph.py",)
 SYNC = (*GRAPH, "tests/otsync/sync/test_verdict.py", "tests/otsync/sync/test_sync.py")
 FIT = ("tests/recon/fit/test_fit.py",)
@@ -506,7 +506,7 @@ BREAKS = (
     ),
     Break(
         "epipolar-derivative-doubled",
-        "otsync/epipolar/refine.py",
+        "otsync/epipolar/residuals.py",
         "self.residual(offset - step)) / (2 * step)",
         "self.residual(offset - step)) / step",
         EPIPOLAR,
@@ -514,13 +514,53 @@ BREAKS = (
     ),
     Break(
         "epipolar-window-short",
-        "otsync/epipolar/refine.py",
+        "otsync/epipolar/residuals.py",
         "np.minimum(np.arange(T) + half + 1, T)",
         "np.minimum(np.arange(T) + half, T)",
         EPIPOLAR,
         "the detrending window lacks its last frame",
     ),
+    Break(
+        "epipolar-wander-unasked",
+        "otsync/epipolar/scan.py",
+        "(Status.BROKEN_CLOCK,) if broken(*residuals.wander(last)) else ()",
+        "()",
+        EPIPOLAR,
+        "the scan no longer asks whether the seconds of its answer agree",
+    ),
+    Break(
+        "epipolar-wander-square",
+        "otsync/epipolar/residuals.py",
+        "(g[told] ** 2 / H[told]).sum()",
+        "(g[told] ** 2).sum()",
+        EPIPOLAR,
+        "the offsets of single seconds are in no unit of time",
+    ),
     # --- frames -----------------------------------------------------------------------------------------------------
+    Break(
+        "frames-depth-turns",
+        "otsync/frames/kernels_fit.py",
+        "g = WJ[0, i] * r[0] + WJ[1, i] * r[1] + WJ[2, i] * r[2] - turning[i]",
+        "g = WJ[0, i] * r[0] + WJ[1, i] * r[1] + WJ[2, i] * r[2]",
+        FRAMES,
+        "errors of depth turn the answer: the covariance is taken not to turn with b",
+    ),
+    Break(
+        "frames-sight-unturned",
+        "otsync/frames/fit.py",
+        "(sight[0], sight[1] @ state.R.T)",
+        "(sight[0], sight[1])",
+        FRAMES,
+        "b's lines of sight are read in the wrong frame",
+    ),
+    Break(
+        "frames-noise-alike",
+        "otsync/frames/noise.py",
+        "return Metric(np.linalg.inv(total / unit), own[0] / unit, own[1] / unit)",
+        "return Metric(np.linalg.inv(total / unit), total / unit, own[1] / unit)",
+        FRAMES,
+        "a is taken to err as much as both together: the scale is pulled to one side",
+    ),
     Break(
         "frames-scale-not-rooted",
         "otsync/frames/kernels.py",

@@ -349,3 +349,37 @@ def test_tracks_of_one_limb_are_not_independent():
         wrong.append(residual.sum() / ones.sum())
         asked.append(problem.scatter(Step(residual, ones, ones)))
     assert 0.6 < np.sqrt(np.mean(np.square(wrong))) / np.sqrt(np.mean(np.square(asked))) < 1.1
+
+
+def seconds_apart(late: np.ndarray) -> tuple[TrackSet, TrackSet, Matches]:
+    """Two cameras of one world; a frame of b is ``late`` s (T,) later than its clock says."""
+    a, b = ring(4, width=640, height=360)[:2]
+    t, rng = np.arange(len(late)) / FPS, np.random.default_rng(1)
+    sets = [
+        replace(made, uv=made.uv + 0.3 * rng.normal(size=made.uv.shape))
+        for made in (filmed(a, paths(t, 40, 5)), filmed(b, paths(t + 0.2 + late, 40, 5)))
+    ]
+    return *sets, Matches(np.stack([np.arange(40)] * 2, 1))
+
+
+@pytest.mark.parametrize("hurry", [0.0, 0.05, 0.1])
+def test_seconds_that_say_different_offsets_are_a_broken_clock(hurry):
+    a, b, matches = seconds_apart(hurry * np.sqrt(2) * np.sin(2 * np.pi * 0.25 * np.arange(150) / FPS + 0.7))
+    for found in (
+        EpipolarScan()(a, b, matches),
+        EpipolarRefine()(a, b, matches, Alignment(0.2, fps=FPS)),
+    ):
+        assert (Status.BROKEN_CLOCK in found.flags) == (hurry > 0), found.flags
+        assert hurry > 0 or abs(found.offset - 0.2) * FPS <= 0.5
+
+
+def test_wander_is_what_the_seconds_say_by_their_information():
+    """Two seconds: the first says 30 ms more than the answer and knows three times as much, the second 10 ms less."""
+    ones = np.ones((1, 60))
+    slope = np.where(np.arange(60) < 30, np.sqrt(3.0), 1.0)[None] * 100
+    residual = -slope * np.where(np.arange(60) < 30, 0.03, -0.01)
+    problem = Residuals(np.zeros((1, 60, 2)), None, np.arange(60) / FPS, None, 0.0, FPS, np.ones(1))
+    wander, blur = problem.wander(Step(residual, slope, ones))
+    assert wander == pytest.approx(np.sqrt((3 * 0.03**2 + 0.01**2) / 4))
+    assert blur == pytest.approx(wander)  # nothing else is left
+    assert problem.wander(Step(residual, 0 * slope, ones)) == (0.0, 0.0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -109,11 +111,9 @@ def test_no_scatter_is_no_noise():
 
 
 def test_lines_of_sight_are_of_the_videos_frame():
-    (a, _), truth = simulate("tennis", preset="clean", own_frames=True, seed=1)
+    (a, _), _ = simulate("tennis", preset="clean", own_frames=True, seed=1)
     towards = line_of_sight(a)
     np.testing.assert_allclose(np.linalg.norm(towards, axis=1), 1)
     depth = a.camera.to_camera(a.camera.center + towards[:, None, :])[:, 0, 2]
     assert (depth > 0.5).all()  # what it sees lies before it
-    from dataclasses import replace
-
     assert line_of_sight(replace(a, camera=None, uv=None)) is None
