@@ -309,6 +309,10 @@ BEST = (50, 100, 200)
 """How many of the best matches the table of matchers looks at; angles are those at the middle one."""
 
 
+FACING = 120
+"""Degrees from which on two cameras face each other and see two sides of everything."""
+
+
 WITH_FEATURES = ("EMD on features", "FGW (paper)", "anchored FGW", "unbalanced OT, curve (default)")
 """Matchers of the table that are measured with every describer that there is, plugins' too."""
 
@@ -367,7 +371,12 @@ def matching_table(
         angle, count, seconds, *precision = np.array(values).T
         row: dict[str, Any] = {"matching": name, "features": features, "matches": round(float(count.mean()), 1)}
         row |= {f"best {n}": round(float(p.mean()), 3) for n, p in zip(BEST, precision, strict=True)}
-        for low, high in ((0, 55), (55, 95), (95, 120), (120, 181)):
+        beside = angle < FACING
+        row |= {
+            f"best {n}, <{FACING}": round(float(p[beside].mean()), 3) if beside.any() else None
+            for n, p in zip(BEST, precision, strict=True)
+        }
+        for low, high in ((0, 55), (55, 95), (95, FACING), (FACING, 181)):
             inside = (angle >= low) & (angle < high)
             row[f"<{high}"] = round(float(precision[1][inside].mean()), 3) if inside.any() else None
         rows.append(row | {"cpu_s": round(float(np.median(seconds)), 3)})

@@ -41,6 +41,10 @@ SOME = 300
 ASTRAY_TIME = 1.5 / 30
 """Seconds by which a pair may contradict the clocks of the graph before its similarity is left out."""
 
+LINK_ROTATION, LINK_SCALE = 6.0, 0.08
+"""Sigmas, degrees and share, up to which a pair with a loose pose still ties two videos: many such ties make a firm
+pose, and its clock is as good as any."""
+
 
 @dataclass(frozen=True, eq=False)
 class OwnJob:
@@ -57,11 +61,23 @@ def run_own(job: OwnJob) -> Answer:
     """Clock and similarity of one pair. An exception becomes the status FAILED, told in the log."""
     try:
         matches, found = job.solver(job.a, job.b, job.start)
+        found = as_tie(found)
         return Answer(job.pair, matches, found, found)
     except Exception as error:
         log.warning("pair %s: %s: %s", job.pair, type(error).__name__, error)
         failed = Alignment(float("nan"), flags=(Status.FAILED,))
         return Answer(job.pair, Matches(np.zeros((0, 2), int), flags=(Status.FAILED,)), failed, failed)
+
+
+def as_tie(found: Alignment) -> Alignment:
+    """Without LOOSE_POSE where the pose is firm enough to tie two videos; :func:`with_pose_flags` puts it back."""
+    S = found.transform
+    firm = S is not None and S.rotation_sigma <= LINK_ROTATION and S.scale_sigma <= LINK_SCALE
+    return dataclasses.replace(found, flags=tuple(f for f in found.flags if not (firm and f is Status.LOOSE_POSE)))
+
+
+def loose(S: Similarity | None, solver: OwnFrames) -> bool:
+    return S is None or not (S.rotation_sigma < solver.trust.rotation and S.scale_sigma < solver.trust.scale)
 
 
 def synchronize_own(
@@ -189,10 +205,7 @@ def with_pose_flags(verdict: Verdict, poses: Poses, links: Sequence[tuple[Pair, 
         frame = poses.frames[v]
         used = [error[p] for p in error if v in p and np.isfinite(error[p])]
         if verdict.component[v] != v or not own:
-            loose = frame is None or not (
-                frame.rotation_sigma <= solver.trust.rotation and frame.scale_sigma <= solver.trust.scale
-            )
-            if v != verdict.reference and loose:
+            if v != verdict.reference and loose(frame, solver):
                 raised.append(Status.LOOSE_POSE)
             if used and sum(e > ASTRAY for e in used) >= len(used) / 2 and v != verdict.reference:
                 raised.append(Status.INCONSISTENT)
@@ -205,11 +218,10 @@ def with_pose_flags(verdict: Verdict, poses: Poses, links: Sequence[tuple[Pair, 
         extra: tuple[Status, ...] = ()
         if a.refined.status.ok and (not closed.get(a.pair, True) or stats.get("pose_error", 0.0) > ASTRAY):
             extra = (Status.INCONSISTENT,)
-        answers.append(
-            dataclasses.replace(
-                a, refined=dataclasses.replace(a.refined, flags=(*a.refined.flags, *extra), stats=stats)
-            )
-        )
+        if a.refined.transform is not None and loose(a.refined.transform, solver):
+            extra = (*extra, Status.LOOSE_POSE)
+        found = dataclasses.replace(a.refined, flags=in_order((*a.refined.flags, *extra)), stats=stats)
+        answers.append(dataclasses.replace(a, refined=found))
     known = [e for e in error.values() if np.isfinite(e)]
     stats = verdict.stats | {"pose_links": float(len(known))}
     if known:

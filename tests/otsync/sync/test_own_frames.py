@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from otsync import LikelihoodScan, OwnFrames, SplineRefine, synchronize
 from otsync.costs import Cosine, CurveDistance
+from otsync.frames import PoseTrust
 from otsync.match import UnbalancedOT
 from otsync.simulate import simulate
 from otsync.sync.own_frames import better
@@ -123,6 +124,17 @@ def test_an_unrelated_video_is_flagged(film):
     (stranger, _), _ = simulate("boxes", preset="mid", own_frames=True, seed=77)
     offsets = synchronize([tracks[0], tracks[1], stranger], frames="own")
     assert offsets.status[1].ok and not offsets.status[2].ok
+
+
+def test_pairs_with_loose_poses_still_tie_videos_together(film):
+    """Who asks for firmer poses gets flags, of pairs and videos, and the same clocks."""
+    tracks, _ = film
+    usual = synchronize(tracks, frames="own")
+    strict = synchronize(tracks, frames=OwnFrames(trust=PoseTrust(rotation=1e-3)))
+    np.testing.assert_array_equal(strict.seconds, usual.seconds)
+    others = [v for v in range(len(tracks)) if v != strict.reference]
+    assert usual.ok and all(strict.flags[v] == (Status.LOOSE_POSE,) for v in others)
+    assert all(Status.LOOSE_POSE in pair.flags for pair in strict.alignments.values())
 
 
 def test_different_frames_are_refused_with_the_remedy(film):
