@@ -61,9 +61,10 @@ def main(
         there = replace(held, camera=replace(held.camera, w2c=held.camera.w2c @ np.linalg.inv(reference.w2c)))
 
         given = synchronize_scene(posed, cache=Cache(out / "stages"), map=pool.map, tell=print)
-        for what, scene, view, offsets in (
-            ("given poses", posed, held, given.offsets),
-            ("found poses", replace(unposed, videos=tuple(moved)), there, own.offsets),
+        # A fit holds cameras still: what is left of a pose's error would go into the clock, so found poses keep theirs.
+        for what, scene, view, offsets, freeze in (
+            ("given poses", posed, held, given.offsets, ()),
+            ("found poses", replace(unposed, videos=tuple(moved)), there, own.offsets, ("offsets",)),
         ):
             whole = replace(scene, videos=(*scene.videos, view), masks=(*scene.masks, None), labels=())
             folder = out / what.replace(" ", "_")
@@ -71,7 +72,7 @@ def main(
                 whole,
                 offsets,
                 folder,
-                plan=Plan(width=width, fit=FitOptions(steps=steps)),
+                plan=Plan(width=width, fit=FitOptions(steps=steps, freeze=freeze)),
                 held_out=(view.name,),
                 map=pool.map,
                 progress=Progress(print),

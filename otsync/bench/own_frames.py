@@ -128,6 +128,7 @@ def promises(rows: list[dict[str, Any]]) -> list[Check]:
         elif what.startswith("cameras, below"):
             checks.append(at_least(f"{what}: right", row["right"], 0.95))
         elif what.startswith("all cameras"):
+            checks.append(at_least(f"{what}: placed", row["placed"], row["n"]))
             bars = (("offset_mean", 0.15, "frames"), ("rotation_mean", 1, "degrees"), ("centre_mean", 0.05, "m"))
             checks += [at_most(f"{what}: {key}, {unit}", row[key], bar) for key, bar, unit in bars]
         if not what.startswith("all cameras"):
@@ -307,12 +308,14 @@ def camera_errors(
         )
     good = [r for r in rows if not r["flags"]]
     wrong = [r for r in good if r["offset_error"] > WRONG_TIME or r["rotation_error"] > WRONG_TURN]
-    late = [r["offset_error"] for r in good if r["camera"] != offsets.names[offsets.reference]]
-    turns, places = [r["rotation_error"] for r in good], [r["centre_error"] for r in good]
+    # of all, also of those with a flag: what is asked of the graph is asked of every camera
+    late = [r["offset_error"] for r in rows if r["camera"] != offsets.names[offsets.reference]]
+    turns, places = [r["rotation_error"] for r in rows], [r["centre_error"] for r in rows]
     n = len(offsets.alignments)
     return rows, {
         "what": "all cameras together",
         "n": len(offsets),
+        "placed": len(rows),
         "flagged": round(1 - len(good) / len(offsets), 3),
         "wrong": len(wrong),
         "offset_mean": round(float(np.mean(late)), 3),

@@ -73,7 +73,7 @@ class VideoFile(Document, frozen=True, kw_only=True):
 
 
 class CalibratedFile(Document, frozen=True, kw_only=True):
-    """How sure the camera of one video is, as ``otsync calibrate`` found it."""
+    """How sure the camera of one video is, as ``otsync calibrate`` or ``otsync sync --frames own`` found it."""
 
     lens: Literal["given", "board", "file", "found", "guessed"]
     sigma_degrees: float | None = None
@@ -86,9 +86,12 @@ class CalibratedFile(Document, frozen=True, kw_only=True):
 
 
 class CalibrationFile(Document, frozen=True, kw_only=True):
-    """What ``otsync calibrate`` found out, by video; videos without a camera too."""
+    """What was found out about cameras that nobody calibrated, by video; videos without a camera too.
 
-    method: Literal["incremental", "global"]
+    method: how ``otsync calibrate`` mapped the scene, or the motion of ``otsync sync --frames own``.
+    """
+
+    method: Literal["incremental", "global", "motion"]
     unit: Literal["arbitrary", "metres"]
     cameras: Annotated[dict[Name, CalibratedFile], Meta(max_length=MAX_VIDEOS)]
     helpers: Annotated[list[Name], Meta(max_length=MAX_VIDEOS)] = field(default_factory=list)

@@ -59,6 +59,7 @@ class Scene:
         tracks: per video the file of point tracks that came along, or None. Empty: none at all.
         doubtful: why the camera of a video is not to be trusted, by its name: what ``otsync calibrate`` says.
         points: per video what another program found in it, used in place of our own tracks; or None. Empty: none.
+        pose_sigma: one sigma of the cameras' rotations, degrees, by the names of their videos, where they were found.
     """
 
     videos: tuple[Video, ...]
@@ -70,6 +71,7 @@ class Scene:
     tracks: tuple[TrackFile | None, ...] = ()
     doubtful: Mapping[str, str] = field(default_factory=dict)
     points: tuple[Detections | None, ...] = ()
+    pose_sigma: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -171,13 +173,18 @@ def scene_from_document(
         tuple(_tracks(entry, builder) for entry in entries) if any(e.get("tracks") for e in entries) else (),
         _doubtful(document),
         tuple(points for _, _, _, points in built) if any(p is not None for *_, p in built) else (),
+        {name: float(told["sigma_degrees"]) for name, told in _found(document).items() if told.get("sigma_degrees")},
     )
 
 
 def _doubtful(document: dict[str, Any]) -> dict[str, str]:
     """Why cameras are not to be trusted, by the names of their videos."""
-    found = (document.get("calibration") or {}).get("cameras") or {}
-    return {name: told["doubtful"] for name, told in found.items() if told.get("doubtful")}
+    return {name: told["doubtful"] for name, told in _found(document).items() if told.get("doubtful")}
+
+
+def _found(document: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """What is told of cameras that were found, by the names of their videos."""
+    return (document.get("calibration") or {}).get("cameras") or {}
 
 
 def names_of(entries: Sequence[dict[str, Any]]) -> list[str]:

@@ -95,13 +95,14 @@ def found_document(document: dict[str, Any], offsets: Offsets) -> dict[str, Any]
     """The scene document with the cameras that were found, in the frame and unit of the reference.
 
     Scales of depth maps are multiplied by the video's scale. Videos without an answer keep what they had and are named
-    under ``missing``.
+    under ``missing``. ``calibration`` tells how sure the others are.
     """
     found = copy.deepcopy(document)
     found.pop("missing", None)
     found["frame"] = f"{offsets.names[offsets.reference]} (found by otsync)"
     lost = []
     videos = []
+    sure: dict[str, Any] = {}
     for n, video in enumerate(found["videos"]):
         name = str(video.get("name", f"video{n}"))
         if name not in offsets.names:
@@ -113,6 +114,7 @@ def found_document(document: dict[str, Any], offsets: Offsets) -> dict[str, Any]
             lost.append(f"{name}: camera.w2c could not be found (world to camera, OpenCV axes)")
             video["camera"]["w2c"] = None
             continue
+        sure[name] = {"lens": "given", "sigma_degrees": _finite(S.rotation_sigma)}
         before = dict(video["camera"])
         if before.get("w2c") is None:
             before["w2c"] = np.eye(4).tolist()
@@ -124,6 +126,11 @@ def found_document(document: dict[str, Any], offsets: Offsets) -> dict[str, Any]
     flagged = [n for n, s in zip(offsets.names, offsets.status, strict=True) if not s.ok]
     notes.append("poses found by otsync sync --frames own" + (f"; doubtful: {', '.join(flagged)}" if flagged else ""))
     found["notes"] = notes
+    found["calibration"] = {"method": "motion", "unit": "arbitrary", "cameras": sure}
     if lost:
         found["missing"] = lost
     return found
+
+
+def _finite(x: float) -> float | None:
+    return round(float(x), 6) if np.isfinite(x) else None

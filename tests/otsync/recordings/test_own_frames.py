@@ -87,3 +87,15 @@ def test_a_video_that_was_not_found_keeps_no_pose():
     w2c = np.array(made["videos"][1]["camera"]["w2c"])
     np.testing.assert_allclose(-w2c[:3, :3].T @ w2c[:3, 3], [1, 2, 3])  # where its own origin lies
     assert document["videos"][1]["camera"]["w2c"] is None  # the document is not changed
+
+
+def test_the_scene_tells_how_sure_its_cameras_are(tmp_path):
+    folder = tmp_path / "rec"
+    write_recording(folder, [0.0, 1.0], frames=3)
+    document = json.loads((folder / "scene.json").read_text())
+    names = [video["name"] for video in document["videos"]]
+    loose = Similarity(1.0, np.eye(3), np.zeros(3)).with_covariance(np.diag([0.01**2] * 3 + [0] * 4))
+    offsets = Offsets.known(names, np.zeros(2), 30, transforms=[Similarity(1.0, np.eye(3), np.zeros(3)), loose])
+    (folder / "scene.json").write_text(json.dumps(found_document(document, offsets)))
+    told = open_scene(folder).pose_sigma
+    assert told == {names[1]: pytest.approx(loose.rotation_sigma, abs=1e-6)} and 0.5 < told[names[1]] < 1.1

@@ -26,6 +26,7 @@ from otsync.types import Offsets, Status, TrackSet
 from recon.backdrop.fit import TIMED
 from recon.cli import main
 from recon.cli.tables import offset_table
+from recon.fit.optimize import initial_rates
 from recon.fit.options import FitOptions
 from recon.footage.footage import footage_of
 from recon.pipeline.intake import only, readable, split
@@ -33,7 +34,7 @@ from recon.pipeline.plan import Plan
 from recon.pipeline.prepare import prepare
 from recon.pipeline.stages import lifted_tracks
 from recon.pipeline.starts import world_footprint
-from recon.pipeline.verb import reconstruct
+from recon.pipeline.verb import clocks_kept, reconstruct
 from recon.result.folder import load_result
 from recon.scene.gaussians4d import Gaussians4D
 from tests.recon.worlds import CAMERAS, FRAMES, SIZE, capture, write_world
@@ -206,6 +207,23 @@ def test_frozen_offsets_stay(world, start, done, tmp_path):
     np.testing.assert_array_equal(outcome.fitted.offsets.seconds, np.zeros(CAMERAS))
     with pytest.raises(ValueError, match="freeze: expected some of"):
         reconstruct(open_scene(world), start, tmp_path, plan=quick(3, freeze=("clocks",)), held_out=("held0",))
+
+
+def test_clocks_stay_where_cameras_are_not_known_well_enough(world, start, done, tmp_path):
+    """A fit holds cameras still, so a camera's error would go into its clock; who names a rate for clocks gets it."""
+    scene = replace(open_scene(world), pose_sigma={start.names[1]: 0.7})
+    told: list[str] = []
+    shutil.copytree(done[1] / "stages", tmp_path / "stages")
+    outcome = reconstruct(scene, start, tmp_path, plan=quick(3), held_out=("held0",), progress=Progress(told.append))
+    assert any("clocks stay" in line and start.names[1] in line for line in told)
+    np.testing.assert_array_equal(outcome.fitted.offsets.seconds, outcome.coarse.seconds)
+    for options, sigma in (
+        (FitOptions(freeze=("offsets",)), {start.names[1]: 0.7}),
+        (FitOptions(rates=initial_rates(FitOptions().groups.values()) | {"offsets": 0.01}), {start.names[1]: 0.7}),
+        (FitOptions(), {start.names[1]: 0.1}),
+        (FitOptions(), {"held out": 0.7}),
+    ):
+        assert clocks_kept(options, replace(scene, pose_sigma=sigma), start.names) == (options, "")
 
 
 def test_bad_frames_are_left_out_and_named(world, start, tmp_path):
