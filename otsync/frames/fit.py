@@ -74,7 +74,6 @@ def fit_jointly(
     sight: Sight | None = None,
     iterations: int = 15,
     tolerance: float = 1e-5,
-    every: float = READ_EVERY,
 ) -> Joint | None:
     """Minimise robustly the differences of matched curves over offset, rotation, scale and translation.
 
@@ -83,12 +82,11 @@ def fit_jointly(
             rate of the clock stays. window: s, half the length of the moving mean that splits the residual.
         sight: along which depth errs; None: errors are taken to be alike in all directions.
         tolerance: frames, radians and relative scale; smaller steps end the iteration.
-        every: seconds between the moments at which residuals are read.
 
     Returns None when no match is seen long enough in both.
     """
     state = State.of(a, b, clock, transform)
-    own = read(a, every), read(b, every)
+    own = read(a), read(b)
     noise: Noise | None = None
     n = 0
     while True:
@@ -212,9 +210,9 @@ def schur(H: np.ndarray, index: list[int]) -> np.ndarray:
 Reading = tuple[Float[np.ndarray, " S"], Float[np.ndarray, "M S 3"], float]
 
 
-def read(curves: TrackSplines, every: float = READ_EVERY) -> Reading:
+def read(curves: TrackSplines) -> Reading:
     """The moments at which residuals are read in one video, its curves there, and the seconds from one to the next."""
-    step = max(1, round(every / curves.frame))
+    step = max(1, round(READ_EVERY / curves.frame))
     t = curves.times[::step]
     return t, curves.value(t), step * curves.frame
 

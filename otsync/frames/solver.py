@@ -22,7 +22,7 @@ from ..types import Alignment, Clock, Matches, Similarity, Status, TrackSet, in_
 from ..types.checks import positive
 from .agreement import Overlay, feature_distances, overlay
 from .clouds import Cloud, clouds, comes_first, from_units, in_units
-from .fit import READ_EVERY, Joint, fit_jointly
+from .fit import Joint, fit_jointly
 from .scan import APART, STRIDE, Shifts, scan
 
 WINDOW = 14 / 30
@@ -34,8 +34,8 @@ SAME_TIME, SAME_TURN = 4 / 30, 15.0
 QUICK_MATCHES = 80
 """Matches of the fits that weigh candidates against each other."""
 
-QUICK_STEPS, QUICK, QUICK_READ = 5, 2e-3, 4 / 30
-"""Steps of those first fits, the step (frames, radians) that ends them, and seconds from one reading to the next."""
+QUICK_STEPS, QUICK = 5, 2e-3
+"""Steps of those first fits, and the step (frames, radians) that ends them."""
 
 PROMISING = 4
 """Candidates that are matched anew and fitted once more, those that most tracks agree with after the first time."""
@@ -187,8 +187,7 @@ class OwnFrames:
             fps = min(nominal_fps(a), nominal_fps(b))
             return nothing(Status.NO_MATCH), Alignment(math.nan, fps=fps, flags=(Status.NO_MATCH,), stats=stats)
         first = weighed[0]
-        rival = pair.rival(first, weighed[1:]) / max(first.agreement, 1e-300)
-        return self._answer(a, b, pair, first, stats | {"rival": rival})
+        return self._answer(a, b, pair, first, pair.rival(first, weighed[1:]), stats)
 
     # --- the search ---------------------------------------------------------------------------------------------
 
@@ -224,12 +223,16 @@ class OwnFrames:
     # --- the answer ---------------------------------------------------------------------------------------------
 
     def _answer(
-        self, a: TrackSet, b: TrackSet, pair: Pair, first: Weighed, stats: dict[str, float]
+        self, a: TrackSet, b: TrackSet, pair: Pair, first: Weighed, rival: float, stats: dict[str, float]
     ) -> tuple[Matches, Alignment]:
+        """Args: rival: agreement of the best other answer."""
         sure = first.agreement >= self.trust.agreement * min(len(pair.a), len(pair.b))
         joint = pair.finish(first.joint, sure)
         laid = pair.overlay(joint)
-        agreement = laid.agreement() / min(len(pair.a), len(pair.b))
+        finished = laid.agreement()
+        agreement = finished / min(len(pair.a), len(pair.b))
+        # its rivals were fitted on, too
+        stats = stats | {"rival": rival / max(finished, first.agreement, 1e-300)}
         pairs, cost = laid.matches(pair.features, *CLOSE)
         covariance = joint.transform.covariance
         assert covariance is not None
@@ -313,7 +316,6 @@ class Pair:
         small: float,
         *,
         directed: bool = False,
-        every: float = READ_EVERY,
     ) -> Joint | None:
         """Args: directed: whether depth, where cameras are known, counts for less than what they see across."""
         if len(pairs) < 4:
@@ -323,9 +325,7 @@ class Pair:
         known = directed and self.a.sight is not None and self.b.sight is not None
         sight = (self.a.sight[i], self.b.sight[j]) if known else None  # type: ignore[index]
         try:
-            return fit_jointly(
-                *curves, clock, start, WINDOW, sight=sight, iterations=steps, tolerance=small, every=every
-            )
+            return fit_jointly(*curves, clock, start, WINDOW, sight=sight, iterations=steps, tolerance=small)
         except np.linalg.LinAlgError:
             return None
 
@@ -386,7 +386,7 @@ class Pair:
     def laid(self, clock: Clock, start: Similarity) -> Weighed | None:
         """Matched in the common frame, fitted, and weighed; None where nothing is left to fit."""
         pairs, _ = self.overlay_at(clock, start).matches(self.features, 2, QUICK_MATCHES)
-        joint = self.fit(pairs, clock, start, QUICK_STEPS, QUICK, every=QUICK_READ)
+        joint = self.fit(pairs, clock, start, QUICK_STEPS, QUICK)
         if joint is None or not 0.2 < joint.transform.scale < 5:
             return None
         return Weighed(joint, self.overlay(joint).agreement())
