@@ -15,7 +15,7 @@ from ..clocks.shutter import at_frame_times
 from ..compute.threads import MapLike
 from ..frames import OwnFrames
 from ..frames.clouds import sizes
-from ..frames.solver import SAME_TIME, SAME_TURN
+from ..frames.weighing import SAME_TIME, SAME_TURN
 from ..match.slot import Matcher, MatcherLike
 from ..match.synchronous import longest_seen
 from ..types import Alignment, Clock, Matches, Similarity, Status, TrackSet, in_order
