@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from ..files.cache import Cache
-from ..frames import OwnFrames
+from ..frames import OwnFrames, PoseTrust
 from ..frames.solver import moved
 from ..geometry import common_target, view_angle
 from ..io import open_scene
@@ -123,10 +123,13 @@ def promises(rows: list[dict[str, Any]]) -> list[Check]:
         checks.append(at_most(f"{what}: wrong without a flag", row["wrong"], 0))
         if what == "simulated, mid":
             checks.append(at_least(f"{what}: right", row["right"], 0.9))
+            checks.append(at_most(f"{what}: neither right nor flagged", row["neither"], 0))
         elif what.startswith("static"):
             checks.append(at_least(f"{what}: flagged", row["flagged"], 1))
         elif what.startswith("cameras, below"):
             checks.append(at_least(f"{what}: right", row["right"], 0.95))
+        elif what.startswith("cameras, beyond"):
+            checks.append(at_most(f"{what}: neither right nor flagged", row["neither"], 0))
         elif what.startswith("all cameras"):
             checks.append(at_least(f"{what}: placed", row["placed"], row["n"]))
             bars = (("offset_mean", 0.15, "frames"), ("rotation_mean", 1, "degrees"), ("centre_mean", 0.05, "m"))
@@ -190,8 +193,10 @@ def a_fps(tracks: TrackSet) -> float:
 
 
 def judge(pair: Pair, limits: tuple[float, float, float]) -> dict[str, Any]:
-    """One pair's errors, and whether it is right, flagged or wrong."""
-    _, found = OwnFrames()(pair.a, pair.b)
+    """One pair's errors, and whether it is right, flagged or wrong; flags are asked for what counts as right."""
+    seconds, degrees, percent = limits[0] / a_fps(pair.a), limits[1], limits[2]
+    trust = PoseTrust.within(seconds=seconds, degrees=degrees, scale=percent / 100 if np.isfinite(percent) else None)
+    _, found = OwnFrames(trust=trust)(pair.a, pair.b)
     return errors(pair, found, limits)
 
 
@@ -236,7 +241,7 @@ def _known(x: float) -> float | None:
 
 
 def summary(what: str, details: list[dict[str, Any]]) -> dict[str, Any]:
-    """Shares and quantiles; errors are of answers without a flag."""
+    """Shares and quantiles; errors are of answers without a flag. careful: the share of right answers with one."""
     trusted = [d for d in details if not d["flagged"] and d.get("offset_error") is not None]
 
     def at(key: str, q: float) -> float | None:
@@ -251,6 +256,9 @@ def summary(what: str, details: list[dict[str, Any]]) -> dict[str, Any]:
         "n": len(details),
         "right": round(float(np.mean([d["right"] for d in details])), 3) if details else None,
         "flagged": round(float(np.mean([d["flagged"] for d in details])), 3) if details else None,
+        "careful": round(
+            sum(d["right"] and d["flagged"] for d in details) / max(sum(d["right"] for d in details), 1), 3
+        ),
         "neither": round(float(np.mean([not d["right"] and not d["flagged"] for d in details])), 3)
         if details
         else None,

@@ -69,6 +69,8 @@ class Jumps:
 
     def each_track(self) -> Iterator[tuple[int, slice]]:
         """Every track that jumps, and where its jumps are, in order of time."""
+        if not len(self):
+            return
         edges = np.flatnonzero(np.diff(self.track, prepend=-1, append=np.iinfo(self.track.dtype).max))
         for first, end in itertools.pairwise(edges):
             yield int(self.track[first]), slice(first, end)

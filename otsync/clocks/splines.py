@@ -79,7 +79,9 @@ class TrackSplines:
 
     def _fit(self, xyz: np.ndarray, penalty: float) -> tuple[np.ndarray, np.ndarray]:
         """(M,3) means, and (M,n,3) coefficients around them. Memory grows with T + n, not with its square."""
-        count, basis = len(xyz), self._design(self.times, DEGREE)
+        count = len(xyz)
+        inside = np.clip(self.times, self.knots[DEGREE], self.knots[-DEGREE - 1])
+        basis = sparse.csr_array(BSpline.design_matrix(inside, self.knots, DEGREE))
         # by diagonal: what turns the weights of samples into a band of the normal equations
         products = [basis[:, : self.n - d].multiply(basis[:, d:]).T.tocsr() for d in range(DEGREE + 1)]
         transposed, regular = basis.T.tocsr(), _penalty_bands(self.n, penalty)
@@ -116,7 +118,17 @@ class TrackSplines:
 
     def value(self, t: Float[np.ndarray, " S"]) -> Float[np.ndarray, "M S 3"]:
         """Positions at seconds ``t``; outside the clip the end values."""
-        x = self.joined(t)
+        return self._with_jumps(self.joined(t), t)
+
+    def value_and_velocity(
+        self, t: Float[np.ndarray, " S"]
+    ) -> tuple[Float[np.ndarray, "M S 3"], Float[np.ndarray, "M S 3"]]:
+        """:meth:`value` and :meth:`velocity`."""
+        first, value, slope = self.basis(t)
+        x = self._curves(first, value, np.repeat(self.mean[:, None], len(t), 1))
+        return self._with_jumps(x, t), self._curves(first, slope, np.zeros_like(x))
+
+    def _with_jumps(self, x: np.ndarray, t: np.ndarray) -> np.ndarray:
         jumps = self.jumps
         for track, those in jumps.each_track():
             when = 0.5 * (self.times[jumps.before[those]] + self.times[jumps.after[those]])
@@ -125,31 +137,19 @@ class TrackSplines:
 
     def joined(self, t: Float[np.ndarray, " S"]) -> Float[np.ndarray, "M S 3"]:
         """Positions at ``t`` as they would be had no track jumped: what the coefficients say."""
-        flat = self._design(self._inside(t), DEGREE) @ self.coefficients
-        return flat.reshape(len(t), -1, 3).transpose(1, 0, 2) + self.mean[:, None]
+        first, value, _ = self.basis(t)
+        return self._curves(first, value, np.repeat(self.mean[:, None], len(t), 1))
 
     def velocity(self, t: Float[np.ndarray, " S"]) -> Float[np.ndarray, "M S 3"]:
         """World units per second at ``t``."""
-        slopes = np.diff(self.coefficients, axis=0) / self.step
-        flat = self._design(self._inside(t), DEGREE - 1) @ slopes
-        return flat.reshape(len(t), -1, 3).transpose(1, 0, 2)
+        first, _, slope = self.basis(t)
+        return self._curves(first, slope, np.zeros((len(self.mean), len(t), 3)))
 
-    def joined_and_velocity(
-        self, t: Float[np.ndarray, " S"]
-    ) -> tuple[Float[np.ndarray, "M S 3"], Float[np.ndarray, "M S 3"]]:
-        """:meth:`joined` and :meth:`velocity` at few moments of a long clip, whose other coefficients are not read."""
-        first, value, slope = self.basis(t)
-        x, v = np.repeat(self.mean[:, None], len(t), 1), np.zeros((len(self.mean), len(t), 3))
-        for k in range(DEGREE + 1):
-            c = self.by_track[:, first + k]
-            x += value[:, k, None] * c
-            v += slope[:, k, None] * c
-        return x, v
+    def _curves(self, first: np.ndarray, weights: np.ndarray, onto: np.ndarray) -> np.ndarray:
+        from .kernels import add_curves
 
-    @property
-    def coefficients(self) -> Float[np.ndarray, "n M*3"]:
-        """Coefficients around each track's mean, one row a knot; a copy."""
-        return self.by_track.transpose(1, 0, 2).reshape(self.n, -1)
+        add_curves(self.by_track, first, weights, onto)
+        return onto
 
     def basis(
         self, t: Float[np.ndarray, " S"]
@@ -195,10 +195,6 @@ class TrackSplines:
 
     def _inside(self, t: np.ndarray) -> np.ndarray:
         return np.clip(t, self.times[0], self.times[-1] - WITHIN * self.step)
-
-    def _design(self, t: np.ndarray, degree: int) -> sparse.csr_array:
-        knots = self.knots if degree == DEGREE else self.knots[1:-1]
-        return sparse.csr_array(BSpline.design_matrix(np.clip(t, knots[degree], knots[-degree - 1]), knots, degree))
 
 
 def sampled(

@@ -247,10 +247,11 @@ def linearise(
         there = clock.own(t) if forward else clock.world(t)
         t_a, t_b = (t, there) if forward else (there, t)
         ok = a.support(t_a) & b.support(t_b)
-        u = ((values if forward else a.value(t_a)) - state.middle_a) / root
-        y = ((b.value(t_b) if forward else values) - state.middle_b) @ turned
+        x, v = (b if forward else a).value_and_velocity(there)
+        u = ((values if forward else x) - state.middle_a) / root
+        y = ((x if forward else values) - state.middle_b) @ turned
         # t_b = (t_a - offset) / rate at a's frames; t_a = rate t_b + offset at b's
-        v = (b.velocity(t_b) @ turned) / clock.rate if forward else a.velocity(t_a) / root
+        v = (v @ turned) / clock.rate if forward else v / root
         slack = 1e-6 * frame
         lo = np.searchsorted(t, t - window - slack)
         hi = np.searchsorted(t, t + window + slack, side="right")

@@ -69,6 +69,7 @@ class PoseTrust:
         blur: WEAK when the residual of the motion is more than this many seconds of it.
         rotation: LOOSE_POSE when one sigma of the rotation is more than this, degrees.
         scale: LOOSE_POSE when one sigma of the scale is more than this share of it.
+        clock: COARSE when one sigma of a pair's offset is more than this many seconds.
         elsewhere: DISAGREE when the likelihood scan of the final matches peaks more than this many seconds away.
         chirality: AMBIGUOUS when fewer of the matched quads have the same handedness in both videos.
     """
@@ -78,8 +79,29 @@ class PoseTrust:
     blur: float = 4.2 / 30
     rotation: float = 2.25
     scale: float = 0.05
+    clock: float = math.inf
     elsewhere: float = 3 / 30
     chirality: float = 0.5
+
+    @classmethod
+    def within(
+        cls, *, seconds: float | None = None, degrees: float | None = None, scale: float | None = None
+    ) -> PoseTrust:
+        """The limits of one who needs errors within these: an answer is flagged where two of its sigmas are more.
+
+        Args:
+            seconds: of the offset. degrees: of the rotation. scale: as a share of it. None: the usual limit.
+        """
+        needs = {"clock": ("seconds", seconds), "rotation": ("degrees", degrees), "scale": ("scale", scale)}
+        for name, value in needs.values():
+            if value is not None:
+                positive(f"PoseTrust.within, {name}", value)
+        return cls(**{limit: value / 2 for limit, (_, value) in needs.items() if value is not None})
+
+    def loose(self, transform: Similarity | None) -> bool:
+        """Whether the pose is unknown, or known to less than these limits."""
+        S = transform
+        return S is None or not (S.rotation_sigma < self.rotation and S.scale_sigma < self.scale)
 
 
 @dataclass(frozen=True)
@@ -237,18 +259,19 @@ class OwnFrames:
             }
         )
         still = (Status.STATIC,) if drifts(a, rows[:, 0]) and drifts(b, rows[:, 1]) else ()
-        flags = in_order((*fine.flags, *self._flags(stats), *still))
-        return matches, replace(fine, transform=transform, flags=flags, stats=stats)
+        found = replace(fine, transform=transform, stats=stats)
+        return matches, replace(found, flags=in_order((*fine.flags, *self._flags(found), *still)))
 
-    def _flags(self, stats: dict[str, float]) -> tuple[Status, ...]:
-        t = self.trust
+    def _flags(self, fine: Alignment) -> tuple[Status, ...]:
+        t, stats = self.trust, fine.stats
         raised = {
             Status.NO_MATCH: stats["agreement"] < t.agreement / 3,
             Status.WEAK: stats["agreement"] < t.agreement or stats["blur"] > t.blur,
             Status.AMBIGUOUS: stats["rival"] > t.rival or stats["chirality"] < t.chirality,
             # the scan over all shifts, of the same matches, ended somewhere else
             Status.DISAGREE: stats["elsewhere"] > t.elsewhere,
-            Status.LOOSE_POSE: not (stats["rotation_sigma"] < t.rotation and stats["scale_sigma"] < t.scale),
+            Status.LOOSE_POSE: t.loose(fine.transform),
+            Status.COARSE: fine.sigma > t.clock,
         }
         return tuple(flag for flag, yes in raised.items() if yes)
 

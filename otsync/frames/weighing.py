@@ -25,6 +25,10 @@ QUICK_MATCHES = 80
 QUICK_STEPS, QUICK = 5, 2e-3
 """Steps of those first fits, and the step (frames, radians) that ends them."""
 
+FITTED = 8
+"""Candidates that are fitted, those that most tracks agree with before. Of the twenty of a second search, the one that
+was best after its fit was among the first five before it, on all pairs where the limits of flags were chosen."""
+
 PROMISING = 4
 """Candidates that are matched anew and fitted once more, those that most tracks agree with after the first time."""
 
@@ -137,18 +141,22 @@ class Pair:
 
     def weigh_all(self, candidates: list[Candidate]) -> list[Weighed]:
         """The most promising candidates after quick fits, best first."""
-        first = [self.laid(Clock(offset), S) for _, offset, S in candidates]
+        begun = [(Clock(offset), S, self.overlay_at(Clock(offset), S)) for _, offset, S in candidates]
+        if len(begun) > FITTED:
+            begun = sorted(begun, key=lambda c: -c[2].agreement())[:FITTED]
+        first = [self.laid(*c) for c in begun]
         best = sorted((w for w in first if w is not None), key=lambda w: -w.agreement)[:PROMISING]
-        again = [self.laid(w.joint.clock, w.joint.transform) for w in best]
+        again = [self.laid(w.joint.clock, w.joint.transform, self.overlay(w.joint)) for w in best]
         return sorted((w for w in again if w is not None), key=lambda w: -w.agreement)
 
     def weigh(self, offset: float, start: Similarity) -> Weighed | None:
         """Two rounds of matching in the common frame and fitting; None where nothing is left to fit."""
         return next(iter(self.weigh_all([(0.0, offset, start)])), None)
 
-    def laid(self, clock: Clock, start: Similarity) -> Weighed | None:
-        """Matched in the common frame, fitted, and weighed; None where nothing is left to fit."""
-        pairs, _ = self.overlay_at(clock, start).matches(self.features, 2, QUICK_MATCHES)
+    def laid(self, clock: Clock, start: Similarity, over: Overlay) -> Weighed | None:
+        """Matched in the common frame, where they lie ``over`` each other, fitted, and weighed; None where nothing is
+        left to fit."""
+        pairs, _ = over.matches(self.features, 2, QUICK_MATCHES)
         joint = self.fit(pairs, clock, start, QUICK_STEPS, QUICK)
         if joint is None or not 0.2 < joint.transform.scale < 5:
             return None

@@ -81,8 +81,8 @@ def _variance(
         middle = slice(first - frames.start, first - frames.start + size)
         times = own.times[frames]
         seen = own.support(times) & other.support(there(times))
-        x = own.joined_and_velocity(times)[0]
-        y, v = other.joined_and_velocity(there(times))
+        x = own.joined(times)
+        y, v = other.joined(there(times)), other.velocity(there(times))
         r, v = (_detrended(values, seen, near)[:, middle] for values in (x - y, v))
         sums = sums + Sums.of(r, v, _weights(r, seen[:, middle], weight), group, 2 * near)
     return sums.variance() * len(some) / pieces

@@ -70,14 +70,12 @@ def run_own(job: OwnJob) -> Answer:
 
 
 def as_tie(found: Alignment) -> Alignment:
-    """Without LOOSE_POSE where the pose is firm enough to tie two videos; :func:`with_pose_flags` puts it back."""
+    """Without LOOSE_POSE and COARSE where the pose is firm enough to tie two videos; :func:`with_pose_flags` puts them
+    back."""
     S = found.transform
     firm = S is not None and S.rotation_sigma <= LINK_ROTATION and S.scale_sigma <= LINK_SCALE
-    return dataclasses.replace(found, flags=tuple(f for f in found.flags if not (firm and f is Status.LOOSE_POSE)))
-
-
-def loose(S: Similarity | None, solver: OwnFrames) -> bool:
-    return S is None or not (S.rotation_sigma < solver.trust.rotation and S.scale_sigma < solver.trust.scale)
+    loose = (Status.LOOSE_POSE, Status.COARSE) if firm else ()
+    return dataclasses.replace(found, flags=tuple(f for f in found.flags if f not in loose))
 
 
 def synchronize_own(
@@ -205,7 +203,7 @@ def with_pose_flags(verdict: Verdict, poses: Poses, links: Sequence[tuple[Pair, 
         frame = poses.frames[v]
         used = [error[p] for p in error if v in p and np.isfinite(error[p])]
         if verdict.component[v] != v or not own:
-            if v != verdict.reference and loose(frame, solver):
+            if v != verdict.reference and solver.trust.loose(frame):
                 raised.append(Status.LOOSE_POSE)
             if used and sum(e > ASTRAY for e in used) >= len(used) / 2 and v != verdict.reference:
                 raised.append(Status.INCONSISTENT)
@@ -218,8 +216,10 @@ def with_pose_flags(verdict: Verdict, poses: Poses, links: Sequence[tuple[Pair, 
         extra: tuple[Status, ...] = ()
         if a.refined.status.ok and (not closed.get(a.pair, True) or stats.get("pose_error", 0.0) > ASTRAY):
             extra = (Status.INCONSISTENT,)
-        if a.refined.transform is not None and loose(a.refined.transform, solver):
+        if a.refined.transform is not None and solver.trust.loose(a.refined.transform):
             extra = (*extra, Status.LOOSE_POSE)
+        if a.refined.sigma > solver.trust.clock:
+            extra = (*extra, Status.COARSE)
         found = dataclasses.replace(a.refined, flags=in_order((*a.refined.flags, *extra)), stats=stats)
         answers.append(dataclasses.replace(a, refined=found))
     known = [e for e in error.values() if np.isfinite(e)]

@@ -85,7 +85,9 @@ class Similarity:
 
     def degrees_from(self, other: Similarity) -> float:
         """Angle between the two rotations."""
-        return float(np.degrees(np.linalg.norm(rotation_vector(other.R @ self.R.T))))
+        turn = other.R @ self.R.T
+        twice_sine = np.hypot(np.hypot(turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0]), turn[1, 0] - turn[0, 1])
+        return float(np.degrees(np.arctan2(twice_sine, np.trace(turn) - 1)))
 
     @property
     def rotation_sigma(self) -> float:

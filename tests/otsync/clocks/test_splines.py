@@ -45,6 +45,21 @@ def test_velocity_is_the_derivative_of_value():
     np.testing.assert_allclose(s.velocity(at), (s.value(at + h) - s.value(at - h)) / (2 * h), atol=1e-6)
 
 
+def test_the_curve_is_the_one_that_its_coefficients_say():
+    """Against scipy's B-splines, at the ends and beyond them too."""
+    rng = np.random.default_rng(0)
+    t = np.arange(40) / 25 + 3
+    s = TrackSplines(t, wiggle(rng, 3, 40))
+    at = np.concatenate([np.linspace(t[0] - 0.1, t[-1] + 0.1, 57), t[[0, -1]]])
+    curves = BSpline(s.knots, s.by_track.transpose(1, 0, 2), 3)
+    inside = np.clip(at, t[0], t[-1] - 1e-9)
+    expected = curves(inside).transpose(1, 0, 2) + s.mean[:, None]
+    np.testing.assert_allclose(s.joined(at), expected, atol=1e-7)
+    value, velocity = s.value_and_velocity(at)
+    np.testing.assert_allclose(value, s.value(at), atol=0)
+    np.testing.assert_allclose(velocity, curves.derivative()(inside).transpose(1, 0, 2), atol=1e-6)
+
+
 def test_support_never_bridges_a_gap_nor_leaves_the_clip():
     x = np.zeros((1, 30, 3))
     x[0, 10:13] = np.nan

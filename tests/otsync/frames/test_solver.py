@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from otsync.frames import OwnFrames
+from otsync.frames import OwnFrames, PoseTrust
+from otsync.frames.clouds import clouds, in_units
 from otsync.frames.solver import moved
+from otsync.frames.weighing import FITTED, Pair
 from otsync.simulate import simulate
 from otsync.types import Clock, Similarity, Status
 
@@ -141,3 +143,26 @@ def test_too_few_tracks_are_flagged(n, pair):
 def test_unsound_options_are_refused(bad):
     with pytest.raises(ValueError, match=f"OwnFrames.{next(iter(bad))}"):
         OwnFrames(**bad)
+
+
+def test_what_is_not_known_as_well_as_needed_is_flagged():
+    a, b, _ = world()
+    _, found = SOLVER(a, b)
+    for need in ({"seconds": found.sigma}, {"degrees": found.transform.rotation_sigma}, {"scale": 1e-4}):
+        _, again = OwnFrames(trust=PoseTrust.within(**need))(a, b)
+        assert again.offset == found.offset
+        assert again.flags == ((Status.COARSE,) if "seconds" in need else (Status.LOOSE_POSE,))
+    roomy = PoseTrust.within(seconds=3 * found.sigma, degrees=3 * found.transform.rotation_sigma)
+    assert OwnFrames(trust=roomy)(a, b)[1].flags == ()
+    assert roomy.scale == PoseTrust().scale
+    with pytest.raises(ValueError, match=r"within, degrees: expected a number > 0"):
+        PoseTrust.within(degrees=0)
+
+
+def test_candidates_that_are_not_fitted_change_nothing():
+    """What is left out of many candidates is what few tracks agree with."""
+    a, b, truth = world()
+    pair = Pair.of(*clouds(a, b, 300))
+    right = (0.0, 0.3, in_units(truth.transform(0, 1), pair.a, pair.b))
+    wrong = [(0.0, 0.3 + 0.1 * k, right[2]) for k in range(3, 3 + 2 * FITTED)]
+    assert pair.weigh_all([*wrong, right])[0].agreement == pair.weigh_all([right])[0].agreement

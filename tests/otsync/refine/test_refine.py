@@ -201,7 +201,7 @@ def test_a_fitted_rate_is_kept_only_when_significant():
         if kept:
             assert found.rate == pytest.approx(1.001, abs=2e-4)
             assert found.offset == pytest.approx(0.3, abs=0.1 / 30)
-            fixed = refine(*tracks, m, align(*tracks, m), throw=False)
+            fixed = refine(*tracks, m, align(*tracks, m), SplineRefine(rate="fixed"), throw=False)
             assert fixed.rate == 1.0 and Status.RATE_MISMATCH in fixed.flags
 
 

@@ -30,6 +30,14 @@ def test_they_are_a_group(i, j):
     np.testing.assert_allclose(f.moved(f.difference(g))(x), g(x), atol=1e-9)
 
 
+@given(seeds, st.sampled_from([0.0, 1e-7, 0.3, 3.0, np.pi - 1e-7, np.pi]))
+def test_the_angle_between_rotations_is_exact_near_none_and_near_a_half_turn(seed, angle):
+    axis = np.random.default_rng(seed).normal(size=3)
+    f = draw(0)
+    g = Similarity(2.0, rotation_of(angle * axis / np.linalg.norm(axis)) @ f.R, f.t)
+    assert f.degrees_from(g) == pytest.approx(np.degrees(angle), abs=1e-7)
+
+
 @given(seeds)
 def test_quaternions_are_scipys_with_w_first(seed):
     f = draw(seed)
