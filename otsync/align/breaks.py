@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -58,6 +60,12 @@ SLOPES = 0.05
 
 LEAST_JUMP = 3 / 30
 """Seconds; smaller steps are a rate, or noise."""
+
+OTHERS = 8
+"""Offsets of a part that are tried where most matches do not agree at its best one."""
+
+SHORT = 1.0
+"""Seconds at either end of the clip in which some offset may suit by chance."""
 
 LEAST_PART = 20 / 30
 """Seconds of the shortest part that counts."""
@@ -149,13 +157,104 @@ def find_breaks(
         return NONE, gain, doubtful  # a rate explains it as well, with one number
     spans = np.split(np.arange(windows), edges)
     tops = [int(np.argmax(curves[p].sum(0))) for p in spans]
-    for span, top in zip(spans, tops, strict=True):
-        if top != best and agreement(pair, span, int(lags[top]), floor, step) < AGREES:
-            return NONE, gain, doubtful  # some offset suits a few of the matches by chance
-    offsets = [float(pair.seconds(vertex(lags, c := curves[p].sum(0), int(np.argmax(c))))) for p in spans]
-    begin = pair.start + (np.concatenate([[0], edges]) - 0.5) * step / pair.fps
+
+    def agrees(k: int, found: Sequence[int]) -> float:
+        # halves that were exchanged lost nothing: all of them counts, too
+        asked = {partners(spans, found, k, step), frames(spans[k], step)}
+        return max(agreement(pair, begin, end, found[k], floor) for begin, end in asked)
+
+    agree = [agrees(k, [int(lags[t]) for t in tops]) for k in range(len(tops))]
+    kept = by_chance(spans, [int(lags[t]) for t in tops], agree, int(lags[best]), pair, step)
+    if len(kept) < len(spans):
+        without = sum(float(curves[spans[k], path[spans[k]]].sum()) for k in range(len(spans)) if k not in kept)
+        gain -= without
+        if len(kept) < 2 or gain < price * (len(kept) - 1):
+            return NONE, max(gain, 0.0), True
+        # the windows of what is left out belong to nothing; the next part begins where it did
+        spans, tops, agree = ([x[k] for k in kept] for x in (spans, tops, agree))
+    for k, top in enumerate(tops):
+        if top == best or agree[k] >= AGREES:
+            continue
+        # some offset suits a few of the matches by chance: of motion that comes again another one may suit most
+        evidence = curves[spans[k]].sum(0)
+        told = {}
+        for other in likely(evidence, least=round(LEAST_JUMP * pair.fps)):
+            found = [int(lags[t]) for t in (*tops[:k], other, *tops[k + 1 :])]
+            if np.abs(np.diff(found)).min() >= round(LEAST_JUMP * pair.fps):
+                told[other] = agrees(k, found)
+        other = max(told, key=lambda o: told[o], default=top)
+        gain += float(evidence[other] - evidence[top])
+        if told.get(other, 0.0) < AGREES or gain < price * (len(tops) - 1):
+            return NONE, max(gain, 0.0), doubtful
+        tops[k] = other
+    offsets = [float(pair.seconds(vertex(lags, curves[p].sum(0), top))) for p, top in zip(spans, tops, strict=True)]
+    begin = pair.start + (np.array([p[0] for p in spans]) - 0.5) * step / pair.fps
     begin[0] = pair.start
     return np.stack([begin, offsets], 1), gain, False
+
+
+def likely(evidence: Float[np.ndarray, " K"], least: int) -> list[int]:
+    """The best local maxima but the first, at least ``least`` lags apart, best first."""
+    inner = np.flatnonzero((evidence[1:-1] >= evidence[:-2]) & (evidence[1:-1] > evidence[2:])) + 1
+    found = [int(np.argmax(evidence))]
+    for k in inner[np.argsort(-evidence[inner], kind="stable")]:
+        if all(abs(int(k) - j) >= least for j in found):
+            found.append(int(k))
+        if len(found) > OTHERS:
+            break
+    return found[1:]
+
+
+def frames(span: Int[np.ndarray, " P"], step: int) -> tuple[int, int]:
+    """a's frames of some windows in a row, from the first one's middle to the last one's."""
+    return int(span[0]) * step - step // 2, int(span[-1]) * step + step // 2
+
+
+def partners(spans: Sequence[np.ndarray], lags: Sequence[int], k: int, step: int) -> tuple[int, int]:
+    """a's frames of part k that have partners in b, whichever end of a gap the windows put its edge at.
+
+    Where the lag grows from one part to the next, b lost that many frames, or a repeats them: there a's have no
+    partner. At least half of the part counts.
+    """
+    begin, end = frames(spans[k], step)
+    half = (end - begin) // 2
+    before = max(0, lags[k] - lags[k - 1]) if k else 0
+    behind = max(0, lags[k + 1] - lags[k]) if k + 1 < len(lags) else 0
+    trim = max(0, min(before, half)), max(0, min(behind, half))
+    if sum(trim) > half:
+        trim = (half // 2, half // 2)
+    return begin + trim[0], end - trim[1]
+
+
+def by_chance(
+    spans: Sequence[np.ndarray],
+    lags: Sequence[int],
+    agree: Sequence[float],
+    best: int,
+    pair: CommonClock,
+    step: int,
+) -> list[int]:
+    """The parts that are left without those in which some offset suits by chance: short ones, not at the ``best`` lag
+    of all, that agree less than the parts beside them, and whose frames of a have no partner if these are right: b lost
+    them, or begins later, or ends earlier.
+    """
+    kept = list(range(len(spans)))
+    for k in range(len(spans)):
+        left = [j for j in kept if j < k][-1:]
+        right = [k + 1] if k + 1 < len(spans) else []
+        if lags[k] == best or not (left or right) or agree[k] >= min(agree[j] for j in (*left, *right)):
+            continue
+        begin, end = frames(spans[k], step)
+        weak = end - begin <= SHORT * pair.fps or agree[k] < AGREES
+        if left and right:
+            alone = end - begin <= lags[right[0]] - lags[left[0]] + 2 * step
+        elif right:
+            alone = weak and end <= lags[right[0]] + step
+        else:
+            alone = weak and begin >= pair.b.shape[1] + lags[left[0]] - step
+        if alone:
+            kept.remove(k)
+    return kept
 
 
 def seen_share(pair: CommonClock, lag: int, step: int) -> Float[np.ndarray, " W"]:
@@ -213,10 +312,11 @@ def explained(pair: CommonClock, lag: int, floor: float, step: int) -> tuple[flo
     return min(shares), ratio
 
 
-def agreement(pair: CommonClock, span: Int[np.ndarray, " P"], lag: int, floor: float, step: int) -> float:
-    """The share of its motion that the median match has in common with its partner over a part, at the part's lag."""
-    begin = max(0, lag, int(span[0]) * step - step // 2)
-    end = min(pair.a.shape[1], pair.b.shape[1] + lag, int(span[-1]) * step + step // 2)
+def agreement(pair: CommonClock, begin: int, end: int, lag: int, floor: float) -> float:
+    """The share of its motion that the median match has in common with its partner, over a's frames from ``begin`` to
+    ``end`` at a lag."""
+    begin = max(0, lag, begin)
+    end = min(pair.a.shape[1], pair.b.shape[1] + lag, end)
     if end - begin < LEAST_WINDOW * pair.fps:
         return 0.0
     x, y = pair.a[:, begin:end], pair.b[:, begin - lag : end - lag]

@@ -121,6 +121,7 @@ class SplineRefine(Refiner):
                 "blur": fit.blur,
                 "wander": fit.wander,
                 "common_error": common,
+                "scatter": math.sqrt(max(float(fit.covariance[0, 0]), 0.0)),
                 "correlation": velocity_correlation(*curves, fit, VELOCITY),
                 "overlap": overlap_seconds(*curves, fit.clock),
                 "iterations": float(fit.iterations),

@@ -203,11 +203,16 @@ def _seen(verdict: Verdict, tracks: Sequence[TrackSet]) -> list[Seen]:
 
 
 def suspected(verdict: Verdict, tracks: Sequence[TrackSet], fps: Sequence[float]) -> list[Suspect]:
-    """Breaks that were not mended, and that no pair which sees both sides of them speaks against."""
+    """Breaks that were not mended, and that no pair which sees both sides of them speaks against.
+
+    A pair that is ambiguous accuses nobody: what suits a part of it at another time may be motion that comes again.
+    """
     doubtful = [
         a
         for a in verdict.answers
-        if len(a.scanned.parts) and Status.BROKEN_CLOCK in a.refined.flags and not NOTHING_COMMON & set(a.refined.flags)
+        if len(a.scanned.parts)
+        and Status.BROKEN_CLOCK in a.refined.flags
+        and not {*NOTHING_COMMON, Status.AMBIGUOUS} & set(a.refined.flags)
     ]
     sound = _seen(verdict, tracks)
     named = [s for a in doubtful for s in suspects(a, tracks[a.pair[0]], tracks[a.pair[1]], fps)]

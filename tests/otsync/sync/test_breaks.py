@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 
 from otsync import synchronize
+from otsync.align.breaks import by_chance, likely, partners
 from otsync.bench.trust.worlds import CLASSES
+from otsync.clocks.common import CommonClock
+from otsync.clocks.splines import TrackSplines
 from otsync.simulate import simulate
 from otsync.simulate.effects import Drop, Freeze, In, SlowMotion
-from otsync.sync.breaks import mended
+from otsync.sync.breaks import mended, stood_still
 from otsync.types import Break, Offsets, Status, TrackSet, mended_frames, mended_times
 
 
@@ -38,6 +41,70 @@ def test_a_break_is_found_named_and_mended(effect, jump, still):
     assert error[[0, -1]].max() < 0.15 and np.nanmax(error[away]) < 0.15
     assert np.isnan(told).sum() == round(still * 30)
     assert any("video1" in note for note in offsets.clock_notes())
+
+
+@pytest.mark.parametrize(
+    ("name", "seed", "jump"),
+    [
+        ("a second missing", 500, 1.0),
+        ("a second missing", 505, 1.0),
+        ("freeze of the first", 505, -20 / 30),
+        ("freeze of 30", 504, -1.0),  # a juggler, whose motion comes again
+        ("halves exchanged", 511, -151 / 30),
+    ],
+)
+def test_frames_without_a_partner_are_no_part_and_speak_against_none(name, seed, jump):
+    """Some offset suits them by chance, and the edges of parts lie anywhere among them."""
+    world = CLASSES[name](seed)
+    offsets = synchronize(list(world.tracks))
+    assert offsets.ok and world.errors(offsets)[0][0] < 0.2
+    (found,) = offsets.breaks[0] + offsets.breaks[1]
+    assert found.jump == pytest.approx(jump, abs=1 / 30 if jump < -2 else 0.2 / 30)
+
+
+def test_of_likely_offsets_no_two_are_near():
+    evidence = np.array([0.0, 5, 4, 4.5, 0, 3, 0, 2, 0])
+    assert likely(evidence, 3) == [5]
+    assert likely(evidence, 2) == [3, 5, 7]
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.03])
+def test_what_rests_is_told_by_what_moves_otherwise(noise):
+    """A third of the tracks moves; the others have nothing but noise."""
+    rng = np.random.default_rng(0)
+    t = np.arange(90) / 30
+    shown = np.where(t < 1, t, np.maximum(1.0, t - 20 / 30))
+    x = np.zeros((30, 90, 3))
+    x[:10, :, 0] = np.sin(4 * shown)
+    x += noise * rng.normal(size=x.shape)
+    assert stood_still(TrackSplines(t, x), 1.0, 20 / 30)
+    x[:10, :, 0] = np.sin(4 * t) + noise * rng.normal(size=(10, 90))
+    assert not stood_still(TrackSplines(t, x), 1.0, 20 / 30)
+
+
+def test_parts_by_chance_are_those_that_the_parts_beside_them_explain():
+    """a has 150 frames and b too; windows every 10 frames."""
+    nothing = np.zeros((1, 150, 3))
+    pair = CommonClock(nothing, nothing, 30.0, 0.0)
+
+    def left(edges: list[int], lags: list[int], agree: list[float], best: int = 99) -> list[int]:
+        return by_chance(np.split(np.arange(16), edges), lags, agree, best, pair, 10)
+
+    assert left([7, 10], [8, 24, 37], [0.9, 0.5, 0.9]) == [0, 2]  # b lost a second: a's frames there have no partner
+    assert left([7, 10], [8, 24, 12], [0.9, 0.5, 0.9]) == [0, 1, 2]  # b lost less than that
+    assert left([7, 10], [8, 24, 37], [0.9, 0.95, 0.9]) == [0, 1, 2]  # it agrees as well as they do
+    assert left([3], [-39, 20], [0.8, 0.9]) == [1]  # b begins there
+    assert left([3], [-39, 5], [0.8, 0.9]) == [0, 1]
+    assert left([8], [-75, 75], [0.8, 0.9]) == [0, 1]  # halves that were exchanged: too long for chance
+    assert left([8], [-75, 75], [0.4, 0.9]) == [1]
+    assert left([8], [-75, 75], [0.4, 0.9], best=-75) == [0, 1]
+    assert left([13], [-20, 90], [0.9, 0.8]) == [0]  # b ended there
+
+
+def test_edges_of_parts_leave_out_what_has_no_partner():
+    spans = np.split(np.arange(16), [6])
+    assert partners(spans, [-10, 20], 0, 10) == (-5, 25) and partners(spans, [-10, 20], 1, 10) == (85, 155)
+    assert partners(spans, [20, -10], 0, 10) == (-5, 55) and partners(spans, [20, -10], 1, 10) == (55, 155)
 
 
 def test_of_four_videos_the_one_that_froze_is_named():
