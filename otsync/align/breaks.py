@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -155,42 +156,73 @@ def find_breaks(
         return NONE, max(gain, 0.0), doubtful
     if gain <= _as_a_rate(curves, straight)[0] + AS_A_RATE:
         return NONE, gain, doubtful  # a rate explains it as well, with one number
+    look = Look(pair, lags, curves, best, floor, step)
     spans = np.split(np.arange(windows), edges)
     tops = [int(np.argmax(curves[p].sum(0))) for p in spans]
-
-    def agrees(k: int, found: Sequence[int]) -> float:
-        # halves that were exchanged lost nothing: all of them counts, too
-        asked = {partners(spans, found, k, step), frames(spans[k], step)}
-        return max(agreement(pair, begin, end, found[k], floor) for begin, end in asked)
-
-    agree = [agrees(k, [int(lags[t]) for t in tops]) for k in range(len(tops))]
-    kept = by_chance(spans, [int(lags[t]) for t in tops], agree, int(lags[best]), pair, step)
+    kept = by_chance(spans, look.at(tops), look.agree(spans, tops), int(lags[best]), pair, step)
     if len(kept) < len(spans):
-        without = sum(float(curves[spans[k], path[spans[k]]].sum()) for k in range(len(spans)) if k not in kept)
-        gain -= without
+        gain -= sum(float(curves[spans[k], path[spans[k]]].sum()) for k in range(len(spans)) if k not in kept)
+        # the windows of what is left out belong to nothing; the next part begins where it did
+        spans, tops = [spans[k] for k in kept], [tops[k] for k in kept]
         if len(kept) < 2 or gain < price * (len(kept) - 1):
             return NONE, max(gain, 0.0), True
-        # the windows of what is left out belong to nothing; the next part begins where it did
-        spans, tops, agree = ([x[k] for k in kept] for x in (spans, tops, agree))
-    for k, top in enumerate(tops):
-        if top == best or agree[k] >= AGREES:
-            continue
-        # some offset suits a few of the matches by chance: of motion that comes again another one may suit most
-        evidence = curves[spans[k]].sum(0)
-        told = {}
-        for other in likely(evidence, least=round(LEAST_JUMP * pair.fps)):
-            found = [int(lags[t]) for t in (*tops[:k], other, *tops[k + 1 :])]
-            if np.abs(np.diff(found)).min() >= round(LEAST_JUMP * pair.fps):
-                told[other] = agrees(k, found)
-        other = max(told, key=lambda o: told[o], default=top)
-        gain += float(evidence[other] - evidence[top])
-        if told.get(other, 0.0) < AGREES or gain < price * (len(tops) - 1):
-            return NONE, max(gain, 0.0), doubtful
-        tops[k] = other
+    tops, change, sound = look.settled(spans, tops)
+    gain += change
+    if not sound or (change and gain < price * (len(tops) - 1)):
+        return NONE, max(gain, 0.0), doubtful
     offsets = [float(pair.seconds(vertex(lags, curves[p].sum(0), top))) for p, top in zip(spans, tops, strict=True)]
     begin = pair.start + (np.array([p[0] for p in spans]) - 0.5) * step / pair.fps
     begin[0] = pair.start
     return np.stack([begin, offsets], 1), gain, False
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """A pair, the evidence of its windows at all lags, and which of these (its index) suits the whole best."""
+
+    pair: CommonClock
+    lags: Int[np.ndarray, " K"]
+    curves: Float[np.ndarray, "W K"]
+    best: int
+    floor: float
+    step: int
+
+    def at(self, tops: Sequence[int]) -> list[int]:
+        """The lags of these indices."""
+        return [int(self.lags[top]) for top in tops]
+
+    def agree(self, spans: Sequence[np.ndarray], tops: Sequence[int]) -> list[float]:
+        """Of every part, the share of its motion that its median match has in common."""
+        return [self.agrees(spans, tops, k) for k in range(len(tops))]
+
+    def agrees(self, spans: Sequence[np.ndarray], tops: Sequence[int], k: int) -> float:
+        found = self.at(tops)
+        # halves that were exchanged lost nothing: all of them counts, too
+        asked = {partners(spans, found, k, self.step), frames(spans[k], self.step)}
+        return max(agreement(self.pair, begin, end, found[k], self.floor) for begin, end in asked)
+
+    def settled(self, spans: Sequence[np.ndarray], tops: list[int]) -> tuple[list[int], float, bool]:
+        """The index of every part's lag, once most of its matches agree at it; the evidence that this adds; whether
+        they do.
+
+        Some offset suits a few of the matches by chance. Of motion that comes again, another one may suit most.
+        """
+        least = round(LEAST_JUMP * self.pair.fps)
+        agree, change = self.agree(spans, tops), 0.0
+        for k, top in enumerate(tops):
+            if top == self.best or agree[k] >= AGREES:
+                continue
+            evidence, told = self.curves[spans[k]].sum(0), {}
+            for other in likely(evidence, least):
+                found = [*tops[:k], other, *tops[k + 1 :]]
+                if np.abs(np.diff(self.at(found))).min() >= least:
+                    told[other] = self.agrees(spans, found, k)
+            other = max(told, key=lambda o: told[o], default=top)
+            if told.get(other, 0.0) < AGREES:
+                return tops, change, False
+            change += float(evidence[other] - evidence[top])
+            tops = [*tops[:k], other, *tops[k + 1 :]]
+        return tops, change, True
 
 
 def likely(evidence: Float[np.ndarray, " K"], least: int) -> list[int]:

@@ -564,7 +564,7 @@ BREAKS = (
     Break(
         "breaks-no-other-offset",
         "otsync/align/breaks.py",
-        "        tops[k] = other\n",
+        "            tops = [*tops[:k], other, *tops[k + 1 :]]\n",
         "",
         ("tests/otsync/sync/test_breaks.py",),
         "an offset that most matches of a part contradict stays",
