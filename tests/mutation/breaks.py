@@ -19,6 +19,7 @@ REFINE = ("tests/otsync/refine",)
 EPIPOLAR = ("tests/otsync/epipolar",)
 PARTS = ("tests/otsync/sync/test_parts.py",)
 FRAMES = ("tests/otsync/frames/test_fit.py", "tests/otsync/frames/test_noise.py")
+POSES = ("tests/otsync/frames/test_solver.py",)
 GRAPH = ("tests/otsync/sync/test_graph.py",)
 SYNC = (*GRAPH, "tests/otsync/sync/test_verdict.py", "tests/otsync/sync/test_sync.py")
 FIT = ("tests/recon/fit/test_fit.py",)
@@ -590,7 +591,7 @@ BREAKS = (
         "otsync/frames/weighing.py",
         "begun = sorted(begun, key=lambda c: -c[2].agreement())[:FITTED]",
         "begun = begun[:FITTED]",
-        FRAMES,
+        POSES,
         "of many candidates the first are fitted, not those that most tracks agree with",
     ),
     Break(
@@ -598,7 +599,7 @@ BREAKS = (
         "otsync/frames/solver.py",
         "value / 2 for limit",
         "value for limit",
-        FRAMES,
+        POSES,
         "one sigma may be as large as the error that is needed",
     ),
     Break(

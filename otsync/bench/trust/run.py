@@ -29,6 +29,20 @@ FIRST_SEED = 20_000
 
 METHODS: dict[str, Method | None] = {"default": None, "paper": PAPER, "DTW": Method("DTW", aligner=DTW())}
 
+MENDED = (
+    "freeze of 15",
+    "freeze of 30",
+    "ten frames dropped",
+    "a second missing",
+    "rate 1 %, 10 s",
+    "rate 1 %, 20 s",
+    "rate .1 %, 20 s",
+    "rate .1 %, 30 s",
+)
+"""Classes whose clocks are to be found out, named and mended, to within :data:`AT_ENDS` frames at both ends."""
+
+AT_ENDS = 0.15
+
 SHORT = ("mid", "hard")
 """Classes that other methods than the default are asked, too."""
 
@@ -174,6 +188,16 @@ def acceptance(rows: Sequence[Row]) -> Iterator[Check]:
             one_sigma = float((e <= s).mean())
             yield Check(f"{preset}: within one sigma", one_sigma, "0.63 - 0.75", 0.63 <= one_sigma <= 0.75)
             yield at_least(f"{preset}: within two sigmas", float((e <= 2 * s).mean()), 0.93)
+    for name in MENDED:
+        own = [r for r in ours if r["class"] == name]
+        if own:
+            found = [r for r in own if (r["breaks"] or r["rate"] != 1.0) and r["error"] <= WRONG]
+            yield at_least(f"{name}: found and named", len(found) / len(own), 0.9)
+            yield at_most(
+                f"{name}: largest error of trusted, frames",
+                max((r["error"] for r in own if r["trusted"]), default=0.0),
+                AT_ENDS,
+            )
 
 
 def interval(bad: int, of: int) -> tuple[float, float]:

@@ -58,6 +58,18 @@ def test_tables_of_made_up_answers():
     assert summarise(rows)[0]["trusted"] == 1.0
     checks = {c.name: c for c in acceptance([*rows, base | {"class": "mid", "error": 9.0, "sigma": 0.1}])}
     assert checks["confident and wrong, in 500 trusted"].measured == pytest.approx(500 / 401)
+
+
+def test_what_is_mended_must_be_named_and_exact():
+    base = {"method": "default", "class": "freeze of 15", "rate": 1.0, "sigma": 0.1, "flags": ""}
+    named = base | {"trusted": True, "breaks": "video 1: stands still", "error": 0.1}
+    flagged = base | {"trusted": False, "breaks": "", "error": 15.0}
+    checks = {c.name: c for c in acceptance([*[named] * 9, flagged])}
+    assert checks["freeze of 15: found and named"].measured == 0.9 and checks["freeze of 15: found and named"].met
+    worse = {c.name: c for c in acceptance([*[named] * 8, named | {"error": 0.2}, flagged])}
+    assert not worse["freeze of 15: largest error of trusted, frames"].met
+    unnamed = {c.name: c for c in acceptance([named | {"breaks": ""}])}
+    assert unnamed["freeze of 15: found and named"].measured == 0
     low, high = interval(0, 300)
     assert low == 0 and high == pytest.approx(0.0122, abs=1e-3)
 

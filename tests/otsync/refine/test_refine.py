@@ -11,7 +11,7 @@ from otsync import Alignment, Matches, Refused, SplineRefine, Status, TrackSet, 
 from otsync.clocks.splines import TrackSplines
 from otsync.compute.indices import blocks
 from otsync.refine import gauss_newton
-from otsync.refine.gauss_newton import Side, _linearise, fit_clock, neighbours, wider
+from otsync.refine.gauss_newton import Side, System, _linearise, fit_clock, jackknife, neighbours, wider
 from otsync.refine.splines import COMMON_ERRORS, LEAST_SIGMA, unsettled_rate
 from otsync.simulate import simulate
 from otsync.types import Clock
@@ -342,3 +342,13 @@ def test_a_fit_of_few_matches_at_a_time_is_the_same(fit_rate, monkeypatch):
     np.testing.assert_allclose(parts.covariance, whole.covariance, rtol=1e-8)
     np.testing.assert_allclose(parts.weights, whole.weights, rtol=1e-9)
     assert (parts.blur, parts.wander) == pytest.approx((whole.blur, whole.wander), rel=1e-9)
+
+
+def test_sigma_is_that_of_the_worse_witness():
+    """Matches that agree and seconds that do not, or the other way round."""
+    H, g = np.full((8, 1, 1), 10.0), np.array([1.0, -1, 2, -2, 1, -1, 2, -2])[:, None]
+    wild, calm = (H, 5 * g), (H, g)
+    for by_match, by_time in ((wild, calm), (calm, wild)):
+        system = System(H.sum(0), np.zeros(1), by_match, by_time, np.ones(8), 0.0)
+        np.testing.assert_allclose(system.covariance(), jackknife(*wild))
+    assert jackknife(*wild)[0, 0] > 20 * jackknife(*calm)[0, 0]
