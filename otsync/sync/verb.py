@@ -363,18 +363,29 @@ def at_known_times(matcher: Matcher | None, clock: Clock, flat: bool = False) ->
     return SynchronousMatching(clock.offset, clock.rate, costs)
 
 
+COUNTED = 0.25
+"""Frames, one sigma, below which the length of a pause tells how many frames it has."""
+
 UNMEASURED = 2.0
 """Frames, one sigma, of a jump whose parts leave too little to measure it by: seed 35015 was 1.8 frames off, and ok."""
+
+
+def jump_sigma(found: Break, frame: float) -> float:
+    """One sigma, s, of how far a clock jumps: a pause lasts whole frames, where it is measured well enough to tell how
+    many; a jump that could not be measured is known to a few frames at best.
+    """
+    if not np.isfinite(found.sigma):
+        return UNMEASURED * frame
+    return 0.0 if found.still > 0 and found.sigma < COUNTED * frame else found.sigma
 
 
 def to_offsets(
     tracks: Sequence[TrackSet], verdict: Verdict, seconds: float, broken: Mapping[int, tuple[Break, ...]] | None = None
 ) -> Offsets:
     found = tuple((broken or {}).get(v, ()) for v in range(len(tracks)))
-    # the error of a jump is that of all behind it; a jump that could not be measured is known to a few frames at best
+    # the error of a jump is that of all behind it
     loose = [
-        sum((b.sigma if np.isfinite(b.sigma) else UNMEASURED / nominal_fps(t)) ** 2 for b in breaks if b.still == 0)
-        for breaks, t in zip(found, tracks, strict=True)
+        sum(jump_sigma(b, 1 / nominal_fps(t)) ** 2 for b in breaks) for breaks, t in zip(found, tracks, strict=True)
     ]
     loose = [total + loose[verdict.reference] for total in loose]
     sigma = np.where(np.arange(len(tracks)) == verdict.reference, 0.0, np.hypot(verdict.sigma, np.sqrt(loose)))

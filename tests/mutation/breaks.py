@@ -79,10 +79,18 @@ BREAKS = (
     Break(
         "parts-jump-exact",
         "otsync/sync/verb.py",
-        "(b.sigma if np.isfinite(b.sigma) else UNMEASURED / nominal_fps(t)) ** 2",
-        "(b.sigma if np.isfinite(b.sigma) else 0.0) ** 2",
+        "return UNMEASURED * frame",
+        "return 0.0",
         PARTS,
         "a jump that could not be measured counts as exact",
+    ),
+    Break(
+        "breaks-pause-always-counted",
+        "otsync/sync/verb.py",
+        "found.still > 0 and found.sigma < COUNTED * frame",
+        "found.still > 0",
+        ("tests/otsync/sync/test_breaks.py",),
+        "the length of a pause is exact, however badly it is measured",
     ),
     # --- costs ------------------------------------------------------------------------------------------------------
     Break(

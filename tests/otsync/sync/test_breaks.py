@@ -13,6 +13,7 @@ from otsync.clocks.splines import TrackSplines
 from otsync.simulate import simulate
 from otsync.simulate.effects import Drop, Freeze, In, SlowMotion
 from otsync.sync.breaks import mended, stood_still
+from otsync.sync.verb import jump_sigma
 from otsync.types import Break, Offsets, Status, TrackSet, mended_frames, mended_times
 
 
@@ -213,3 +214,12 @@ def test_pairs_speak_only_for_what_they_see_of_a_clock():
     assert ends.max() < 0.2
     (broken,) = found.breaks[2]
     assert broken.jump == pytest.approx(-1.0) and found.ok
+
+
+def test_a_pause_lasts_whole_frames_where_it_is_measured():
+    frame = 1 / 30
+    assert jump_sigma(Break(2.0, -0.5, 0.5, 0.1 * frame), frame) == 0
+    assert jump_sigma(Break(2.0, -0.5, 0.5, 0.4 * frame), frame) == pytest.approx(0.4 * frame)
+    assert jump_sigma(Break(2.0, 0.5, 0.0, 0.1 * frame), frame) == pytest.approx(0.1 * frame)
+    for still in (0.0, 0.5):
+        assert jump_sigma(Break(2.0, -0.5, still, float("nan")), frame) > frame
