@@ -98,14 +98,18 @@ class RollingShutter:
 
 @dataclass(frozen=True)
 class ClockDrift:
-    """The video's clock wanders: frames are exposed up to ``size`` s (one sigma) off the times the file tells."""
+    """The video's clock wanders: frames are exposed up to ``size`` s (one sigma) off the times the file tells.
+
+    ``Truth.shown`` tells when they were.
+    """
 
     size: float = 0.005
     correlation: float = 2.0
 
     def __call__(self, obs: Observation, rng: np.random.Generator) -> Observation:
         off = self.size * smooth_noise((1,), obs.times, self.correlation, rng, np.float64)[0]
-        return replace(obs, xyz=obs.xyz + obs.moved(off))
+        late = off if obs.late is None else obs.late + off
+        return replace(obs, xyz=obs.xyz + obs.moved(off), late=late)
 
 
 @dataclass(frozen=True)

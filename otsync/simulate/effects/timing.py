@@ -34,11 +34,30 @@ class In:
 
 
 def showing(obs: Observation, own: Float[np.ndarray, " T"]) -> Observation:
-    """The observation whose k-th frame shows what a faultless video shows ``own[k]`` s after its first frame."""
-    shown = obs.rate * (obs.times[0] + own) + obs.offset
+    """The observation whose k-th frame shows what this one shows ``own[k]`` s after its first frame.
+
+    So effects of one video add up in their order: each is done to the file that the one before has made. Beyond the
+    clip the file goes on as it ends.
+    """
+    earlier = 0.0 if obs.late is None else _late_at(obs.late, obs.times - obs.times[0], own)
+    shown = obs.rate * (obs.times[0] + own) + obs.offset + earlier
     step = shown - obs.world_times
     late = step if obs.late is None else obs.late + step
     return replace(obs, xyz=obs.xyz + obs.moved(step), late=late)
+
+
+def _late_at(
+    late: Float[np.ndarray, " T"], times: Float[np.ndarray, " T"], t: Float[np.ndarray, " S"]
+) -> Float[np.ndarray, " S"]:
+    """``late`` at the moments ``t``: on a line between two frames; where the file jumps, that of the nearest frame."""
+    if len(times) < 2:
+        return np.full(len(t), late[0])
+    right = np.clip(np.searchsorted(times, t), 1, len(times) - 1)
+    low, high = late[right - 1], late[right]
+    step = times[right] - times[right - 1]
+    share = np.clip((t - times[right - 1]) / step, 0.0, 1.0)
+    jumps = np.abs(high - low) > 1.5 * step
+    return np.asarray(low + np.where(jumps, np.round(share), share) * (high - low))
 
 
 def moment(at: float | None, clock: np.ndarray, rng: np.random.Generator) -> int:

@@ -6,19 +6,33 @@ import numpy as np
 import pytest
 
 from otsync.simulate import ADVERSARIES, simulate
-from otsync.simulate.effects import Cut, Drop, Freeze, In, Loop, Repeats, Reverse, SlowMotion
+from otsync.simulate.effects import ClockDrift, Cut, Drop, Freeze, In, Loop, Repeats, Reverse, SlowMotion
 
 
-def filmed(effect, seed: int = 2):
-    return simulate("tennis", preset="mid", videos=2, offsets=[0.0, 0.2], effects=(In(1, effect),), seed=seed)
+def filmed(*effects, seed: int = 2):
+    inside = tuple(In(1, effect) for effect in effects)
+    return simulate("tennis", preset="mid", videos=2, offsets=[0.0, 0.2], effects=inside, seed=seed)
 
 
 @pytest.mark.parametrize(
-    "effect",
-    [Freeze(12), Freeze(12, catches_up=True), Drop(0.4), Cut(), Repeats(24), Loop(1.0), Reverse(), SlowMotion()],
+    "effects",
+    [
+        (Freeze(12),),
+        (Freeze(12, catches_up=True),),
+        (Drop(0.4),),
+        (Cut(),),
+        (Repeats(24),),
+        (Loop(1.0),),
+        (Reverse(),),
+        (SlowMotion(),),
+        (ClockDrift(0.1),),
+        (ClockDrift(0.1), Freeze(12)),
+        (Freeze(12, at=0.3), Drop(0.4)),
+        (Drop(0.4), Cut(), Repeats(24)),
+    ],
 )
-def test_frames_show_what_the_truth_says(effect):
-    tracks, truth = filmed(effect)
+def test_frames_show_what_the_truth_says(effects):
+    tracks, truth = filmed(*effects)
     for v in (0, 1):
         expected = truth.positions(v, truth.shown[v])
         seen = tracks[v].seen
@@ -32,6 +46,23 @@ def test_a_freeze_repeats_the_frame_before_it_and_goes_on():
     shown = truth.shown[1]
     assert np.ptp(shown[74:85]) < 1e-9 and shown[85] - shown[84] == pytest.approx(1 / 30)
     assert shown[-1] == pytest.approx(tracks[1].times[-1] + 0.2 - 10 / 30)
+
+
+def test_effects_on_one_file_add_up_in_their_order():
+    told = filmed()[0][1].times + 0.2
+    _, both = filmed(Freeze(10, at=0.3), Drop(1.0, at=0.7))
+    late = both.shown[1] - told
+    np.testing.assert_allclose(late[:44], 0, atol=1e-9)
+    np.testing.assert_allclose(late[60:100], -10 / 30)
+    np.testing.assert_allclose(late[110:], 1.0 - 10 / 30)
+    _, backwards = filmed(Freeze(10, at=0.3), Reverse())
+    _, frozen = filmed(Freeze(10, at=0.3))
+    np.testing.assert_allclose(backwards.shown[1], frozen.shown[1][::-1])
+    _, twice = filmed(Reverse(), Reverse())
+    np.testing.assert_allclose(twice.shown[1], told)
+    _, still = filmed(Freeze(10, at=0.3), Repeats(24))
+    during = still.shown[1][(told > told[0] + 1.52) & (told < told[0] + 1.80)]  # the freeze begins at frame 45
+    assert np.ptp(during) < 1e-9
 
 
 def test_lost_frames_are_jumped_over():
