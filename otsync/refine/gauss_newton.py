@@ -6,6 +6,7 @@ sign of the offset and changes nothing else.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -46,19 +47,24 @@ ONE_SIGMA = 0.8413
 MOST_LEVERAGE = 0.9
 """Share of the information that one cluster may be said to hold."""
 
+WHOLE = -math.inf, math.inf
+"""All frames of a video."""
+
 
 @dataclass(frozen=True, eq=False)
 class Side:
     """One video's frames against the other's curves.
 
     Args:
-        own: curves of the video whose frames are looked at; at: their values there, (M,T,3).
+        own: curves of the video whose frames are looked at. times: (T,) of these frames, on its clock; at: the curves'
+            values there, (M,T,3).
         other: curves of the other video.
         lo, hi: (T,) the frames within the detrending window of each frame, lo inclusive, hi exclusive.
         forward: whether these are a's frames.
     """
 
     own: TrackSplines
+    times: Float[np.ndarray, " T"]
     at: Float[np.ndarray, "M T 3"]
     other: TrackSplines
     lo: Int[np.ndarray, " T"]
@@ -66,20 +72,24 @@ class Side:
     forward: bool
 
     @classmethod
-    def of(cls, own: TrackSplines, other: TrackSplines, window: float, forward: bool) -> Side:
-        t = own.times
+    def of(
+        cls, own: TrackSplines, other: TrackSplines, window: float, forward: bool, span: tuple[float, float] = WHOLE
+    ) -> Side:
+        """All frames, or those from ``span[0]`` to ``span[1]`` s of their own clock."""
         slack = 1e-6 * own.frame
+        first, last = np.searchsorted(own.times, [span[0] - slack, span[1] + slack])
+        t = own.times[first:last]
         lo = np.searchsorted(t, t - window - slack)
         hi = np.searchsorted(t, t + window + slack, side="right")
-        return cls(own, own.joined(t), other, lo, hi, forward)
+        return cls(own, t, own.joined(t), other, lo, hi, forward)
 
     def there(self, clock: Clock) -> Float[np.ndarray, " T"]:
         """The moments of the other video that this one's frames show."""
-        return clock.own(self.own.times) if self.forward else clock.world(self.own.times)
+        return clock.own(self.times) if self.forward else clock.world(self.times)
 
     def time_b(self, clock: Clock) -> Float[np.ndarray, " T"]:
         """Seconds of b's clock at these frames."""
-        return self.there(clock) if self.forward else self.own.times
+        return self.there(clock) if self.forward else self.times
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +98,8 @@ class Fit:
 
     Args:
         clock: the answer. covariance: (P,P) of offset (and rate), jackknifed over matches or over time, the larger.
-        weights: (M,) of the matches. iterations: done.
+        weights: (M,) of the matches. iterations: done. settled: whether the last step was next to nothing. Where noise
+            is as large as the motion, each step goes but a small part of the way, and the answer is where it stopped.
         blur: rms residual over rms speed, s: how far off a single sample of a typical match tells the time.
         wander: rms over blocks of a second, by their information, of what each says the offset is off by, s.
     """
@@ -99,6 +110,7 @@ class Fit:
     iterations: int
     blur: float
     wander: float = 0.0
+    settled: bool = True
 
     @property
     def effective_matches(self) -> float:
@@ -115,6 +127,7 @@ def fit_clock(
     weight: Float[np.ndarray, " M"] | None = None,
     fit_rate: bool = False,
     iterations: int = 25,
+    span: tuple[float, float] | None = None,
 ) -> Fit | None:
     """Minimise robustly the detrended differences of matched curves over the offset (and rate).
 
@@ -122,10 +135,17 @@ def fit_clock(
         a, b: curves of the matched tracks, m-th to m-th. start: where to begin; its rate stays unless ``fit_rate``.
         window: s; the mean residual within ± this much of time is removed, as drifts of depth are slower.
         weight: of the matches, mean 1; robust weights multiply it. None: all alike.
+        span: seconds of a's clock, from and to; only frames that ``start`` puts there count. None: all frames.
 
     Returns None when no match is seen long enough in both.
     """
-    sides = Side.of(a, b, window, True), Side.of(b, a, window, False)
+    begin, end = WHOLE if span is None else span
+    sides = (
+        Side.of(a, b, window, True, (begin, end)),
+        Side.of(b, a, window, False, (start.own(begin), start.own(end))),
+    )
+    if not all(len(side.times) for side in sides):
+        return None
     clock = start
     centre = _centre(a, b, start)
     n = 0
@@ -139,14 +159,15 @@ def fit_clock(
         turn = float(np.clip(step[1], -LONGEST_RATE_STEP, LONGEST_RATE_STEP)) if fit_rate else 0.0
         rate = clock.rate + turn
         clock = Clock(clock.offset + shift - turn * centre, rate)
-        if n >= iterations or (abs(shift) < CONVERGED and abs(turn) < CONVERGED / 30 and n > 3):
+        settled = abs(shift) < CONVERGED and abs(turn) < CONVERGED / 30
+        if n >= iterations or (settled and n > 3):
             break
     covariance = system.covariance()
     if fit_rate:
         # from the offset at the centre of the overlap to that at b's time zero
         move = np.array([[1.0, -centre], [0.0, 1.0]])
         covariance = move @ covariance @ move.T
-    return Fit(clock, covariance, system.match_weights, n, system.blur, system.wander())
+    return Fit(clock, covariance, system.match_weights, n, system.blur, system.wander(), settled)
 
 
 def _centre(a: TrackSplines, b: TrackSplines, clock: Clock) -> float:
@@ -224,7 +245,7 @@ def _linearise(
     P, M = 2 if fit_rate else 1, len(sides[0].at)
     reads = [Read.of(side, clock, centre) for side in sides]
     # of long clips few matches at a time: once for the size of residuals, which weights depend on, once for the sums
-    parts = list(blocks(M, 2 * max(len(side.own.times) for side in sides)))
+    parts = list(blocks(M, 2 * max(len(side.times) for side in sides)))
     kept: list[Any] = []
     size: list[list[np.ndarray]] = [[] for _ in sides]
     used: list[list[np.ndarray]] = [[] for _ in sides]
@@ -245,7 +266,7 @@ def _linearise(
     weight = np.where(seen > 0, 1 / (1 + (rms / max(OUTLYING * typical, 1e-300)) ** 2) ** 2, 0.0)
     if prior is not None:
         weight *= prior
-    start = max(sides[0].own.times[0], float(clock.world(sides[1].own.times[0])))
+    start = max(sides[0].times[0], float(clock.world(sides[1].times[0])))
     block = [read.blocks_from(start, clock) for read in reads]
     count = max(int(b.max(initial=0)) for b in block) + 1
     H_match, g_match = np.zeros((M, P, P)), np.zeros((M, P))
@@ -286,7 +307,7 @@ class Read:
         # d(other curve's argument)/d offset: t_b = (t_a - offset) / rate from a's frames, t_a = rate t_b + offset from
         # b's
         sign = 1 / clock.rate if side.forward else -1.0
-        ok = side.own.support(side.own.times) & side.other.support(there)
+        ok = side.own.support(side.times) & side.other.support(there)
         return cls(side, there, side.time_b(clock) - centre, (first, value, sign * slope), ok)
 
     def residuals(self, part: slice, P: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -315,7 +336,7 @@ class Read:
 
     def blocks_from(self, start: float, clock: Clock) -> Int[np.ndarray, " T"]:
         """Which block of time every frame lies in."""
-        own = self.side.own.times
+        own = self.side.times
         t_a = own if self.side.forward else clock.world(own)
         return np.maximum(np.floor((t_a - start) / CLUSTER + 1e-9), 0).astype(np.int64)
 

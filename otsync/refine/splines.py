@@ -19,6 +19,7 @@ from ..types.checks import positive
 from ..types.trust import Trust
 from .common_error import common_error
 from .gauss_newton import GROUPS, Fit, fit_clock, neighbours, overlap_seconds, velocity_correlation
+from .seconds import Seconds
 from .slot import JUDGED_BY, Rate, Refiner
 
 LEAST_SIGMA = 0.012 / 30
@@ -33,7 +34,10 @@ LONG = 180 / 30
 what whole videos have in common (drifting depth, limbs) looks like one: real cameras, 3.3 s, "1.010 ± .0015"."""
 
 AT_ENDS = 0.1
-"""Share of ``blur`` by which errors that a whole video shares move either end of the overlap by itself."""
+"""Share of ``blur`` by which errors that a whole video shares move the offset of a moment by itself."""
+
+FORGOTTEN = 1.2
+"""Seconds within which such errors are forgotten: drifts of depth, one step of somebody who walks."""
 
 LEAST_WANDER = 0.05 / 30
 """Seconds by which the parts of the overlap may differ, however well the tracks agree. In units of the limit that this
@@ -57,7 +61,7 @@ VELOCITY = 5 / 30
 """Half window, s, of the velocities whose correlation judges the fit."""
 
 
-READS = ("moved", "spread", "correlation", "blur", "wander", "overlap", "matches", "rate_sigmas")
+READS = ("moved", "spread", "correlation", "blur", "wander", "unsteady", "overlap", "matches", "rate_sigmas")
 """The limits of :class:`otsync.Trust` that the fit's flags are raised by."""
 
 
@@ -120,6 +124,8 @@ class SplineRefine(Refiner):
                 "spread": spread,
                 "blur": fit.blur,
                 "wander": fit.wander,
+                "unsteady": Seconds.of(*curves, fit.clock, self.windows[0], weight).unsteady(self._wanders(fit.blur)),
+                "settled": float(fit.settled),
                 "common_error": common,
                 "scatter": math.sqrt(max(float(fit.covariance[0, 0]), 0.0)),
                 "correlation": velocity_correlation(*curves, fit, VELOCITY),
@@ -180,7 +186,8 @@ class SplineRefine(Refiner):
         if free is None:
             return fit, None, (), {}
         common = (AT_ENDS * free.blur) ** 2 + LEAST_SIGMA**2
-        sigma = math.sqrt(float(free.covariance[1, 1]) + 2 * common / overlap**2)
+        # the slope of a line through errors of that size, which are forgotten within FORGOTTEN seconds
+        sigma = math.sqrt(float(free.covariance[1, 1]) + 12 * common * FORGOTTEN / overlap**3)
         stats = {"fitted_rate": free.clock.rate, "rate_sigma": sigma}
         off = abs(free.clock.rate - fit.clock.rate)
         if off <= self.trust.rate_sigmas * sigma or off * overlap / 2 <= LEAST_DRIFT:
@@ -218,13 +225,17 @@ class SplineRefine(Refiner):
             variance = [float(fit.covariance[0, 0]) + drift**2] * 2
         return math.sqrt(max(variance[0], 0) + shared), math.sqrt(max(variance[1], 0) + shared)
 
+    def _wanders(self, blur: float) -> float:
+        """Seconds by which single seconds of one clock may differ: what all tracks share moves them."""
+        return self.trust.wander * blur + LEAST_WANDER
+
     def _flags(self, stats: dict[str, float]) -> tuple[Status, ...]:
         t = self.trust
         found = {
-            Status.WEAK: stats["blur"] > t.blur,
+            Status.WEAK: stats["blur"] > t.blur or not stats["settled"],
             Status.MOVED: stats["moved"] > t.moved,
             Status.SPREAD: stats["spread"] > t.spread,
-            Status.BROKEN_CLOCK: stats["wander"] > t.wander * stats["blur"] + LEAST_WANDER,
+            Status.BROKEN_CLOCK: stats["wander"] > self._wanders(stats["blur"]) or stats["unsteady"] > t.unsteady,
             Status.SHORT_OVERLAP: stats["overlap"] < t.overlap - 1e-9,
             Status.FEW_MATCHES: stats["effective_matches"] < t.matches,
             Status.POOR_FIT: stats["correlation"] < t.correlation,

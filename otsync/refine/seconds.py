@@ -1,0 +1,77 @@
+"""Every second of an overlap answers for itself: what each says the offset is, and whether one clock explains them all.
+
+A fit of the whole overlap gives samples that disagree less weight, whole seconds of them too: where a clock wanders, or
+where there is no common time at all, it settles on the part that agrees most, and says that it fits well. A fit of one
+second alone goes where that second leads.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from ..clocks.splines import TrackSplines
+from ..compute.indices import evenly
+from ..types import Clock
+from .gauss_newton import fit_clock
+
+LENGTH, STEP = 1.0, 0.5
+"""Seconds of a part, and between the beginnings of two."""
+
+MOST = 40
+"""Parts that are asked, at most; of long overlaps they are spread evenly."""
+
+LEAST = 3
+"""Parts that tell whether a clock runs evenly, at least."""
+
+ITERATIONS = 12
+
+
+@dataclass(frozen=True, eq=False)
+class Seconds:
+    """What short parts of an overlap say.
+
+    Args:
+        at: (K,) their middles, s on a's clock. late: (K,) by how much larger than the answer's the offset of each is, s;
+            nan where a part cannot tell. sigma: (K,) of that, jackknifed within the part.
+    """
+
+    at: Float[np.ndarray, " K"]
+    late: Float[np.ndarray, " K"]
+    sigma: Float[np.ndarray, " K"]
+
+    @classmethod
+    def of(
+        cls,
+        a: TrackSplines,
+        b: TrackSplines,
+        clock: Clock,
+        window: float,
+        weight: Float[np.ndarray, " M"] | None = None,
+    ) -> Seconds:
+        """Of the answer ``clock``, with the fit's detrending ``window`` and ``weight`` of the matches."""
+        ends = clock.world(b.times[[0, -1]])
+        begin, end = max(float(a.times[0]), float(ends[0])), min(float(a.times[-1]), float(ends[1]))
+        count = max(1, math.ceil((end - begin - LENGTH) / STEP) + 1)  # both ends are looked at
+        first = np.linspace(begin, max(begin, end - LENGTH), count)[evenly(count, MOST)]
+        told = np.full((2, len(first)), np.nan)
+        for k, t in enumerate(first.tolist()):
+            span = t, t + LENGTH
+            fit = fit_clock(a, b, clock, window, weight=weight, iterations=ITERATIONS, span=span)
+            if fit is not None:
+                told[:, k] = fit.clock.offset - clock.offset, math.sqrt(max(float(fit.covariance[0, 0]), 0.0))
+        return cls(first + LENGTH / 2, *told)
+
+    def unsteady(self, floor: float) -> float:
+        """Root mean square of what the parts are off by, each in units of how well it is known; 0 where too few can tell.
+
+        Args:
+            floor: seconds by which single seconds may be off whatever their sigma says: errors that all tracks share.
+        """
+        known = np.isfinite(self.late)
+        if known.sum() < LEAST:
+            return 0.0
+        return float(np.sqrt((self.late[known] ** 2 / (self.sigma[known] ** 2 + floor**2)).mean()))
