@@ -102,6 +102,7 @@ class Fit:
             is as large as the motion, each step goes but a small part of the way, and the answer is where it stopped.
         blur: rms residual over rms speed, s: how far off a single sample of a typical match tells the time.
         wander: rms over blocks of a second, by their information, of what each says the offset is off by, s.
+        information: Σ w v·v of the weighted samples: how much moves there.
     """
 
     clock: Clock
@@ -111,6 +112,7 @@ class Fit:
     blur: float
     wander: float = 0.0
     settled: bool = True
+    information: float = 0.0
 
     @property
     def effective_matches(self) -> float:
@@ -167,7 +169,8 @@ def fit_clock(
         # from the offset at the centre of the overlap to that at b's time zero
         move = np.array([[1.0, -centre], [0.0, 1.0]])
         covariance = move @ covariance @ move.T
-    return Fit(clock, covariance, system.match_weights, n, system.blur, system.wander(), settled)
+    moving = float(system.H[0, 0])
+    return Fit(clock, covariance, system.match_weights, n, system.blur, system.wander(), settled, moving)
 
 
 def _centre(a: TrackSplines, b: TrackSplines, clock: Clock) -> float:

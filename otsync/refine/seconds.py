@@ -27,6 +27,9 @@ MOST = 40
 LEAST = 3
 """Parts that tell whether a clock runs evenly, at least."""
 
+MOVES = 0.2
+"""Share of what usually moves that must move in a second which is to tell the time."""
+
 ITERATIONS = 12
 
 
@@ -36,12 +39,14 @@ class Seconds:
 
     Args:
         at: (K,) their middles, s on a's clock. late: (K,) by how much larger than the answer's the offset of each is, s;
-            nan where a part cannot tell. sigma: (K,) of that, jackknifed within the part.
+            nan where a part cannot tell. sigma: (K,) of that, jackknifed within the part. moving: (K,) how much moves
+            there, in any unit.
     """
 
     at: Float[np.ndarray, " K"]
     late: Float[np.ndarray, " K"]
     sigma: Float[np.ndarray, " K"]
+    moving: Float[np.ndarray, " K"]
 
     @classmethod
     def of(
@@ -57,12 +62,13 @@ class Seconds:
         begin, end = max(float(a.times[0]), float(ends[0])), min(float(a.times[-1]), float(ends[1]))
         count = max(1, math.ceil((end - begin - LENGTH) / STEP) + 1)  # both ends are looked at
         first = np.linspace(begin, max(begin, end - LENGTH), count)[evenly(count, MOST)]
-        told = np.full((2, len(first)), np.nan)
+        told = np.full((3, len(first)), np.nan)
         for k, t in enumerate(first.tolist()):
             span = t, t + LENGTH
             fit = fit_clock(a, b, clock, window, weight=weight, iterations=ITERATIONS, span=span)
             if fit is not None:
-                told[:, k] = fit.clock.offset - clock.offset, math.sqrt(max(float(fit.covariance[0, 0]), 0.0))
+                scatter = math.sqrt(max(float(fit.covariance[0, 0]), 0.0))
+                told[:, k] = fit.clock.offset - clock.offset, scatter, fit.information
         return cls(first + LENGTH / 2, *told)
 
     def unsteady(self, floor: float) -> float:
@@ -75,3 +81,15 @@ class Seconds:
         if known.sum() < LEAST:
             return 0.0
         return float(np.sqrt((self.late[known] ** 2 / (self.sigma[known] ** 2 + floor**2)).mean()))
+
+    def untold(self) -> float:
+        """The larger sigma of the first and the last second, s, of those in which things move; 0 where neither is.
+
+        Where nothing moves nothing can be told, and nothing speaks against the clock that holds beside it. Where things
+        move and all the same no offset suits them, the answer does not hold there, or nobody knows.
+        """
+        known = np.isfinite(self.sigma)
+        if known.sum() < LEAST:
+            return 0.0
+        moves = known & (self.moving >= MOVES * float(np.median(self.moving[known])))
+        return float(max((self.sigma[k] for k in (0, -1) if moves[k]), default=0.0))

@@ -61,7 +61,7 @@ VELOCITY = 5 / 30
 """Half window, s, of the velocities whose correlation judges the fit."""
 
 
-READS = ("moved", "spread", "correlation", "blur", "wander", "unsteady", "overlap", "matches", "rate_sigmas")
+READS = ("moved", "spread", "correlation", "blur", "wander", "unsteady", "untold", "overlap", "matches", "rate_sigmas")
 """The limits of :class:`otsync.Trust` that the fit's flags are raised by."""
 
 
@@ -113,6 +113,7 @@ class SplineRefine(Refiner):
         common = common_error(*curves, fit.clock, fit.weights, together, self.windows[0])
         shared += max(0.0, common**2 - float(fit.covariance[0, 0]))
         unsettled = unsettled_rate(rate_stats, fit.clock.rate)
+        seconds = Seconds.of(*curves, fit.clock, self.windows[0], weight)
         ends = self._ends(curves, fit, free, shared, unsettled, rate_stats.get("rate_sigma"))
         stats = (
             alignment.stats
@@ -124,7 +125,8 @@ class SplineRefine(Refiner):
                 "spread": spread,
                 "blur": fit.blur,
                 "wander": fit.wander,
-                "unsteady": Seconds.of(*curves, fit.clock, self.windows[0], weight).unsteady(self._wanders(fit.blur)),
+                "unsteady": seconds.unsteady(self._wanders(fit.blur)),
+                "untold": seconds.untold(),
                 "settled": float(fit.settled),
                 "common_error": common,
                 "scatter": math.sqrt(max(float(fit.covariance[0, 0]), 0.0)),
@@ -235,7 +237,9 @@ class SplineRefine(Refiner):
             Status.WEAK: stats["blur"] > t.blur or not stats["settled"],
             Status.MOVED: stats["moved"] > t.moved,
             Status.SPREAD: stats["spread"] > t.spread,
-            Status.BROKEN_CLOCK: stats["wander"] > self._wanders(stats["blur"]) or stats["unsteady"] > t.unsteady,
+            Status.BROKEN_CLOCK: stats["wander"] > self._wanders(stats["blur"])
+            or stats["unsteady"] > t.unsteady
+            or stats["untold"] > t.untold,
             Status.SHORT_OVERLAP: stats["overlap"] < t.overlap - 1e-9,
             Status.FEW_MATCHES: stats["effective_matches"] < t.matches,
             Status.POOR_FIT: stats["correlation"] < t.correlation,

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
@@ -18,16 +17,12 @@ from ..clocks.splines import TrackSplines
 from ..refine.gauss_newton import fit_clock
 from ..refine.splines import SplineRefine
 from ..types import Break, Clock, TrackSet, mended_frames
+from .alike import LEAST_BESIDE, LIMIT, MARGIN, Raw, Usual
+from .places import Part, measured
 from .verdict import Answer
-
-LIMIT = 200
-"""Matches that a break is located by."""
 
 WINDOW = 14 / 30
 """Half window, s, of the detrending in the fits of the parts."""
-
-MARGIN = 3 / 30
-"""Seconds beside a break that the fits of its parts leave out: curves are smoothed across it."""
 
 STILL = 0.35
 """A video stands still where its speed is below this share of what it is around, and moves around."""
@@ -47,11 +42,8 @@ MOVING, RESTING = 0.6, 0.4
 SEARCH = 2.0
 """Seconds around a break's coarse place in which it is looked for, at most, beside :data:`AROUND`."""
 
-ENOUGH, LEAST_BESIDE = 15, 4
-"""Frames that tell where a match's own constant difference lies; and that are asked beside a break, at least."""
-
-LEAST_KNOWN = 5
-"""Samples that tell where a match's own constant difference lies, at least."""
+ENOUGH = 15
+"""Frames that tell where a match's own constant difference lies."""
 
 BACK = 1.5
 """Seconds that a video must go back by to be taken for cut; less is lost frames."""
@@ -67,9 +59,6 @@ of the answer is the best (46 worlds of mid noise); beside a slow motion that is
 
 MOST = 4
 """Breaks that are mended, at most."""
-
-GAP = 2.5
-"""Frames beyond which what lies between two samples is a gap in a clock, of which nothing is known."""
 
 
 @dataclass(frozen=True)
@@ -122,15 +111,12 @@ def _readings(
     low, high = limits
     first, second = float(before), later
     gap = 0.0
-    one = two = None
+    told = (math.nan, math.nan)
     for margin in (2 * AROUND / 3, MARGIN):
-        one = fit_clock(a.within(low, when - margin), b, Clock(first), WINDOW)
-        two = fit_clock(a.within(when + gap + margin, high), b, Clock(second), WINDOW)
-        first = one.clock.offset if one is not None and abs(one.clock.offset - first) < AROUND else first
-        second = two.clock.offset if two is not None and abs(two.clock.offset - second) < AROUND else second
+        sides = Part(low, when - margin, first), Part(when + gap + margin, high, second)
+        (first, second), told = _offsets(a, b, sides)
         when, gap = _moment(*raw, first, second, when, limits)
-    jump = second - first
-    sigma = math.hypot(*(math.sqrt(float(f.covariance[0, 0])) if f is not None else math.nan for f in (one, two)))
+    jump, sigma = second - first, math.hypot(*told)
     i, j = answer.pair
     if jump > 0 and gap == 0:  # a's frames run on, b's go back: its parts are in the other order
         return [Suspect(j, Break(_turn(*raw, second, first), -jump, 0.0, sigma), 1.0)]
@@ -151,50 +137,19 @@ def _readings(
     return [Suspect(video, back, votes[0]), Suspect(lost[0], gone, votes[1])]
 
 
-@dataclass(frozen=True, eq=False)
-class Raw:
-    """Matched tracks as they were seen: curves are smoothed across a break, samples are not.
+def _offsets(a: TrackSplines, b: TrackSplines, sides: tuple[Part, Part]) -> tuple[list[float], list[float]]:
+    """Offsets of two parts beside a break, and their sigmas, s; nan where a part cannot tell: its offset stays.
 
-    Args:
-        times: (T,) s. x: (M,T,3), nan where not seen.
+    Each by the motion within it; where that is too little, by the places of the matches in the other part.
     """
-
-    times: np.ndarray
-    x: np.ndarray
-
-    @classmethod
-    def of(cls, tracks: TrackSet, index: np.ndarray) -> Raw:
-        return cls(tracks.times, tracks.take(index).positions())
-
-    def at(self, t: np.ndarray) -> np.ndarray:
-        """(M,S,3) between two samples on a line; nan outside."""
-        right = np.clip(np.searchsorted(self.times, t), 1, len(self.times) - 1)
-        step = self.times[right] - self.times[right - 1]
-        share = ((t - self.times[right - 1]) / step)[None, :, None]
-        x = (1 - share) * self.x[:, right - 1] + share * self.x[:, right]
-        outside = (t < self.times[0]) | (t > self.times[-1])
-        return np.where(outside[None, :, None], np.nan, x)
-
-    def sampled(self, t: np.ndarray) -> np.ndarray:
-        """(S,) whether a moment lies between two samples that are no gap apart (:data:`GAP`)."""
-        right = np.clip(np.searchsorted(self.times, t), 1, len(self.times) - 1)
-        steps = np.diff(self.times)
-        return np.asarray(steps[right - 1] < GAP * np.median(steps))
-
-    @cached_property
-    def _bends(self) -> np.ndarray:
-        square = np.zeros(self.x.shape[:2])
-        second = ((self.x[:, 2:] - 2 * self.x[:, 1:-1] + self.x[:, :-2]) ** 2).sum(2) / 64
-        square[:, 1:-1] = np.where(np.isfinite(second), second, 0.0)
-        return square
-
-    def bent(self, t: np.ndarray) -> np.ndarray:
-        """(M,S) how far a curve may lie off such a line, squared: an eighth of the second difference; 0 where unknown.
-
-        At a sample it is an eighth as well: curves that bend there are not known better than their samples are apart.
-        """
-        right = np.clip(np.searchsorted(self.times, t), 1, len(self.times) - 1)
-        return np.maximum(self._bends[:, right - 1], self._bends[:, right])
+    fits = [fit_clock(a.within(p.begin, p.end), b, Clock(p.offset), WINDOW) for p in sides]
+    near = [f is not None and abs(f.clock.offset - p.offset) < AROUND for f, p in zip(fits, sides, strict=True)]
+    found = [f.clock.offset if f is not None and ok else p.offset for f, p, ok in zip(fits, sides, near, strict=True)]
+    sigma = [math.sqrt(float(f.covariance[0, 0])) if f is not None else math.nan for f in fits]
+    for k in (0, 1):
+        if fits[k] is None and near[1 - k]:
+            found[k], sigma[k] = measured(a, b, replace(sides[1 - k], offset=found[1 - k]), sides[k])
+    return found, sigma
 
 
 def _moment(
@@ -253,42 +208,6 @@ def _agreement(apart: np.ndarray, inside: np.ndarray) -> np.ndarray:
     """(S,) how well positions agree, from the differences (M,S,3) of matched tracks: see :func:`_suits`."""
     level = Usual.of(apart, inside).levels(apart)
     return np.asarray(np.nansum(level, 0) / np.maximum(np.isfinite(level).sum(0), 1))
-
-
-@dataclass(frozen=True, eq=False)
-class Usual:
-    """How far apart matched tracks usually are, which tells how well they agree elsewhere.
-
-    Args:
-        known: (M,) matches of which enough is seen. middle: (M',3) the constant difference of each of them, its median.
-        spread: the median squared distance from it.
-    """
-
-    known: np.ndarray
-    middle: np.ndarray
-    spread: float
-
-    @classmethod
-    def of(cls, apart: np.ndarray, inside: np.ndarray) -> Usual:
-        """From the differences (M,S,3) at the moments ``inside`` (S,)."""
-        seen = np.isfinite(apart[..., 0]) & inside
-        known = seen.sum(1) >= LEAST_KNOWN
-        if not known.any():
-            return cls(known, np.zeros((0, 3)), 1.0)
-        middle = np.nanmedian(np.where(seen[known][..., None], apart[known], np.nan), 1)
-        off = ((apart[known] - middle[:, None]) ** 2).sum(2)
-        return cls(known, middle, float(np.median(off[seen[known]])) + 1e-300)
-
-    def levels(self, apart: np.ndarray, bent: np.ndarray | None = None) -> np.ndarray:
-        """(M',S) how well each known match agrees at each moment, in (-inf, 1]; nan where it is not seen.
-
-        Args:
-            apart: (M,S,3) differences. bent: (M,S) squared error of what was read between samples; it counts for
-                nothing.
-        """
-        off = ((apart[self.known] - self.middle[:, None]) ** 2).sum(2)
-        usual = self.spread if bent is None else self.spread + bent[self.known]
-        return np.asarray(1 - np.log1p(off / (4 * usual)))
 
 
 def stood_still(curves: TrackSplines, start: float, length: float) -> bool:
@@ -376,13 +295,10 @@ def culprit(found: Sequence[Suspect], sound: Sequence[Seen]) -> Suspect | None:
 def remeasured(answer: Answer, a: TrackSet, b: TrackSet, moment: float) -> tuple[float, float]:
     """What is left of a jump after it was mended, s, and one sigma of it; ``moment``: of the break, on a's clock."""
     curves = SplineRefine().splines(a, b, strongest(answer.matches, readable(LIMIT, a, b)))
-    start = Clock(answer.refined.offset, answer.refined.rate)
-    one = fit_clock(curves[0].within(-math.inf, moment - MARGIN), curves[1], start, WINDOW)
-    two = fit_clock(curves[0].within(moment + MARGIN, math.inf), curves[1], start, WINDOW)
-    if one is None or two is None:
-        return 0.0, math.nan
-    sigma = math.hypot(*(math.sqrt(float(f.covariance[0, 0])) for f in (one, two)))
-    return two.clock.offset - one.clock.offset, sigma
+    offset = answer.refined.offset
+    sides = Part(-math.inf, moment - MARGIN, offset), Part(moment + MARGIN, math.inf, offset)
+    (first, second), sigma = _offsets(*curves, sides)
+    return second - first, math.hypot(*sigma)
 
 
 def runs_on(answer: Answer, a: TrackSet, b: TrackSet, before: float, behind: float) -> bool:

@@ -16,7 +16,8 @@ from jaxtyping import Float
 
 from ..clocks.common import readable, strongest
 from ..types import Clock, TrackSet
-from .breaks import LEAST_BESIDE, LIMIT, MARGIN, OFF, OTHERS, Raw, Seen, Usual
+from .alike import LEAST_BESIDE, LIMIT, MARGIN, Raw, Usual
+from .breaks import OFF, OTHERS, Seen
 from .graph import Pair
 from .verdict import Answer
 

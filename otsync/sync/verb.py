@@ -33,7 +33,11 @@ from .method import Method, with_costs
 from .own_frames import Frames, refuse_common, solver_from, synchronize_own
 from .pairs import Job, Refit, run, run_refit, with_rate
 from .parts import broken_part, unvouched
+from .places import parts_by_place
 from .verdict import NOTHING_COMMON, Answer, Verdict, judge
+
+MEASURED, SETTLED = 3, 0.02 / 30
+"""How often a jump is measured anew, at most, and seconds by which it may still change."""
 
 
 def synchronize(
@@ -172,6 +176,7 @@ def mend_clocks(
     doubtful_mends: set[int] = set()
     fps = [nominal_fps(t) for t in tracks]
     for _ in range(MOST):
+        verdict = dataclasses.replace(verdict, answers=tuple(_with_parts(a, tracks) for a in verdict.answers))
         doubtful = [a for a in verdict.answers if len(a.scanned.parts) and not NOTHING_COMMON & set(a.scanned.flags)]
         named = [s for a in doubtful for s in suspects(a, tracks[a.pair[0]], tracks[a.pair[1]], fps)]
         one = culprit(named, _seen(verdict, tracks))
@@ -194,6 +199,17 @@ def mend_clocks(
     if doubtful_mends:
         verdict = judged([_doubted(a) if doubtful_mends & set(a.pair) else a for a in verdict.answers])
     return jobs, verdict, broken
+
+
+def _with_parts(answer: Answer, tracks: Sequence[TrackSet]) -> Answer:
+    """The answer, with the parts that positions tell of where its clock is doubtful and motion tells of none."""
+    first, second = (tracks[v] for v in answer.pair)
+    if len(answer.scanned.parts) or Status.BROKEN_CLOCK not in answer.refined.flags or not answer.finite:
+        return answer
+    if first.xyz is None or second.xyz is None:
+        return answer
+    parts = parts_by_place(answer, first, second)
+    return dataclasses.replace(answer, scanned=dataclasses.replace(answer.scanned, parts=parts))
 
 
 def _seen(verdict: Verdict, tracks: Sequence[TrackSet]) -> list[Seen]:
@@ -244,23 +260,27 @@ def steady_beside(fresh: Mapping[Pair, Answer], tracks: Sequence[TrackSet], v: i
 def with_break(
     jobs: list[Job], tracks: Sequence[TrackSet], v: int, found: Break, verdict: Verdict, map: MapLike
 ) -> tuple[list[Job], TrackSet, dict[Pair, Answer], Break] | None:
-    """The pairs of video v done anew with its clock mended, twice: what is left of the jump is measured in between.
+    """The pairs of video v done anew with its clock mended, and again while what is left of the jump is measured.
 
-    None where that adds nothing to the evidence.
+    None where that adds nothing to the evidence, or where the clock still breaks in as many pairs. That is asked of
+    the last jump alone: the first one, measured by matches of two offsets, may be a frame off.
     """
     own = [a for a in verdict.answers if v in a.pair]
     before, doubts = _evidence(own), _broken(own)
     best = None
-    for _ in range(2):
+    for _ in range(MEASURED):
         better = mended(tracks[v], (found,))
         sets = [better if k == v else t for k, t in enumerate(tracks)]
         again = [dataclasses.replace(j, a=sets[j.pair[0]], b=sets[j.pair[1]]) for j in jobs]
         fresh = {a.pair: a for a in map(run, [j for j in again if v in j.pair])}
-        if _evidence(fresh.values()) <= before or _broken(fresh.values()) >= doubts:
+        if _evidence(fresh.values()) <= before:
             break
-        best = again, better, fresh, found
+        if _broken(fresh.values()) < doubts:
+            best = again, better, fresh, found
         left = remeasured_jump(fresh, sets, v, found)
         if left is None or found.still > 0:  # a freeze lasts whole frames
+            break
+        if best is not None and abs(left.jump - found.jump) < SETTLED:
             break
         found = left
     return best

@@ -38,6 +38,9 @@ class Trust:
         unsteady: BROKEN_CLOCK when single seconds, each fitted by itself, are off by more than this, rms, in units of how
             well each is known. Of 320 right answers (mid to brutal, few tracks, like people, drifts, rates; seeds
             41000-41029) none has more than 1.65 but for wrong rates; two takes that were trusted 2.3 to 4.
+        untold: BROKEN_CLOCK when things move in the first or the last second, and their offset there, fitted by itself,
+            is not known to this many seconds. Of the same right answers none has more than 2.7 frames; brutal tracks
+            that froze behind their first second, 15 frames off there at sigma .22, have 9.8.
         rate_gain: RATE_MISMATCH when another common ratio of frame rates raises the score's peak by this factor.
         rate_sigmas: a fitted rate counts when it differs from the declared one by more than this many sigmas.
     """
@@ -55,6 +58,7 @@ class Trust:
     blur: float = 5.6 / 30
     wander: float = 0.1
     unsteady: float = 2.0
+    untold: float = 4 / 30
     rate_sigmas: float = 4.0
     rate_gain: float = 1.3
 

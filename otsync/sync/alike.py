@@ -1,0 +1,107 @@
+"""How well the positions of matched tracks agree: samples as they were seen, and how far apart they usually are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from ..types import TrackSet
+
+LIMIT = 200
+"""Matches that a break is located by."""
+
+MARGIN = 3 / 30
+"""Seconds beside a break that the fits of its parts leave out: curves are smoothed across it."""
+
+LEAST_KNOWN = 5
+"""Samples that tell where a match's own constant difference lies, at least."""
+
+GAP = 2.5
+"""Frames beyond which what lies between two samples is a gap in a clock, of which nothing is known."""
+
+LEAST_BESIDE = 4
+"""Frames that are asked beside a break, at least."""
+
+
+@dataclass(frozen=True, eq=False)
+class Raw:
+    """Matched tracks as they were seen: curves are smoothed across a break, samples are not.
+
+    Args:
+        times: (T,) s. x: (M,T,3), nan where not seen.
+    """
+
+    times: np.ndarray
+    x: np.ndarray
+
+    @classmethod
+    def of(cls, tracks: TrackSet, index: np.ndarray) -> Raw:
+        return cls(tracks.times, tracks.take(index).positions())
+
+    def at(self, t: np.ndarray) -> np.ndarray:
+        """(M,S,3) between two samples on a line; nan outside."""
+        right = np.clip(np.searchsorted(self.times, t), 1, len(self.times) - 1)
+        step = self.times[right] - self.times[right - 1]
+        share = ((t - self.times[right - 1]) / step)[None, :, None]
+        x = (1 - share) * self.x[:, right - 1] + share * self.x[:, right]
+        outside = (t < self.times[0]) | (t > self.times[-1])
+        return np.where(outside[None, :, None], np.nan, x)
+
+    def sampled(self, t: np.ndarray) -> np.ndarray:
+        """(S,) whether a moment lies between two samples that are no gap apart (:data:`GAP`)."""
+        right = np.clip(np.searchsorted(self.times, t), 1, len(self.times) - 1)
+        steps = np.diff(self.times)
+        return np.asarray(steps[right - 1] < GAP * np.median(steps))
+
+    @cached_property
+    def _bends(self) -> np.ndarray:
+        square = np.zeros(self.x.shape[:2])
+        second = ((self.x[:, 2:] - 2 * self.x[:, 1:-1] + self.x[:, :-2]) ** 2).sum(2) / 64
+        square[:, 1:-1] = np.where(np.isfinite(second), second, 0.0)
+        return square
+
+    def bent(self, t: np.ndarray) -> np.ndarray:
+        """(M,S) how far a curve may lie off such a line, squared: an eighth of the second difference; 0 where unknown.
+
+        At a sample it is an eighth as well: curves that bend there are not known better than their samples are apart.
+        """
+        right = np.clip(np.searchsorted(self.times, t), 1, len(self.times) - 1)
+        return np.maximum(self._bends[:, right - 1], self._bends[:, right])
+
+
+@dataclass(frozen=True, eq=False)
+class Usual:
+    """How far apart matched tracks usually are, which tells how well they agree elsewhere.
+
+    Args:
+        known: (M,) matches of which enough is seen. middle: (M',3) the constant difference of each of them, its median.
+        spread: the median squared distance from it.
+    """
+
+    known: np.ndarray
+    middle: np.ndarray
+    spread: float
+
+    @classmethod
+    def of(cls, apart: np.ndarray, inside: np.ndarray) -> Usual:
+        """From the differences (M,S,3) at the moments ``inside`` (S,)."""
+        seen = np.isfinite(apart[..., 0]) & inside
+        known = seen.sum(1) >= LEAST_KNOWN
+        if not known.any():
+            return cls(known, np.zeros((0, 3)), 1.0)
+        middle = np.nanmedian(np.where(seen[known][..., None], apart[known], np.nan), 1)
+        off = ((apart[known] - middle[:, None]) ** 2).sum(2)
+        return cls(known, middle, float(np.median(off[seen[known]])) + 1e-300)
+
+    def levels(self, apart: np.ndarray, bent: np.ndarray | None = None) -> np.ndarray:
+        """(M',S) how well each known match agrees at each moment, in (-inf, 1]; nan where it is not seen.
+
+        Args:
+            apart: (M,S,3) differences. bent: (M,S) squared error of what was read between samples; it counts for
+                nothing.
+        """
+        off = ((apart[self.known] - self.middle[:, None]) ** 2).sum(2)
+        usual = self.spread if bent is None else self.spread + bent[self.known]
+        return np.asarray(1 - np.log1p(off / (4 * usual)))
