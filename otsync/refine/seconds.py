@@ -27,8 +27,9 @@ MOST = 40
 LEAST = 3
 """Parts that tell whether a clock runs evenly, at least."""
 
-MOVES = 0.2
-"""Share of what usually moves that must move in a second which is to tell the time."""
+MOVES, UNUSUAL = 0.05, 3.0
+"""Share of what usually moves that must move in a second which is to tell the time; and times the usual sigma of single
+seconds that its sigma must have to be unusual."""
 
 ITERATIONS = 12
 
@@ -38,9 +39,9 @@ class Seconds:
     """What short parts of an overlap say.
 
     Args:
-        at: (K,) their middles, s on a's clock. late: (K,) by how much larger than the answer's the offset of each is, s;
-            nan where a part cannot tell. sigma: (K,) of that, jackknifed within the part. moving: (K,) how much moves
-            there, in any unit.
+        at: (K,) their middles, s on a's clock. late: (K,) by how much larger than the answer's the offset of each is,
+            s; nan where a part cannot tell. sigma: (K,) of that, jackknifed within the part. moving: (K,) how much
+            moves there, in any unit.
     """
 
     at: Float[np.ndarray, " K"]
@@ -72,7 +73,7 @@ class Seconds:
         return cls(first + LENGTH / 2, *told)
 
     def unsteady(self, floor: float) -> float:
-        """Root mean square of what the parts are off by, each in units of how well it is known; 0 where too few can tell.
+        """Root mean square of what the parts are off by, each in units of how well it is known; 0 where few can tell.
 
         Args:
             floor: seconds by which single seconds may be off whatever their sigma says: errors that all tracks share.
@@ -83,7 +84,8 @@ class Seconds:
         return float(np.sqrt((self.late[known] ** 2 / (self.sigma[known] ** 2 + floor**2)).mean()))
 
     def untold(self) -> float:
-        """The larger sigma of the first and the last second, s, of those in which things move; 0 where neither is.
+        """The larger sigma of the first and the last second, s, of those in which things move and which is far larger
+        than usual; 0 where neither is.
 
         Where nothing moves nothing can be told, and nothing speaks against the clock that holds beside it. Where things
         move and all the same no offset suits them, the answer does not hold there, or nobody knows.
@@ -92,4 +94,5 @@ class Seconds:
         if known.sum() < LEAST:
             return 0.0
         moves = known & (self.moving >= MOVES * float(np.median(self.moving[known])))
-        return float(max((self.sigma[k] for k in (0, -1) if moves[k]), default=0.0))
+        unusual = self.sigma > UNUSUAL * float(np.median(self.sigma[known]))
+        return float(max((self.sigma[k] for k in (0, -1) if moves[k] and unusual[k]), default=0.0))

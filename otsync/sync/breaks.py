@@ -111,12 +111,12 @@ def _readings(
     low, high = limits
     first, second = float(before), later
     gap = 0.0
-    told = (math.nan, math.nan)
+    sigmas = [math.nan, math.nan]
     for margin in (2 * AROUND / 3, MARGIN):
         sides = Part(low, when - margin, first), Part(when + gap + margin, high, second)
-        (first, second), told = _offsets(a, b, sides)
+        (first, second), sigmas = _offsets(a, b, sides)
         when, gap = _moment(*raw, first, second, when, limits)
-    jump, sigma = second - first, math.hypot(*told)
+    jump, sigma = second - first, math.hypot(*sigmas)
     i, j = answer.pair
     if jump > 0 and gap == 0:  # a's frames run on, b's go back: its parts are in the other order
         return [Suspect(j, Break(_turn(*raw, second, first), -jump, 0.0, sigma), 1.0)]

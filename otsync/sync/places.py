@@ -55,14 +55,14 @@ def parts_by_place(answer: Answer, a: TrackSet, b: TrackSet) -> Float[np.ndarray
     """
     clock = Clock(answer.refined.offset, answer.refined.rate)
     frame = float(np.median(np.diff(a.times))) if a.n_frames > 1 else 0.0
-    if not (0 < frame and a.n_frames <= MOST_FRAMES):
+    if not (frame > 0 and a.n_frames <= MOST_FRAMES):
         return NONE
     pairs = strongest(answer.matches, readable(LIMIT, a, b)).pairs
     first, second = Raw.of(a, pairs[:, 0]), Raw.of(b, pairs[:, 1])
     usual = _usual(first, second, clock)
-    here = _levels(first, second, clock, 0.0, usual)
-    if usual is None or here is None:
+    if usual is None:
         return NONE
+    here = _levels(first, second, clock, 0.0, usual)
     straight = np.nan_to_num(here)
     before, behind = np.concatenate([[0.0], np.cumsum(straight)]), float(straight.sum())
     best, found = GAIN, NONE
@@ -99,7 +99,7 @@ def parts_by_place(answer: Answer, a: TrackSet, b: TrackSet) -> Float[np.ndarray
 
 
 def _usual(a: Raw, b: Raw, clock: Clock) -> Usual | None:
-    """How far apart matched tracks are where the clock holds: that part is not known, so it is found in a few rounds."""
+    """How far apart matched tracks are where the clock holds: in a few rounds, since that part is not known."""
     apart = a.x - b.at(clock.own(a.times))
     inside = np.isfinite(apart[..., 0]).sum(0) >= WITNESSES
     usual = None
@@ -117,10 +117,8 @@ def _usual(a: Raw, b: Raw, clock: Clock) -> Usual | None:
     return usual
 
 
-def _levels(a: Raw, b: Raw, clock: Clock, late: float, usual: Usual | None) -> Float[np.ndarray, " T"] | None:
-    """(T,) how well the positions agree at a's frames and an offset larger by ``late`` s; nan where too few are seen."""
-    if usual is None:
-        return None
+def _levels(a: Raw, b: Raw, clock: Clock, late: float, usual: Usual) -> Float[np.ndarray, " T"]:
+    """(T,) how well positions agree at a's frames and an offset larger by ``late`` s; nan where too few are seen."""
     t = clock.own(a.times - late)
     return _mean(usual.levels(a.x - b.at(t), b.bent(t)))
 
@@ -156,7 +154,7 @@ def measured(a: TrackSplines, b: TrackSplines, known: Part, short: Part) -> tupl
     told = seen.sum(1) >= LEAST_BESIDE
     apart = np.where(seen[..., None], a.joined(t) - b.joined(t - known.offset), 0.0)
     middle = apart.sum(1) / np.maximum(seen.sum(1), 1)[:, None]
-    x, visible, offset = a.joined(asked), a.support(asked) & told[:, None], short.offset
+    place, visible, offset = a.joined(asked), a.support(asked) & told[:, None], short.offset
     group = neighbours(a.mean + b.mean, GROUPS)
     H, g = np.zeros(GROUPS), np.zeros(GROUPS)
     for _ in range(ITERATIONS):
@@ -164,11 +162,10 @@ def measured(a: TrackSplines, b: TrackSplines, known: Part, short: Part) -> tupl
         ok = visible & b.support(own)
         if ok.sum() < WITNESSES * LEAST_BESIDE:
             return short.offset, math.nan
-        r, v = x - b.joined(own) - middle[:, None], b.velocity(own)
+        r, v = place - b.joined(own) - middle[:, None], b.velocity(own)
         size = np.sqrt((r**2).sum(2))
         w = np.where(ok, 1 / (1 + (size / max(ROBUST * float(np.median(size[ok])), 1e-300)) ** 2), 0.0)
-        by_match = np.stack([(w[..., None] * v * v).sum((1, 2)), (w[..., None] * v * r).sum((1, 2))])
-        H, g = (np.bincount(group, values, GROUPS) for values in by_match)
+        H, g = (np.bincount(group, (w[..., None] * v * x).sum((1, 2)), GROUPS).astype(float) for x in (v, r))
         if not H.sum() > 0:
             return short.offset, math.nan
         offset -= float(np.clip(g.sum() / H.sum(), -MARGIN, MARGIN))

@@ -38,7 +38,7 @@ STANDING_MARGIN = 0.1
 CAPTURED = 3.0 * FRAME
 """The new fit counts when it ends this close to where it began."""
 
-SHARED = 0.5
+SHARED = 0.25
 """Share of a pair's variance that its two videos have in all their pairs. With four videos, mid and hard (35 worlds
 each), 66 to 70 % of the answers lie within one sigma with .2, 74 % with .5, 83 to 86 % with 1. Recordings share more
 than simulated tracks, so the larger one of what suits these."""
