@@ -39,6 +39,9 @@ how much, in the mean, that offset must suit the part better, and how well."""
 BESIDE = 1.0
 """Seconds beside a break that tell the constant differences of the matches."""
 
+TRIED, FEWEST = 6, 2
+"""Parts of known offset that are measured in the same way, at most and at least."""
+
 MOST_FRAMES = 1500
 """Of longer clips windows of motion tell enough."""
 
@@ -144,10 +147,36 @@ class Part:
 def measured(a: TrackSplines, b: TrackSplines, known: Part, short: Part) -> tuple[float, float]:
     """The offset of a short part, and one sigma of it, s, by the places that the matches have in the part beside it,
     whose offset is known; (its own offset, nan) where nothing tells.
+
+    Places drift, those of all matches alike, which their scatter does not show. So the same is asked of parts of the
+    known one, too, as long and as far from what they are measured by: what these are off by joins sigma.
     """
-    nearest = np.flatnonzero(known.moments(a.times) & (np.abs(a.times - _nearest(known, short)) <= BESIDE))
+    offset, sigma = _by_place(a, b, known, short)
+    length, gap = min(short.end, float(a.times[-1])) - max(short.begin, float(a.times[0])), _gap(known, short)
+    inwards = -1.0 if known.begin < short.begin else 1.0
+    first = _nearest(known, short) + inwards * a.frame
+    off = []
+    for k in range(TRIED):
+        near = first + inwards * k * length / 2
+        low, high = sorted((near, near + inwards * length))
+        beyond = high + gap if inwards > 0 else low - gap
+        begin, end = sorted((beyond, beyond + inwards * BESIDE))
+        rest = Part(begin, end, known.offset)
+        if not (known.begin <= rest.begin and rest.end <= known.end):
+            break
+        found, scatter = _by_place(a, b, rest, Part(low, high, known.offset))
+        if math.isfinite(scatter):
+            off.append(found - known.offset)
+    if len(off) < FEWEST:
+        return offset, math.nan
+    return offset, math.hypot(sigma, float(np.sqrt(np.mean(np.square(off)))))
+
+
+def _by_place(a: TrackSplines, b: TrackSplines, known: Part, short: Part) -> tuple[float, float]:
+    """See :func:`measured`; sigma tells of the scatter between neighbourhoods of matches alone."""
+    nearest = known.moments(a.times) & (np.abs(a.times - _nearest(known, short)) <= BESIDE)
     asked = a.times[short.moments(a.times)]
-    if len(nearest) < LEAST_BESIDE or len(asked) < LEAST_BESIDE:
+    if nearest.sum() < LEAST_BESIDE or len(asked) < LEAST_BESIDE:
         return short.offset, math.nan
     t = a.times[nearest]
     seen = a.support(t) & b.support(t - known.offset)
@@ -175,3 +204,8 @@ def measured(a: TrackSplines, b: TrackSplines, known: Part, short: Part) -> tupl
 def _nearest(known: Part, short: Part) -> float:
     """The moment of the known part that is nearest to the short one."""
     return known.end if known.begin < short.begin else known.begin
+
+
+def _gap(known: Part, short: Part) -> float:
+    """Seconds between the two."""
+    return max(short.begin - known.end, known.begin - short.end, 0.0)

@@ -1,0 +1,135 @@
+"""Single seconds of an overlap: each finds its own offset, and together they say whether one clock runs evenly."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from otsync import SplineRefine, Status, TrackSet, refine
+from otsync.clocks.splines import TrackSplines
+from otsync.refine.gauss_newton import fit_clock
+from otsync.refine.seconds import LEAST, LENGTH, MOST, STEP, Seconds
+from otsync.types import Clock
+
+from .test_refine import films, near, smooth
+
+WINDOW = 14 / 30
+
+
+def seconds_of(a, b, clock, **options):
+    curves = TrackSplines(a.times, a.positions()), TrackSplines(b.times, b.positions())
+    return Seconds.of(*curves, clock, WINDOW, **options)
+
+
+def wandering(late, seed: int = 3, n: int = 40, frames: int = 150, noise: float = 0.004):
+    """Two videos; the second one's frames are ``late(t)`` s late."""
+    rng = np.random.default_rng(seed)
+    move, t = smooth(rng, n), np.arange(frames) / 30
+    a, b = (move(x) + noise * rng.normal(size=(n, frames, 3)) for x in (t, t + late(t)))
+    return TrackSet(a, fps=30), TrackSet(b, fps=30)
+
+
+def test_every_second_finds_the_offset_that_holds_in_it():
+    a, b = wandering(lambda t: np.where(t < 2.0, 0.0, 2 / 30))
+    told = seconds_of(a, b, Clock(0.0))
+    before, behind = told.at + LENGTH / 2 < 1.9, told.at - LENGTH / 2 > 2.1
+    assert before.sum() >= 2 and behind.sum() >= 4
+    np.testing.assert_allclose(told.late[before] * 30, 0.0, atol=0.1)
+    np.testing.assert_allclose(told.late[behind] * 30, 2.0, atol=0.15)
+    assert (np.abs(told.late[before]) < 5 * told.sigma[before] + 0.02 / 30).all()
+
+
+def test_both_ends_of_the_overlap_are_looked_at():
+    a, b, _ = films(offset=0.31)
+    told = seconds_of(a, b, Clock(0.31))
+    begin, end = 0.31, float(a.times[-1])
+    assert told.at[0] - LENGTH / 2 == pytest.approx(begin)
+    assert told.at[-1] + LENGTH / 2 == pytest.approx(end)
+    assert np.diff(told.at).max() <= STEP + 1e-9
+
+
+def test_long_overlaps_are_looked_at_here_and_there():
+    a, b = wandering(lambda t: 0 * t, n=3, frames=1800)
+    told = seconds_of(a, b, Clock(0.0))
+    assert len(told.at) == MOST and np.ptp(told.at) == pytest.approx(60 - 1 / 30 - LENGTH)
+
+
+def test_a_span_is_the_fit_of_the_frames_within_it():
+    """``span`` leaves out frames; cutting the videos there gives the same answer, but for curves at the cuts."""
+    a, b, _ = films(noise=0.003)
+    curves = TrackSplines(a.times, a.positions()), TrackSplines(b.times, b.positions())
+    some = fit_clock(*curves, Clock(0.3), WINDOW, span=(1.0, 2.5))
+    inside = (a.times >= 1.0 - 1e-9) & (a.times <= 2.5 + 1e-9)
+    other = (b.times >= 0.7 - 1e-9) & (b.times <= 2.2 + 1e-9)
+    cut = [TrackSplines(t.times[k], t.positions()[:, k]) for t, k in ((a, inside), (b, other))]
+    alone = fit_clock(*cut, Clock(0.3), WINDOW)
+    assert some is not None and alone is not None
+    assert some.clock.offset == pytest.approx(alone.clock.offset, abs=0.1 / 30)
+    assert fit_clock(*curves, Clock(0.3), WINDOW, span=(50.0, 51.0)) is None
+
+
+def test_exchanging_the_videos_turns_the_sign_of_every_second():
+    a, b = wandering(lambda t: 0.3 + np.where(t < 2.0, 0.0, 1.5 / 30))
+    there, back = seconds_of(a, b, Clock(0.3)), seconds_of(b, a, Clock(-0.3))
+    np.testing.assert_allclose(there.late, -back.late, atol=1e-3 / 30)
+    assert there.unsteady(0.001) == pytest.approx(back.unsteady(0.001), rel=0.02)
+
+
+def test_a_clock_that_wanders_is_unsteady_and_one_that_runs_evenly_is_not():
+    def late(t):
+        return 0.3 + 2.5 / 30 * np.sin(2 * np.pi * t / 3.0)
+
+    told = {}
+    for name, which in (("even", lambda t: 0.3 + 0 * t), ("wanders", late)):
+        a, b = wandering(which)
+        _, _, matches = films(n=40)
+        told[name] = refine(a, b, matches, near(0.3), throw=False)
+    limit = SplineRefine().trust.unsteady
+    assert told["even"].stats["unsteady"] < 0.5 * limit and told["even"].status.ok
+    assert told["wanders"].stats["unsteady"] > limit and Status.BROKEN_CLOCK in told["wanders"].flags
+
+
+def test_an_end_that_moves_and_fits_nothing_is_not_vouched_for():
+    """In its last second the second video shows something else: no offset suits that."""
+    rng = np.random.default_rng(5)
+    a, b = wandering(lambda t: 0.3 + 0 * t)
+    x = b.positions().copy()
+    other = smooth(rng, 40)(np.arange(150) / 30)
+    x[:, 105:] = other[:, 105:] - other[:, [105]] + x[:, [105]]
+    strange = TrackSet(x, fps=30)
+    _, _, matches = films(n=40)
+    sound = refine(a, b, matches, near(0.3), throw=False)
+    doubted = refine(a, strange, matches, near(0.3), throw=False)
+    assert sound.stats["untold"] == 0.0 and sound.status.ok
+    assert doubted.stats["untold"] > SplineRefine().trust.untold and Status.BROKEN_CLOCK in doubted.flags
+
+
+def test_an_end_at_which_nothing_moves_speaks_against_nothing():
+    rng = np.random.default_rng(6)
+    move, t = smooth(rng, 40), np.arange(150) / 30
+    shown = np.minimum(t, 3.5)  # everybody stands still at the end
+    a = move(shown) + 0.003 * rng.normal(size=(40, 150, 3))
+    b = move(np.minimum(t + 0.3, 3.5)) + 0.003 * rng.normal(size=(40, 150, 3))
+    _, _, matches = films(n=40)
+    found = refine(TrackSet(a, fps=30), TrackSet(b, fps=30), matches, near(0.3), throw=False)
+    assert found.stats["untold"] <= SplineRefine().trust.untold
+    assert found.offset == pytest.approx(0.3, abs=0.1 / 30) and Status.BROKEN_CLOCK not in found.flags
+
+
+def test_few_seconds_say_nothing():
+    some = np.arange(LEAST - 1.0)
+    told = Seconds(some, some + 9, some + 0.01, some + 1)
+    assert told.unsteady(0.001) == 0.0 and told.untold() == 0.0
+    unknown = Seconds(np.arange(6.0), np.full(6, np.nan), np.full(6, np.nan), np.full(6, np.nan))
+    assert unknown.unsteady(0.001) == 0.0 and unknown.untold() == 0.0
+
+
+def test_an_answer_that_did_not_settle_is_weak():
+    """Where noise is as large as the motion, every step goes but a part of the way."""
+    rng = np.random.default_rng(1)
+    a, b, matches = films(n=40)
+    small = [0.05 * t.positions() + 0.05 * rng.normal(size=t.positions().shape) for t in (a, b)]
+    found = refine(TrackSet(small[0], fps=30), TrackSet(small[1], fps=30), matches, near(0.25), throw=False)
+    assert found.stats["blur"] < SplineRefine().trust.blur
+    assert found.stats["settled"] == 0.0 and Status.WEAK in found.flags
+    assert refine(a, b, matches, near(0.31)).stats["settled"] == 1.0
