@@ -18,6 +18,9 @@ CLOCKS = ("tests/otsync/clocks/test_splines.py",)
 REFINE = ("tests/otsync/refine",)
 EPIPOLAR = ("tests/otsync/epipolar",)
 PARTS = ("tests/otsync/sync/test_parts.py",)
+PLACES = ("tests/otsync/sync/test_places.py",)
+SECONDS = ("tests/otsync/refine/test_seconds.py",)
+TIMING = ("tests/otsync/simulate/test_timing.py",)
 FRAMES = ("tests/otsync/frames/test_fit.py", "tests/otsync/frames/test_noise.py")
 POSES = ("tests/otsync/frames/test_solver.py",)
 GRAPH = ("tests/otsync/sync/test_graph.py",)
@@ -51,6 +54,78 @@ class Break:
 
 
 BREAKS = (
+    Break(
+        "seconds-end-unseen",
+        "otsync/refine/seconds.py",
+        "first = np.linspace(begin, max(begin, end - LENGTH), count)",
+        "first = np.linspace(begin, max(begin, end - 2 * LENGTH), count)",
+        SECONDS,
+        "the last second of the overlap is not asked",
+    ),
+    Break(
+        "seconds-of-one-clock",
+        "otsync/refine/gauss_newton.py",
+        "Side.of(b, a, window, False, (start.own(begin), start.own(end))),",
+        "Side.of(b, a, window, False, (begin, end)),",
+        SECONDS,
+        "a span of a's clock is taken for one of b's",
+    ),
+    Break(
+        "seconds-rest-speaks",
+        "otsync/refine/seconds.py",
+        "(self.sigma[k] for k in (0, -1) if moves[k] and unusual[k])",
+        "(self.sigma[k] for k in (0, -1) if unusual[k])",
+        SECONDS,
+        "an end at which nothing moves speaks against the clock",
+    ),
+    Break(
+        "refine-unsettled-passes",
+        "otsync/refine/splines.py",
+        'Status.WEAK: stats["blur"] > t.blur or not stats["settled"],',
+        'Status.WEAK: stats["blur"] > t.blur,',
+        SECONDS,
+        "an answer whose fit has not settled passes",
+    ),
+    Break(
+        "places-late-sign",
+        "otsync/sync/places.py",
+        "t = clock.own(a.times - late)",
+        "t = clock.own(a.times + late)",
+        PLACES,
+        "a larger offset looks at b's later frames instead of its earlier ones",
+    ),
+    Break(
+        "places-no-gap",
+        "otsync/sync/places.py",
+        "gap = max(grows, 0)",
+        "gap = 0",
+        PLACES,
+        "frames without a partner are given to a part",
+    ),
+    Break(
+        "places-step-sign",
+        "otsync/sync/places.py",
+        "offset -= float(np.clip(g.sum() / H.sum(), -MARGIN, MARGIN))",
+        "offset += float(np.clip(g.sum() / H.sum(), -MARGIN, MARGIN))",
+        PLACES,
+        "the offset of a short part is sought in the wrong direction",
+    ),
+    Break(
+        "places-own-scatter",
+        "otsync/sync/places.py",
+        "return offset, math.hypot(sigma, float(np.sqrt(np.mean(np.square(off)))))",
+        "return offset, sigma",
+        PARTS,
+        "sigma of a short part does not know that places drift",
+    ),
+    Break(
+        "timing-last-effect-wins",
+        "otsync/simulate/effects/timing.py",
+        "earlier = 0.0 if obs.late is None else",
+        "earlier = 0.0 if True else",
+        TIMING,
+        "of two effects on one file's time the last one replaces the first",
+    ),
     # --- parts of clips in which an answer does not hold ------------------------------------------------------------
     Break(
         "parts-few-agree",

@@ -116,6 +116,17 @@ def test_an_end_at_which_nothing_moves_speaks_against_nothing():
     assert found.offset == pytest.approx(0.3, abs=0.1 / 30) and Status.BROKEN_CLOCK not in found.flags
 
 
+def test_only_ends_that_move_and_are_unusually_unsure_are_untold():
+    at, late, moves = np.arange(6.0), np.zeros(6), np.ones(6)
+    sure, unsure = np.full(6, 0.003), np.array([0.003] * 5 + [1.0])
+    rests = np.array([1.0] * 5 + [0.001])
+    assert Seconds(at, late, unsure, moves).untold() == 1.0
+    assert Seconds(at, late, unsure[::-1], moves).untold() == 1.0
+    assert Seconds(at, late, unsure, rests).untold() == 0.0
+    assert Seconds(at, late, sure, moves).untold() == 0.0
+    assert Seconds(at, late, np.full(6, 1.0), moves).untold() == 0.0  # nobody knows more: sigma says so
+
+
 def test_few_seconds_say_nothing():
     some = np.arange(LEAST - 1.0)
     told = Seconds(some, some + 9, some + 0.01, some + 1)
