@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ..compute.indices import blocks
 from ..files.arrays import MAX_BYTES, read_npz, write_npz
 from ..files.strict import nearest, on_one_line, shown
 from . import drawing
@@ -152,8 +153,7 @@ class TrackSet:
             value = getattr(self, field)
             if value is None:
                 continue
-            finite = np.isfinite(value)
-            bad = self.seen & ~(finite.all(-1) if value.ndim == 3 else finite)
+            bad = self._unfit(value)
             if bad.any():
                 n, t = np.argwhere(bad)[0]
                 raise ValueError(
@@ -166,6 +166,15 @@ class TrackSet:
                     f"{name}.features: expected (N,D) descriptors; found none. Add them, or match by hand."
                 )
             _check_features(self.features, name)
+
+    def _unfit(self, value: np.ndarray) -> Bool[np.ndarray, "N T"]:
+        """Which visible samples of a field are not finite. Of long clips few tracks at a time are looked at."""
+        bad = np.zeros(self.seen.shape, bool)
+        for some in blocks(*bad.shape):
+            finite = np.isfinite(value[some])
+            for known in np.moveaxis(finite, -1, 0) if value.ndim == 3 else [finite]:
+                bad[some] |= ~known
+        return np.logical_and(bad, self.seen, out=bad)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write a versioned ``.npz`` without pickle, atomically."""
