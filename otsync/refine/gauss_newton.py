@@ -60,7 +60,7 @@ class Side:
             values there, (M,T,3).
         other: curves of the other video.
         lo, hi: (T,) the frames within the detrending window of each frame, lo inclusive, hi exclusive.
-        forward: whether these are a's frames.
+        forward: whether these are a's frames. seen: where the curves are known at these frames.
     """
 
     own: TrackSplines
@@ -70,6 +70,7 @@ class Side:
     lo: Int[np.ndarray, " T"]
     hi: Int[np.ndarray, " T"]
     forward: bool
+    seen: Bool[np.ndarray, "M T"]
 
     @classmethod
     def of(
@@ -81,7 +82,7 @@ class Side:
         t = own.times[first:last]
         lo = np.searchsorted(t, t - window - slack)
         hi = np.searchsorted(t, t + window + slack, side="right")
-        return cls(own, t, own.joined(t), other, lo, hi, forward)
+        return cls(own, t, own.joined(t), other, lo, hi, forward, own.support(t))
 
     def there(self, clock: Clock) -> Float[np.ndarray, " T"]:
         """The moments of the other video that this one's frames show."""
@@ -250,15 +251,13 @@ def _linearise(
     # of long clips few matches at a time: once for the size of residuals, which weights depend on, once for the sums
     parts = list(blocks(M, 2 * max(len(side.times) for side in sides)))
     kept: list[Any] = []
-    size: list[list[np.ndarray]] = [[] for _ in sides]
-    used: list[list[np.ndarray]] = [[] for _ in sides]
+    sizes, known = ([np.empty((M, len(side.times)), kind) for side in sides] for kind in (float, bool))
     for part in parts:
         found = [read.residuals(part, P) for read in reads]
         for n, (rr, _, _, ok) in enumerate(found):
-            size[n].append(np.sqrt(rr))
-            used[n].append(ok)
+            np.sqrt(rr, out=sizes[n][part])
+            known[n][part] = ok
         kept = [found] if len(parts) == 1 else []
-    sizes, known = [np.concatenate(x) for x in size], [np.concatenate(x) for x in used]
     seen = np.sum([ok.sum(1) for ok in known], axis=0)
     if not seen.any():
         return None
@@ -271,9 +270,8 @@ def _linearise(
         weight *= prior
     start = max(sides[0].times[0], float(clock.world(sides[1].times[0])))
     block = [read.blocks_from(start, clock) for read in reads]
-    count = max(int(b.max(initial=0)) for b in block) + 1
     H_match, g_match = np.zeros((M, P, P)), np.zeros((M, P))
-    H_time, g_time = np.zeros((count, P, P)), np.zeros((count, P))
+    H_frame, g_frame = ([np.zeros((len(side.times), *shape)) for side in sides] for shape in ((P, P), (P,)))
     speed = 0.0
     for part in parts:
         found = kept[0] if kept else [read.residuals(part, P) for read in reads]
@@ -282,15 +280,24 @@ def _linearise(
             w = np.where(known[n][part], weight[part, None] / (1 + (sizes[n][part] / at_most) ** 2), 0.0)
             H_match[part] += np.einsum("pqmt,mt->mpq", h, w)
             g_match[part] += np.einsum("pmt,mt->mp", g, w)
-            np.add.at(H_time, block[n], np.einsum("pqmt,mt->tpq", h, w))
-            np.add.at(g_time, block[n], np.einsum("pmt,mt->tp", g, w))
+            H_frame[n] += np.einsum("pqmt,mt->tpq", h, w)
+            g_frame[n] += np.einsum("pmt,mt->tp", g, w)
             speed += float(weight[part] @ h[0, 0].sum(1))
+    H_time, g_time = (added(np.concatenate(block), np.concatenate(x)) for x in (H_frame, g_frame))
     H_group, g_group = np.zeros((GROUPS, P, P)), np.zeros((GROUPS, P))
     group = neighbours(sides[0].own.mean + sides[1].own.mean, GROUPS)
     np.add.at(H_group, group, H_match)
     np.add.at(g_group, group, g_match)
     blur = np.sqrt(float(weight @ squares) / speed) if speed > 0 else np.inf
     return System(H_match.sum(0), g_match.sum(0), (H_group, g_group), (H_time, g_time), weight, float(blur))
+
+
+def added(index: Int[np.ndarray, " S"], values: np.ndarray) -> np.ndarray:
+    """The sums of the rows of ``values`` (S,...) with the same index, in their order."""
+    count = int(index.max(initial=0)) + 1
+    flat = values.reshape(len(values), -1)
+    sums = np.stack([np.bincount(index, column, count) for column in flat.T], 1)
+    return sums.reshape(count, *values.shape[1:])
 
 
 @dataclass(frozen=True, eq=False)
@@ -310,18 +317,18 @@ class Read:
         # d(other curve's argument)/d offset: t_b = (t_a - offset) / rate from a's frames, t_a = rate t_b + offset from
         # b's
         sign = 1 / clock.rate if side.forward else -1.0
-        ok = side.own.support(side.times) & side.other.support(there)
+        ok = side.seen & side.other.support(there)
         return cls(side, there, side.time_b(clock) - centre, (first, value, sign * slope), ok)
 
     def residuals(self, part: slice, P: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """|R|² (m,T), J·R (P,m,T), J·J (P,P,m,T) of some matches, and where they count."""
-        from . import kernels
+        from .kernels import shift_residuals
 
         side = self.side
         ok = np.ascontiguousarray(self.ok[part])
         rr, g, h = (np.empty((*leading, *ok.shape)) for leading in ((), (P,), (P, P)))
         least = MIN_FRAMES / side.own.frame
-        kernels.shift_residuals(
+        shift_residuals(
             side.at[part],
             side.other.by_track[part],
             side.other.mean[part],
