@@ -13,6 +13,7 @@ import numpy as np
 
 from ..files.arrays import read_json
 from ..files.strict import in_words
+from ..types import Camera
 from .document import document
 
 METAS = ("train_meta.json", "test_meta.json")
@@ -60,6 +61,10 @@ def _videos(meta: dict[str, Any], folder: Path, fps: float) -> list[dict[str, An
         static = bool(np.ptp(poses, 0).max() == 0)
         if np.ptp(k[:, c], 0).max() > 0:
             raise ValueError(f"camera {cam}: expected one K for all frames; it changes (zoom is not supported)")
+        try:
+            Camera(k[0, c], poses[0] if static else poses, int(meta["w"]), int(meta["h"]))
+        except ValueError as error:
+            raise ValueError(f"camera {cam}: {error}") from None
         entry: dict[str, Any] = {
             "name": cam,
             "frames": _pattern([str(row[c]) for row in fn], folder / "ims", "ims"),

@@ -169,8 +169,8 @@ class TrackSet:
 
     def _unfit(self, value: np.ndarray) -> Bool[np.ndarray, "N T"]:
         """Which visible samples of a field are not finite. Of long clips few tracks at a time are looked at."""
-        bad = np.zeros(self.seen.shape, bool)
-        for some in blocks(*bad.shape):
+        bad = np.zeros_like(self.seen)
+        for some in blocks(len(bad), self.n_frames):
             finite = np.isfinite(value[some])
             for known in np.moveaxis(finite, -1, 0) if value.ndim == 3 else [finite]:
                 bad[some] |= ~known
