@@ -44,6 +44,13 @@ class Panoptic:
                     raise ValueError(
                         f"{folder / name}: expected w, h, fn, k, w2c and cam_id; {in_words(error)}. Mend the file."
                     ) from None
+                names = [video["name"] for video in videos]
+                twice = sorted({n for n in names if names.count(n) > 1})
+                if twice:
+                    raise ValueError(
+                        f"{folder / name}: cam_id: expected every camera once; found {', '.join(twice)} again. "
+                        "Mend the file."
+                    )
         videos.sort(key=lambda v: (len(v["name"]), v["name"]))
         assumed = f"the layout does not store the capture rate; {rate:g} fps assumed"
         return document(videos, "panoptic", notes=[assumed] if fps is None else [])

@@ -18,9 +18,12 @@ from .drawing import short
 
 FORMAT, VERSION = "otsync.tracks", 1
 
+CAMERA = ("camera_K", "camera_w2c", "camera_width", "camera_height")
+"""What a file tells of a camera, at least."""
+
 ARRAYS = (
     *("format", "version", "name", "frame", "xyz", "visible", "features", "fps", "timestamps", "uv", "sigma", "labels"),
-    *("camera_K", "camera_w2c", "camera_width", "camera_height", "camera_distortion", "camera_readout"),
+    *(*CAMERA, "camera_distortion", "camera_readout"),
 )
 """All that a file may hold."""
 
@@ -202,7 +205,8 @@ class TrackSet:
         version = data.get("version")
         if version is None or version.shape != () or version.dtype.kind not in "iu" or int(version) != VERSION:
             raise ValueError(
-                f"{path}: expected version {VERSION}; found {version}. Read it with the otsync release that wrote it."
+                f"{path}: expected version {VERSION}; found {shown(str(version))}. Read it with the otsync release "
+                "that wrote it."
             )
         try:
             for name in data:
@@ -214,9 +218,12 @@ class TrackSet:
                         "it out."
                     )
             camera = None
-            if "camera_K" in data:
+            given = [f for f in ARRAYS if f.startswith("camera_") and f in data]
+            if given:
+                for field in (f for f in CAMERA if f not in data):
+                    raise ValueError(f"{field}: expected an array beside {given[0]}; found none. Save it again.")
                 parts: dict[str, Any] = {}
-                for field in (f for f in ARRAYS if f.startswith("camera_") and f in data):
+                for field in given:
                     kinds = {"camera_width": "iu", "camera_height": "iu", "camera_readout": "iuf"}.get(field)
                     value = _numbers(data[field], field) if kinds is None else _scalar(data, field, kinds)
                     parts[field.removeprefix("camera_")] = value
