@@ -5,6 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from ..compute.jit import kernel
+from ..compute.threads import for_each, ranges
+
+SAMPLES_AT_ONCE = 10_000_000
+"""Samples times lags that one thread takes at a time: some hundredths of a second."""
 
 
 @kernel()
@@ -113,29 +117,36 @@ def lag_statistics(a, wa, qa, b, wb, qb, lags, least, count, power, residual):
             power[m, n], residual[m, n] = variances(s)
 
 
-@kernel(fastmath={"contract", "reassoc", "nsz"})
 def windowed_evidence(a, wa, qa, b, wb, qb, lags, begin, block, least, floor, weight, out):
     """Sum over matches and windows of n/2 log((Var a + Var b + floor) / (Var(a - b) + floor)) at every lag.
 
     Matches count by their ``weight``. Arrays as for :func:`lag_statistics`. Windows are two blocks of ``block`` frames
     long and start every block, counted from frame ``begin`` (K,) of a; the first and last block are windows of their
     own too. Adds to out (W,K), where W = 1 for the sum of all windows, or one row a window; each counts 1/2, since
-    every sample is in two.
+    every sample is in two. The lags are spread over threads.
     """
+    at_once = max(1, SAMPLES_AT_ONCE // max(a.shape[0] * a.shape[2], 1))
+    arrays = a, wa, qa, b, wb, qb, lags, begin, block, least, floor, weight, out
+    for_each(add_evidence, ranges(len(lags), at_once), *arrays)
+
+
+@kernel(fastmath={"contract", "reassoc", "nsz"})
+def add_evidence(first, end, a, wa, qa, b, wb, qb, lags, begin, block, least, floor, weight, out):
+    """:func:`windowed_evidence` of the lags first:end."""
     M, _, Ta = a.shape
     Tb = b.shape[2]
     sums = np.empty((2, 10))
     whole = np.empty(10)
     for m in range(M):
-        for n in range(len(lags)):
+        for n in range(first, end):
             k = lags[n]
-            first, end = max(0, k), min(Ta, Tb + k)
-            blocks = (end - begin[n] + block - 1) // block
+            lowest, highest = max(0, k), min(Ta, Tb + k)
+            blocks = (highest - begin[n] + block - 1) // block
             sums[:] = 0.0
             for j in range(blocks + 1):
                 now, before = sums[j % 2], sums[1 - j % 2]
                 now[:] = 0.0
-                lo, hi = max(first, begin[n] + j * block), min(begin[n] + (j + 1) * block, end)
+                lo, hi = max(lowest, begin[n] + j * block), min(begin[n] + (j + 1) * block, highest)
                 if hi > lo:
                     common_sums(a, wa, qa, b, wb, qb, m, lo, hi, k, now)
                 for q in range(10):

@@ -16,7 +16,7 @@ from ..types.checks import positive
 from ..types.trust import Trust
 from .breaks import find_breaks
 from .peaks import separate_peaks, vertex
-from .signal import Signal
+from .signal import Signal, extent_of
 from .slot import Aligner
 from .spectra import lag_statistics
 
@@ -188,15 +188,14 @@ def evidence(pair: CommonClock, lags: Int[np.ndarray, " K"], weight: Float[np.nd
     def frames(seconds: float) -> int:
         return max(1, round(seconds * pair.fps))
 
-    positions = Signal.of(pair.a), Signal.of(pair.b)
     least = frames(MIN_FRAMES)
-    count, power, residual = statistics(*positions, lags, least)
-    floor, extent = noise_floor(count, power, residual), 0.5 * (positions[0].extent + positions[1].extent)
+    count, power, residual = statistics_by_part(pair, lags, least)
+    floor, extent = noise_floor(count, power, residual), 0.5 * (extent_of(pair.a) + extent_of(pair.b))
     observed = (count > 0).sum(0).astype(float)
     power -= residual
     power *= count
     shared = 0.5 * power.sum(0) / np.maximum(count.sum(0), 1)
-    del count, power, residual, positions  # of long clips, hundreds of megabytes
+    del count, power, residual  # of long clips, hundreds of megabytes
     fast, slow = (velocity_score(pair, lags, frames(half), least, weight) for half in (FAST, SLOW))
     windows = np.where(observed > 0, window_score(pair, lags, fast + slow, floor, weight), -np.inf)
     return Curves(
@@ -243,6 +242,19 @@ def window_score(
     return score
 
 
+def statistics_by_part(
+    pair: CommonClock, lags: Int[np.ndarray, " K"], least: int, half: int | None = None
+) -> tuple[Float[np.ndarray, "M K"], Float[np.ndarray, "M K"], Float[np.ndarray, "M K"]]:
+    """:func:`statistics` of the positions, or of the velocities over ±``half`` frames; of long clips few matches at a
+    time are brought into the form that it reads.
+    """
+    count, power, residual = (np.zeros((len(pair.a), len(lags))) for _ in range(3))
+    for some in blocks(len(pair.a), max(pair.a.shape[1], pair.b.shape[1])):
+        a, b = (Signal.of(x[some] if half is None else velocity(x[some], half)) for x in (pair.a, pair.b))
+        count[some], power[some], residual[some] = statistics(a, b, lags, least)
+    return count, power, residual
+
+
 def statistics(
     a: Signal, b: Signal, lags: Int[np.ndarray, " K"], least: int
 ) -> tuple[Float[np.ndarray, "M K"], Float[np.ndarray, "M K"], Float[np.ndarray, "M K"]]:
@@ -282,10 +294,7 @@ def velocity_score(
     weight: Float[np.ndarray, " M"] | None = None,
 ) -> Float[np.ndarray, " K"]:
     """Mean LLR of the velocities over ±``half`` frames, the matches counted by ``weight`` (mean 1)."""
-    count, power, residual = (np.zeros((len(pair.a), len(lags))) for _ in range(3))
-    for some in blocks(len(pair.a), max(pair.a.shape[1], pair.b.shape[1])):
-        a, b = Signal.of(velocity(pair.a[some], half)), Signal.of(velocity(pair.b[some], half))
-        count[some], power[some], residual[some] = statistics(a, b, lags, least)
+    count, power, residual = statistics_by_part(pair, lags, least, half)
     floor = noise_floor(count, power, residual)
     # in place: of long clips these are the largest arrays
     power += floor

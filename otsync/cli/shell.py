@@ -5,13 +5,15 @@ from __future__ import annotations
 import errno
 import importlib
 import logging
+import os
+import select
 import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
-from typing import Any
+from typing import Any, TextIO
 
 import tyro
 
@@ -85,16 +87,25 @@ def run_command(
             OSError, a package that is not installed) give 2, an interrupt 130.
         interrupted: what an interrupted run leaves behind, in words.
 
-    SIGTERM is an interrupt like Ctrl-C.
+    SIGTERM is an interrupt like Ctrl-C. Where nobody reads standard output any more (``otsync ... | head``), the
+    command ends without a word, with the exit code of programs that SIGPIPE ends.
     """
     try:
-        rest = shared_options(list(sys.argv[1:] if args is None else args))
-        if rest is None:
-            print(f"{prog} {__version__}")
-            return 0
-        command = parsed(prog, commands(), rest, description + SHARED)
-        with ended_like_ctrl_c():
-            return command.run()
+        try:
+            rest = shared_options(list(sys.argv[1:] if args is None else args))
+            if rest is None:
+                print(f"{prog} {__version__}")
+                return 0
+            command = parsed(prog, commands(), rest, description + SHARED)
+            with ended_like_ctrl_c():
+                return command.run()
+        finally:
+            sys.stdout.flush()  # not later, when the interpreter ends and can only complain
+    except BrokenPipeError as error:  # perhaps of another program that we write to
+        if nobody_reads(sys.stdout):
+            leave(sys.stdout)
+            return NOBODY_READS
+        code, said = 2, of_the_system(error)
     except refused as error:
         code, said = 1, str(error)
     except ModuleNotFoundError as error:
@@ -111,6 +122,27 @@ def run_command(
         code, said = 130, f"interrupted; {interrupted}"
     print(f"{prog}: {said}", file=sys.stderr)
     return code
+
+
+NOBODY_READS = 128 + 13
+"""Exit code of a program that SIGPIPE ended, as shells tell it."""
+
+
+def nobody_reads(stream: TextIO) -> bool:
+    """Whether a stream is a pipe whose other end is closed."""
+    try:
+        look = select.poll()
+        look.register(stream.fileno(), 0)
+    except (AttributeError, OSError, ValueError):  # no poll on this system; a stream that is no file
+        return False
+    return any(event & (select.POLLERR | select.POLLHUP) for _, event in look.poll(0))
+
+
+def leave(stream: TextIO) -> None:
+    """What is still to be written to a stream goes nowhere."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, stream.fileno())
+    os.close(nowhere)
 
 
 REMEDIES = {

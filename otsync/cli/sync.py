@@ -8,6 +8,7 @@ from typing import Annotated
 
 import tyro
 
+from ..clocks.common import narrowed
 from ..files.claim import claimed
 from ..io.footage import VIDEO_SUFFIXES
 from ..sync.graph import Graph
@@ -101,7 +102,7 @@ class Sync:
                 f"{videos[0]}: expected one folder that holds all videos, or two and more .npz of tracks; found a "
                 "video file. Put the videos into a folder, and run otsync sync FOLDER."
             )
-        tracks = [TrackSet.load(path) for path in self.tracks]
+        tracks = [narrowed(TrackSet.load(path)) for path in self.tracks]
         names = unique_names(tracks)
         reference = reference_among(names, self.reference)
         known = None if self.truth is None else true_offsets(self.truth, names)

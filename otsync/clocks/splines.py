@@ -75,7 +75,7 @@ class TrackSplines:
         self.n = intervals + DEGREE
         self.jumps = find_jumps(xyz)
         #: (M,n,3) coefficients around each track's own mean, which keeps them small; one block a track
-        self.mean, self.by_track = self._fit(self._joined(xyz), smoothing * max(1.0, 1 / (30 * self.frame)))
+        self.mean, self.by_track = self._fit(xyz, smoothing * max(1.0, 1 / (30 * self.frame)))
 
     def _fit(self, xyz: np.ndarray, penalty: float) -> tuple[np.ndarray, np.ndarray]:
         """(M,3) means, and (M,n,3) coefficients around them. Memory grows with T + n, not with its square."""
@@ -89,9 +89,10 @@ class TrackSplines:
         for part in blocks(count, len(self.times) + self.n):
             seen = self.seen[part]
             weight = seen.astype(float)
-            values = np.where(seen[..., None], xyz[part], 0.0)
+            joined = self._joined(xyz[part], part)
+            values = np.where(seen[..., None], joined, 0.0)
             mean[part] = values.sum(1) / np.maximum(weight.sum(1), 1)[:, None]
-            values = np.where(seen[..., None], xyz[part] - mean[part, None], 0.0)
+            values = np.where(seen[..., None], joined - mean[part, None], 0.0)
             right = (transposed @ values.transpose(1, 0, 2).reshape(len(self.times), -1)).reshape(self.n, -1, 3)
             bands = np.tile(regular, (len(values), 1, 1))
             for d in range(DEGREE + 1):
@@ -184,12 +185,13 @@ class TrackSplines:
         """Positions at ``t``, nan where not supported."""
         return np.where(self.support(t)[..., None], self.value(t), np.nan)
 
-    def _joined(self, xyz: np.ndarray) -> np.ndarray:
-        """Samples with the jumps taken out."""
+    def _joined(self, xyz: np.ndarray, part: slice) -> np.ndarray:
+        """Samples of some tracks with the jumps taken out."""
         jumps = self.jumps
-        if len(jumps):
+        own = (jumps.track >= part.start) & (jumps.track < part.stop)
+        if own.any():
             level = np.zeros_like(xyz)
-            level[jumps.track, jumps.after] = jumps.by
+            level[jumps.track[own] - part.start, jumps.after[own]] = jumps.by[own]
             xyz = xyz - np.cumsum(level, 1)
         return xyz
 

@@ -1,1 +1,1 @@
-"""How numbers are crunched: compiled kernels (jit, simd, quaternions), threads, and evenly spread indices."""
+"""How numbers are crunched: compiled kernels (jit, simd, quaternions), threads, evenly spread indices, and POT."""

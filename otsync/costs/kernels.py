@@ -86,23 +86,17 @@ def curve_distances(A, B, pairs_a, pairs_b, share):
 
 
 @kernel()
-def paired_frame_distances(A, B, pairs_a, pairs_b, at, least):
-    """Mean distance of A[i,t] and B[j,at[t]] (at -1: none) over frames that both see; nan below ``least`` of them."""
-    out = np.full(len(pairs_a), np.nan)
+def add_frame_distances(A, B, pairs_a, pairs_b, total, count):
+    """Adds to total (P,) the distances of A[i,t] and B[j,t] over the frames that both see, and to count (P,) these."""
     for p in range(len(pairs_a)):
         i, j = pairs_a[p], pairs_b[p]
-        total, n = 0.0, 0
         for t in range(A.shape[1]):
-            u = at[t]
-            if u < 0 or np.isnan(A[i, t, 0]) or np.isnan(B[j, u, 0]):
+            if np.isnan(A[i, t, 0]) or np.isnan(B[j, t, 0]):
                 continue
-            total += np.sqrt(
-                (A[i, t, 0] - B[j, u, 0]) ** 2 + (A[i, t, 1] - B[j, u, 1]) ** 2 + (A[i, t, 2] - B[j, u, 2]) ** 2
+            total[p] += np.sqrt(
+                (A[i, t, 0] - B[j, t, 0]) ** 2 + (A[i, t, 1] - B[j, t, 1]) ** 2 + (A[i, t, 2] - B[j, t, 2]) ** 2
             )
-            n += 1
-        if n >= least:
-            out[p] = total / n
-    return out
+            count[p] += 1
 
 
 @kernel()

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 
+from ..compute.indices import blocks
 from ..types import Clock, TrackSet
 from .linear import Cost
 
@@ -51,9 +52,10 @@ class CurveDistance:
     ) -> Float[np.ndarray, " P"]:
         from .kernels import curve_distances
 
-        xa, xb = positions_in_common_frame(a, b)
-        distance = curve_distances(_thinned(xa, self.samples), _thinned(xb, self.samples), i, j, self.share)
-        return capped(distance, self.scale * scene_scale(xa, xb), self.cap)
+        check_common_frame(a, b)
+        paths = (x.positions(frames=_few(x.n_frames, self.samples)) for x in (a, b))
+        distance = curve_distances(*map(np.ascontiguousarray, paths), i, j, self.share)
+        return capped(distance, self.scale * scene_scale(a, b), self.cap)
 
 
 @dataclass(frozen=True)
@@ -76,9 +78,9 @@ class MedianPosition:
     def pairs(
         self, a: TrackSet, b: TrackSet, i: Int[np.ndarray, " P"], j: Int[np.ndarray, " P"]
     ) -> Float[np.ndarray, " P"]:
-        xa, xb = positions_in_common_frame(a, b)
-        distance = np.linalg.norm(_medians(xa)[i] - _medians(xb)[j], axis=1)
-        return capped(distance, self.scale * scene_scale(xa, xb), self.cap)
+        check_common_frame(a, b)
+        distance = np.linalg.norm(_medians(a)[i] - _medians(b)[j], axis=1)
+        return capped(distance, self.scale * scene_scale(a, b), self.cap)
 
 
 @dataclass(frozen=True)
@@ -114,16 +116,21 @@ class SynchronousDistance:
     def pairs(
         self, a: TrackSet, b: TrackSet, i: Int[np.ndarray, " P"], j: Int[np.ndarray, " P"]
     ) -> Float[np.ndarray, " P"]:
-        from .kernels import paired_frame_distances
+        from .kernels import add_frame_distances
 
-        xa, xb = positions_in_common_frame(a, b)
+        check_common_frame(a, b)
         ta, tb = a.times, self.rate * b.times + self.offset
         step = _step(ta, alone=1.0)
         at = np.clip(np.round(np.interp(ta, tb, np.arange(len(tb)))).astype(int), 0, len(tb) - 1)
         at = np.where(np.abs(tb[at] - ta) <= 0.51 * max(step, _step(tb, alone=0.0)), at, -1)
         least = max(2, round(self.min_overlap / step))
-        distance = paired_frame_distances(xa, xb, i, j, at, least)
-        return capped(distance, self.scale * scene_scale(xa, xb), self.cap)
+        total, count = np.zeros(len(i)), np.zeros(len(i))
+        for some in blocks(len(ta), max(len(a), len(b))):
+            known = at[some] >= 0
+            xa, xb = a.positions(frames=np.flatnonzero(known) + some.start), b.positions(frames=at[some][known])
+            add_frame_distances(xa, xb, i, j, total, count)
+        distance = np.where(count >= least, total / np.maximum(count, 1), np.nan)
+        return capped(distance, self.scale * scene_scale(a, b), self.cap)
 
 
 def at_clock(costs: tuple[Cost, ...], clock: Clock) -> tuple[Cost, ...]:
@@ -149,8 +156,8 @@ def all_pairs(cost: Cost, a: TrackSet, b: TrackSet) -> Float[np.ndarray, "Na Nb"
     return cost.pairs(a, b, i, j).reshape(len(a), len(b))
 
 
-def positions_in_common_frame(a: TrackSet, b: TrackSet) -> tuple[np.ndarray, np.ndarray]:
-    """Both sets' positions; ValueError unless both declare the same world frame."""
+def check_common_frame(a: TrackSet, b: TrackSet) -> None:
+    """ValueError unless both sets have positions and declare the same world frame."""
     a.check("a")
     b.check("b")
     if a.frame is None or a.frame != b.frame:
@@ -158,14 +165,13 @@ def positions_in_common_frame(a: TrackSet, b: TrackSet) -> tuple[np.ndarray, np.
             f"frame: expected the same world frame in a and b to compare positions; found {a.frame!r} and {b.frame!r}. "
             "Declare it (TrackSet.frame) when the cameras are calibrated together, or use costs without positions."
         )
-    return a.positions(), b.positions()
 
 
-def scene_scale(xa: Float[np.ndarray, "Na T 3"], xb: Float[np.ndarray, "Nb T 3"]) -> float:
+def scene_scale(a: TrackSet, b: TrackSet) -> float:
     """Median distance between the median positions of all tracks: the size of the scene, in its own unit."""
     from scipy.spatial.distance import pdist
 
-    medians = np.concatenate([_medians(xa), _medians(xb)])
+    medians = np.concatenate([_medians(a), _medians(b)])
     medians = medians[np.isfinite(medians[:, 0])]
     medians = medians[:: max(1, len(medians) // SCALE_SAMPLES)]
     distance = pdist(medians) if len(medians) > 1 else np.zeros(0)
@@ -177,16 +183,17 @@ def _step(times: Float[np.ndarray, " T"], alone: float) -> float:
     return float(np.median(np.diff(times))) if len(times) > 1 else alone
 
 
-def _medians(x: Float[np.ndarray, "N T 3"]) -> Float[np.ndarray, "N 3"]:
-    out = np.full((len(x), 3), np.nan)
-    for n, track in enumerate(x):
+def _medians(tracks: TrackSet) -> Float[np.ndarray, "N 3"]:
+    out = np.full((len(tracks), 3), np.nan)
+    for n in range(len(tracks)):
+        track = tracks.positions(n)
         seen = track[np.isfinite(track[:, 0])]
         if len(seen):
             out[n] = np.median(seen, 0)
     return out
 
 
-def _thinned(x: Float[np.ndarray, "N T 3"], samples: int) -> Float[np.ndarray, "N S 3"]:
+def _few(frames: int, samples: int) -> slice:
     """Every n-th frame, so that a path has at most ``samples``."""
-    step = max(1, -(-x.shape[1] // samples))
-    return np.ascontiguousarray(x[:, step // 2 :: step])
+    step = max(1, -(-frames // samples))
+    return slice(step // 2, None, step)

@@ -62,7 +62,7 @@ def checked(value: Any, kind: type[T], where: str | os.PathLike[str], at: str = 
     ValueError names the file, the field, what was expected and what was found: of a field that there is not the nearest
     one that there is.
     """
-    _all_on_one_line(value, where, "" if at == "$" else at)  # first: msgspec stumbles over what cannot be encoded
+    all_on_one_line(value, where, "" if at == "$" else at)  # first: msgspec stumbles over what cannot be encoded
     try:
         return msgspec.convert(value, kind, strict=True)
     except msgspec.ValidationError as error:
@@ -100,7 +100,7 @@ def on_one_line(text: str, field: str) -> None:
         )
 
 
-def _all_on_one_line(value: Any, where: str | os.PathLike[str], at: str) -> None:
+def all_on_one_line(value: Any, where: str | os.PathLike[str], at: str) -> None:
     """The same of every text and key of a document, however deep."""
     left = [(value, at)]
     while left:

@@ -74,7 +74,8 @@ def read_depth(path: str | os.PathLike[str], scale: float) -> Float[np.ndarray, 
     values = _array(path, "depth") if suffix in (".npy", ".npz") else np.asarray(_decode(path))
     if values.ndim != 2 or values.dtype.kind not in "iuf":
         raise ValueError(f"{path}: expected a depth map (H,W) of numbers; found {values.dtype} of {values.shape}.")
-    depth = values.astype(np.float32) * np.float32(scale)
+    with np.errstate(invalid="ignore", over="ignore"):  # what is no number is unknown
+        depth = values.astype(np.float32) * np.float32(scale)
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from ..files.arrays import read_json
 from ..files.strict import in_words
+from ..types import Camera
 from .document import document
 
 METAS = ("train_meta.json", "test_meta.json")
@@ -43,6 +44,13 @@ class Panoptic:
                     raise ValueError(
                         f"{folder / name}: expected w, h, fn, k, w2c and cam_id; {in_words(error)}. Mend the file."
                     ) from None
+                names = [video["name"] for video in videos]
+                twice = sorted({n for n in names if names.count(n) > 1})
+                if twice:
+                    raise ValueError(
+                        f"{folder / name}: cam_id: expected every camera once; found {', '.join(twice)} again. "
+                        "Mend the file."
+                    )
         videos.sort(key=lambda v: (len(v["name"]), v["name"]))
         assumed = f"the layout does not store the capture rate; {rate:g} fps assumed"
         return document(videos, "panoptic", notes=[assumed] if fps is None else [])
@@ -60,6 +68,10 @@ def _videos(meta: dict[str, Any], folder: Path, fps: float) -> list[dict[str, An
         static = bool(np.ptp(poses, 0).max() == 0)
         if np.ptp(k[:, c], 0).max() > 0:
             raise ValueError(f"camera {cam}: expected one K for all frames; it changes (zoom is not supported)")
+        try:
+            Camera(k[0, c], poses[0] if static else poses, int(meta["w"]), int(meta["h"]))
+        except ValueError as error:
+            raise ValueError(f"camera {cam}: {error}") from None
         entry: dict[str, Any] = {
             "name": cam,
             "frames": _pattern([str(row[c]) for row in fn], folder / "ims", "ims"),

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from ..compute.pot import pot
 from ..costs.linear import Cosine, Cost
 from ..types import Matches, TrackSet
 from ..types.checks import positive
@@ -58,8 +59,7 @@ class OptimalTransport(Matcher):
         positive("OptimalTransport.reg", self.reg, zero=True)
 
     def __call__(self, a: TrackSet, b: TrackSet) -> Matches:
-        import ot
-
+        ot = pot()
         M = linear_cost(self.costs, a, b)
         if is_flat(M):
             return no_information(M)
@@ -100,8 +100,7 @@ class FusedGromovWasserstein(StructuralMatcher):
         positive("FusedGromovWasserstein.tol", self.tol)
 
     def __call__(self, a: TrackSet, b: TrackSet) -> Matches:
-        import ot
-
+        ot = pot()
         problem = Problem.of(a, b, self.costs, self.alpha)
         if problem.flat:
             return no_information(problem.M)
@@ -198,8 +197,7 @@ class PartialFGW(StructuralMatcher):
         positive("PartialFGW.tol", self.tol)
 
     def __call__(self, a: TrackSet, b: TrackSet) -> Matches:
-        import ot
-
+        ot = pot()
         problem = Problem.of(a, b, self.costs, self.alpha)
         if problem.flat:
             return no_information(problem.M)

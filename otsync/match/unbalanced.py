@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from ..compute.pot import pot
 from ..costs.linear import Cosine, Cost
 from ..costs.positions import at_clock
 from ..types import Clock, Matches, Status, TrackSet
@@ -124,8 +125,7 @@ class UnbalancedFGW(StructuralMatcher):
         check_partners("UnbalancedFGW", self.partners, self.top)
 
     def __call__(self, a: TrackSet, b: TrackSet) -> Matches:
-        import ot
-
+        ot = pot()
         problem = Problem.of(a, b, self.costs, self.alpha)
         if problem.flat:
             return no_information(problem.M)
@@ -194,8 +194,7 @@ class SemirelaxedFGW(StructuralMatcher):
     def _solve(
         self, M: np.ndarray, Ca: np.ndarray, Cb: np.ndarray, p: np.ndarray, weight: float
     ) -> tuple[np.ndarray, int]:
-        import ot
-
+        ot = pot()
         plan, log = ot.gromov.semirelaxed_fused_gromov_wasserstein(
             np.ascontiguousarray(M),
             Ca,
@@ -233,8 +232,7 @@ def relaxed_plan(
     The least cost is subtracted first, in the kernel only: it multiplies the plan by one factor, put back afterwards,
     and keeps the kernel from vanishing at small ε.
     """
-    import ot
-
+    ot = pot()
     least = float(M.min())
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what they warn of is checked below

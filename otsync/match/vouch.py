@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from ..clocks.common import readable
 from ..compute.indices import evenly
 from ..costs.linear import Cosine, Cost, binary_scale, total_cost, track_distance
 from ..types import Clock, Matches, Status, TrackSet
@@ -32,6 +33,9 @@ UNTOLD = 0.6
 
 FEW = 4
 """Matches below which nothing vouches for them: any three tracks resemble some other three."""
+
+CHANCE = 256
+"""Tracks of each video that random pairs are made of, at most."""
 
 SAMPLE, RIVALS = 128, 400
 """Matches, and tracks of b, that a second answer is looked for among."""
@@ -142,7 +146,7 @@ class Likeness:
         if chance is None:
             return cls(None, None, others)
         matched = sum((c.weight * c.pairs(a, b, i, j) for c in costs), start=np.zeros(len(i)))
-        return cls(matched / chance, total_cost(costs, a.take(i), b.take(others)) / chance, others)
+        return cls(matched / chance, total_cost(costs, a.take(i), taken(b, others)) / chance, others)
 
     @property
     def relative(self) -> float:
@@ -159,11 +163,16 @@ def relative_cost(
 
 def random_cost(costs: tuple[Cost, ...], a: TrackSet, b: TrackSet) -> float | None:
     """Mean cost of random pairs; None where all cost the same."""
-    rng = np.random.default_rng(0)
-    M = total_cost(costs, a.take(rng.permutation(len(a))[:256]), b.take(rng.permutation(len(b))[:256]))
+    rng, many = np.random.default_rng(0), readable(CHANCE, a, b)
+    M = total_cost(costs, a.take(rng.permutation(len(a))[:many]), b.take(rng.permutation(len(b))[:many]))
     if np.ptp(M) <= 1e-9 * max(1.0, float(np.abs(M).max())) or M.mean() <= 0:
         return None
     return float(M.mean())
+
+
+def taken(tracks: TrackSet, index: Int[np.ndarray, " n"]) -> TrackSet:
+    """The tracks at ``index``; all of them without a copy."""
+    return tracks if np.array_equal(index, np.arange(len(tracks))) else tracks.take(index)
 
 
 def unlike(a: TrackSet, b: TrackSet, i: Int[np.ndarray, " H"], j: Int[np.ndarray, " H"], features: Likeness) -> bool:
@@ -203,7 +212,9 @@ def one_of_several(
         return False
     some = np.sort(np.random.default_rng(len(i)).permutation(len(i))[:SAMPLE])
     i, j = i[some], j[some]
-    away = track_distance(b.xyz[j], b.seen[j], b.xyz[features.others], b.seen[features.others]).astype(float)
+    rest = taken(b, features.others)
+    assert rest.xyz is not None
+    away = track_distance(b.xyz[j], b.seen[j], rest.xyz, rest.seen).astype(float)
     if not (away > 0).any():
         return False
     unit = float(np.median(away[away > 0]))
@@ -234,8 +245,10 @@ def one_of_several(
 def profiles(tracks: TrackSet, index: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n Q"]:
     """Quantiles of the distances from each track to the others: the same wherever an isometry puts it."""
     assert tracks.xyz is not None
-    pool = evenly(len(tracks), RIVALS)
-    D = track_distance(tracks.xyz[index], tracks.seen[index], tracks.xyz[pool], tracks.seen[pool]).astype(float)
+    pool = taken(tracks, evenly(len(tracks), RIVALS))
+    own = taken(tracks, index)
+    assert own.xyz is not None and pool.xyz is not None
+    D = track_distance(own.xyz, own.seen, pool.xyz, pool.seen).astype(float)
     known = np.isfinite(D)
     out = np.full((len(index), len(QUANTILES)), np.nan)
     if known.any(1).any():

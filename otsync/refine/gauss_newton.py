@@ -7,6 +7,7 @@ sign of the offset and changes nothing else.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +17,7 @@ from scipy.special import stdtrit
 
 from ..clocks.splines import TrackSplines
 from ..compute.indices import blocks
+from ..compute.threads import for_each
 from ..types import Clock
 
 ROBUST = 2.0
@@ -60,7 +62,7 @@ class Side:
             values there, (M,T,3).
         other: curves of the other video.
         lo, hi: (T,) the frames within the detrending window of each frame, lo inclusive, hi exclusive.
-        forward: whether these are a's frames.
+        forward: whether these are a's frames. seen: where the curves are known at these frames.
     """
 
     own: TrackSplines
@@ -70,6 +72,7 @@ class Side:
     lo: Int[np.ndarray, " T"]
     hi: Int[np.ndarray, " T"]
     forward: bool
+    seen: Bool[np.ndarray, "M T"]
 
     @classmethod
     def of(
@@ -81,7 +84,7 @@ class Side:
         t = own.times[first:last]
         lo = np.searchsorted(t, t - window - slack)
         hi = np.searchsorted(t, t + window + slack, side="right")
-        return cls(own, t, own.joined(t), other, lo, hi, forward)
+        return cls(own, t, own.joined(t), other, lo, hi, forward, own.support(t))
 
     def there(self, clock: Clock) -> Float[np.ndarray, " T"]:
         """The moments of the other video that this one's frames show."""
@@ -249,16 +252,17 @@ def _linearise(
     reads = [Read.of(side, clock, centre) for side in sides]
     # of long clips few matches at a time: once for the size of residuals, which weights depend on, once for the sums
     parts = list(blocks(M, 2 * max(len(side.times) for side in sides)))
-    kept: list[Any] = []
-    size: list[list[np.ndarray]] = [[] for _ in sides]
-    used: list[list[np.ndarray]] = [[] for _ in sides]
-    for part in parts:
-        found = [read.residuals(part, P) for read in reads]
-        for n, (rr, _, _, ok) in enumerate(found):
-            size[n].append(np.sqrt(rr))
-            used[n].append(ok)
-        kept = [found] if len(parts) == 1 else []
-    sizes, known = [np.concatenate(x) for x in size], [np.concatenate(x) for x in used]
+    kept: list[Any] = [None, None]
+    sizes, known = ([np.empty((M, len(side.times)), kind) for side in sides] for kind in (float, bool))
+
+    def measure(n: int) -> None:
+        for part in parts:
+            found = reads[n].residuals(part, P)
+            np.sqrt(found[0], out=sizes[n][part])
+            known[n][part] = found[3]
+            kept[n] = found if len(parts) == 1 else None
+
+    of_both(measure, threads=len(parts) > 1)
     seen = np.sum([ok.sum(1) for ok in known], axis=0)
     if not seen.any():
         return None
@@ -271,26 +275,47 @@ def _linearise(
         weight *= prior
     start = max(sides[0].times[0], float(clock.world(sides[1].times[0])))
     block = [read.blocks_from(start, clock) for read in reads]
-    count = max(int(b.max(initial=0)) for b in block) + 1
-    H_match, g_match = np.zeros((M, P, P)), np.zeros((M, P))
-    H_time, g_time = np.zeros((count, P, P)), np.zeros((count, P))
-    speed = 0.0
-    for part in parts:
-        found = kept[0] if kept else [read.residuals(part, P) for read in reads]
-        for n, (_, g, h, _) in enumerate(found):
+    H_match, g_match = np.zeros((2, M, P, P)), np.zeros((2, M, P))
+    H_frame, g_frame = ([np.zeros((len(side.times), *shape)) for side in sides] for shape in ((P, P), (P,)))
+    speed = np.zeros((len(parts), 2))
+
+    def gather(n: int) -> None:
+        for k, part in enumerate(parts):
+            _, g, h, _ = kept[n] or reads[n].residuals(part, P)
             at_most = max(ROBUST * noise, 1e-300)
             w = np.where(known[n][part], weight[part, None] / (1 + (sizes[n][part] / at_most) ** 2), 0.0)
-            H_match[part] += np.einsum("pqmt,mt->mpq", h, w)
-            g_match[part] += np.einsum("pmt,mt->mp", g, w)
-            np.add.at(H_time, block[n], np.einsum("pqmt,mt->tpq", h, w))
-            np.add.at(g_time, block[n], np.einsum("pmt,mt->tp", g, w))
-            speed += float(weight[part] @ h[0, 0].sum(1))
+            H_match[n, part] = np.einsum("pqmt,mt->mpq", h, w)
+            g_match[n, part] = np.einsum("pmt,mt->mp", g, w)
+            H_frame[n] += np.einsum("pqmt,mt->tpq", h, w)
+            g_frame[n] += np.einsum("pmt,mt->tp", g, w)
+            speed[k, n] = weight[part] @ h[0, 0].sum(1)
+
+    of_both(gather, threads=len(parts) > 1)
+    H_match, g_match, moving = H_match.sum(0), g_match.sum(0), sum(speed.ravel().tolist())
+    H_time, g_time = (added(np.concatenate(block), np.concatenate(x)) for x in (H_frame, g_frame))
     H_group, g_group = np.zeros((GROUPS, P, P)), np.zeros((GROUPS, P))
     group = neighbours(sides[0].own.mean + sides[1].own.mean, GROUPS)
     np.add.at(H_group, group, H_match)
     np.add.at(g_group, group, g_match)
-    blur = np.sqrt(float(weight @ squares) / speed) if speed > 0 else np.inf
+    blur = np.sqrt(float(weight @ squares) / moving) if moving > 0 else np.inf
     return System(H_match.sum(0), g_match.sum(0), (H_group, g_group), (H_time, g_time), weight, float(blur))
+
+
+def of_both(work: Callable[[int], None], *, threads: bool) -> None:
+    """Do ``work`` for both sides, each on a thread of its own where that is worth it."""
+    if threads:
+        for_each(work, [(0,), (1,)])
+    else:
+        work(0)
+        work(1)
+
+
+def added(index: Int[np.ndarray, " S"], values: np.ndarray) -> np.ndarray:
+    """The sums of the rows of ``values`` (S,...) with the same index, in their order."""
+    count = int(index.max(initial=0)) + 1
+    flat = values.reshape(len(values), -1)
+    sums = np.stack([np.bincount(index, column, count) for column in flat.T], 1)
+    return sums.reshape(count, *values.shape[1:])
 
 
 @dataclass(frozen=True, eq=False)
@@ -310,18 +335,18 @@ class Read:
         # d(other curve's argument)/d offset: t_b = (t_a - offset) / rate from a's frames, t_a = rate t_b + offset from
         # b's
         sign = 1 / clock.rate if side.forward else -1.0
-        ok = side.own.support(side.times) & side.other.support(there)
+        ok = side.seen & side.other.support(there)
         return cls(side, there, side.time_b(clock) - centre, (first, value, sign * slope), ok)
 
     def residuals(self, part: slice, P: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """|R|² (m,T), J·R (P,m,T), J·J (P,P,m,T) of some matches, and where they count."""
-        from . import kernels
+        from .kernels import shift_residuals
 
         side = self.side
         ok = np.ascontiguousarray(self.ok[part])
         rr, g, h = (np.empty((*leading, *ok.shape)) for leading in ((), (P,), (P, P)))
         least = MIN_FRAMES / side.own.frame
-        kernels.shift_residuals(
+        shift_residuals(
             side.at[part],
             side.other.by_track[part],
             side.other.mean[part],

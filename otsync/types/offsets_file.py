@@ -11,7 +11,7 @@ import numpy as np
 from msgspec import UNSET, Meta, UnsetType
 
 from ..files.arrays import read_json
-from ..files.strict import Document, Name, Text, checked
+from ..files.strict import Document, Name, Text, all_on_one_line, checked
 from .clock import Break
 from .similarity import Similarity
 from .status import Status, gravest, in_order
@@ -119,6 +119,7 @@ def read_offsets(path: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[tup
             f"{path}: expected version {VERSION}; found {data.get('version')!r}. Read it with the otsync release "
             "that wrote it, or write it anew with this one."
         )
+    all_on_one_line(data, path, "")  # first: errors show names as they are
     try:
         fields = _fields(data)
     except (KeyError, TypeError, IndexError, AttributeError, OverflowError) as error:

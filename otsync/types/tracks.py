@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ..compute.indices import blocks
 from ..files.arrays import MAX_BYTES, read_npz, write_npz
 from ..files.strict import nearest, on_one_line, shown
 from . import drawing
@@ -17,9 +18,12 @@ from .drawing import short
 
 FORMAT, VERSION = "otsync.tracks", 1
 
+CAMERA = ("camera_K", "camera_w2c", "camera_width", "camera_height")
+"""What a file tells of a camera, at least."""
+
 ARRAYS = (
     *("format", "version", "name", "frame", "xyz", "visible", "features", "fps", "timestamps", "uv", "sigma", "labels"),
-    *("camera_K", "camera_w2c", "camera_width", "camera_height", "camera_distortion", "camera_readout"),
+    *(*CAMERA, "camera_distortion", "camera_readout"),
 )
 """All that a file may hold."""
 
@@ -152,8 +156,7 @@ class TrackSet:
             value = getattr(self, field)
             if value is None:
                 continue
-            finite = np.isfinite(value)
-            bad = self.seen & ~(finite.all(-1) if value.ndim == 3 else finite)
+            bad = self._unfit(value)
             if bad.any():
                 n, t = np.argwhere(bad)[0]
                 raise ValueError(
@@ -166,6 +169,15 @@ class TrackSet:
                     f"{name}.features: expected (N,D) descriptors; found none. Add them, or match by hand."
                 )
             _check_features(self.features, name)
+
+    def _unfit(self, value: np.ndarray) -> Bool[np.ndarray, "N T"]:
+        """Which visible samples of a field are not finite. Of long clips few tracks at a time are looked at."""
+        bad = np.zeros_like(self.seen)
+        for some in blocks(len(bad), self.n_frames):
+            finite = np.isfinite(value[some])
+            for known in np.moveaxis(finite, -1, 0) if value.ndim == 3 else [finite]:
+                bad[some] |= ~known
+        return np.logical_and(bad, self.seen, out=bad)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write a versioned ``.npz`` without pickle, atomically."""
@@ -193,7 +205,8 @@ class TrackSet:
         version = data.get("version")
         if version is None or version.shape != () or version.dtype.kind not in "iu" or int(version) != VERSION:
             raise ValueError(
-                f"{path}: expected version {VERSION}; found {version}. Read it with the otsync release that wrote it."
+                f"{path}: expected version {VERSION}; found {shown(str(version))}. Read it with the otsync release "
+                "that wrote it."
             )
         try:
             for name in data:
@@ -205,9 +218,12 @@ class TrackSet:
                         "it out."
                     )
             camera = None
-            if "camera_K" in data:
+            given = [f for f in ARRAYS if f.startswith("camera_") and f in data]
+            if given:
+                for field in (f for f in CAMERA if f not in data):
+                    raise ValueError(f"{field}: expected an array beside {given[0]}; found none. Save it again.")
                 parts: dict[str, Any] = {}
-                for field in (f for f in ARRAYS if f.startswith("camera_") and f in data):
+                for field in given:
                     kinds = {"camera_width": "iu", "camera_height": "iu", "camera_readout": "iuf"}.get(field)
                     value = _numbers(data[field], field) if kinds is None else _scalar(data, field, kinds)
                     parts[field.removeprefix("camera_")] = value

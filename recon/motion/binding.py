@@ -69,17 +69,17 @@ class Binding:
         KeyError or ValueError for what is missing or unsound. Only arrays are checked: a binding made here is sound.
         """
         times = numbers(arrays, "binding_times", (None,), (np.float64,))
-        rest = indices(arrays, "binding_rest", (None,), len(times))
-        weights = numbers(arrays, "binding_weights", (len(rest), NODES), kind)
+        rest = indices(arrays, "binding_rest", (None,), len(times), like="binding_times")
+        weights = numbers(arrays, "binding_weights", (len(rest), NODES), kind, like="binding_rest and knots")
         if not (weights >= 0).all():
             raise ValueError(f"binding_weights: expected weights >= 0; found {float(weights.min())}.")
         return cls(
             rest,
-            indices(arrays, "binding_nodes", (len(rest), NODES), n_nodes),
+            indices(arrays, "binding_nodes", (len(rest), NODES), n_nodes, like="binding_rest and knots"),
             weights,
             times,
-            numbers(arrays, "binding_positions", (len(times), n_nodes, 3), kind),
-            numbers(arrays, "binding_quats", (len(times), n_nodes, 4), kind),
+            numbers(arrays, "binding_positions", (len(times), n_nodes, 3), kind, like="binding_times and knots"),
+            numbers(arrays, "binding_quats", (len(times), n_nodes, 4), kind, like="binding_times and knots"),
         )
 
     def __len__(self) -> int:

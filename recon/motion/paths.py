@@ -42,7 +42,7 @@ class Path(ABC):
             )
         if not WINDOW <= self.count <= MAX_KNOTS:
             raise ValueError(
-                f"count: expected {WINDOW}..{MAX_KNOTS} knots; found {self.count}. Check the offsets (in seconds) of "
+                f"count: expected {WINDOW}..{MAX_KNOTS} knots; found {self.count:g}. Check the offsets (in seconds) of "
                 "the videos, or set a wider spacing."
             )
 
@@ -196,4 +196,7 @@ def path_from_arrays(arrays: Mapping[str, np.ndarray]) -> Path:
         raise ValueError(f"path: expected one of {sorted(kinds)}; found {name!r}.")
     if count != int(count):
         raise ValueError(f"path_knots: expected a whole number of knots; found {count}.")
-    return kinds[name](start, spacing, int(count))
+    try:
+        return kinds[name](start, spacing, int(count))
+    except ValueError as error:
+        raise ValueError(f"path_knots: {error}") from None

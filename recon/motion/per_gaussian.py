@@ -140,10 +140,14 @@ class PerGaussian:
         """The motion whose :meth:`arrays` these are. ValueError where one is missing, unsound or does not fit."""
         try:
             path = path_from_arrays(arrays)
-            knots = numbers(arrays, "own_knots", (path.count, None, 3))
+            knots = numbers(arrays, "own_knots", (path.count, None, 3), like="path_knots")
             n, kind = knots.shape[1], (np.asarray(arrays["own_knots"]).dtype.type,)
-            quats = numbers(arrays, "own_quats", (path.count, n, 4), kind) if "own_quats" in arrays else None
-            near = indices(arrays, "near", (n, None), n) if "near" in arrays else None
+            quats = (
+                numbers(arrays, "own_quats", (path.count, n, 4), kind, like="own_knots")
+                if "own_quats" in arrays
+                else None
+            )
+            near = indices(arrays, "near", (n, None), n, like="own_knots") if "near" in arrays else None
             return cls(path, knots, quats, near)
         except KeyError as error:
             raise ValueError(f"arrays: expected those of a motion per Gaussian; found no {error}.") from None

@@ -240,23 +240,23 @@ class Scaffold:
         """The scaffold whose :meth:`arrays` these are. ValueError where one is missing, unsound or does not fit."""
         try:
             path = path_from_arrays(arrays)
-            knots = numbers(arrays, "knots", (path.count, None, 3))
+            knots = numbers(arrays, "knots", (path.count, None, 3), like="path_knots")
             m, kind = knots.shape[1], (np.asarray(arrays["knots"]).dtype.type,)  # kernels take one precision
-            edges = indices(arrays, "edges", (m, None), m)
+            edges = indices(arrays, "edges", (m, None), m, like="knots")
             clock = offsets = rates = None
             if "offsets" in arrays:
                 offsets = numbers(arrays, "offsets", (None,), (np.float64,))
-                rates = numbers(arrays, "rates", offsets.shape, (np.float64,))
+                rates = numbers(arrays, "rates", offsets.shape, (np.float64,), like="offsets")
                 if not (rates > 0).all():
                     raise ValueError(f"rates: expected numbers > 0; found {rates.tolist()}.")
             if "clock" in arrays:
-                clock = indices(arrays, "clock", (m,), 0 if offsets is None else len(offsets))
+                clock = indices(arrays, "clock", (m,), 0 if offsets is None else len(offsets), like="knots and offsets")
             return cls(
                 path,
                 knots=knots,
-                knot_quats=numbers(arrays, "knot_quats", (path.count, m, 4), kind),
+                knot_quats=numbers(arrays, "knot_quats", (path.count, m, 4), kind, like="path_knots and knots"),
                 edges=edges,
-                edge_weights=numbers(arrays, "edge_weights", edges.shape, kind),
+                edge_weights=numbers(arrays, "edge_weights", edges.shape, kind, like="edges and knots"),
                 unit=scalar(arrays, "unit"),
                 binding=Binding.from_arrays(arrays, m, kind),
                 clock=clock,

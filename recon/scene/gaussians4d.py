@@ -235,6 +235,7 @@ def _gaussians(arrays: Mapping[str, np.ndarray], part: str) -> Gaussians:
     names = [f"{part}.{f.name}" for f in fields(Gaussians)]
     means, *others = (numbers(arrays, n, (None,) * np.ndim(arrays[n])) for n in names)
     gaussians = _named(part, lambda: Gaussians(means, *others))
-    if any(x.dtype != means.dtype for x in others):
-        raise ValueError(f"{part}: expected arrays of one precision; found {[str(x.dtype) for x in (means, *others)]}.")
+    for name, x in zip(names[1:], others, strict=True):
+        if x.dtype != means.dtype:
+            raise ValueError(f"{name}: expected {means.dtype} as {names[0]} has; found {x.dtype}. Save both alike.")
     return gaussians

@@ -186,9 +186,9 @@ BREAKS = (
     ),
     Break(
         "costs-mean-over-all-frames",
-        "otsync/costs/kernels.py",
-        "out[p] = total / n",
-        "out[p] = total / A.shape[1]",
+        "otsync/costs/positions.py",
+        "total / np.maximum(count, 1), np.nan)",
+        "total / len(ta), np.nan)",
         POSITIONS,
         "the distance at equal times is divided by all frames instead of the common ones",
     ),

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from ...compute.pot import pot
+
 LP_PIVOTS = 10_000_000
 
 
@@ -31,8 +33,7 @@ class AnchorProblem:
 
     def solve(self, mass: float, start: Float[np.ndarray, "na nb"] | None) -> Float[np.ndarray, "na nb"]:
         """A stationary partial plan from ``start`` (None: the product plan)."""
-        import ot
-
+        ot = pot()
         p, q = (np.full(n, 1 / n) for n in self.M.shape)
         weight = 2 / (2 + self.alpha)
         # see PartialFGW: at fixed mass a constant changes no minimiser, and keeps POT's dummies apart
@@ -57,8 +58,7 @@ class AnchorProblem:
 
     def features_only(self, mass: float) -> Float[np.ndarray, "na nb"]:
         """The partial plan of M alone: the second start."""
-        import ot
-
+        ot = pot()
         p, q = (np.full(n, 1 / n) for n in self.M.shape)
         # POT asserts marginals of a start to the last bit
         return (1 - 1e-9) * ot.partial.partial_wasserstein(p, q, self.M + 1.0, m=mass)

@@ -256,6 +256,28 @@ def test_version_help_and_unknown_commands(capsys):
         assert stop.value.code == 2
 
 
+@pytest.mark.parametrize("args", [["--version"], ["--help"], ["bench", "trust", "--help"]], ids=" ".join)
+def test_a_reader_that_has_gone_ends_a_command_without_a_word(args):
+    """As in ``otsync bench trust --help | head -5``, once head is done."""
+    reads, writes = os.pipe()
+    os.close(reads)
+    try:
+        command = [sys.executable, "-m", "otsync.cli", *args]
+        done = subprocess.run(command, cwd=ROOT, stdout=writes, stderr=subprocess.PIPE, text=True, timeout=3600)
+    finally:
+        os.close(writes)
+    assert (done.returncode, done.stderr) == (128 + signal.SIGPIPE, "")
+
+
+def test_a_pipe_to_another_program_that_breaks_is_told(monkeypatch, capsys):
+    def breaks(self) -> int:
+        raise BrokenPipeError(errno.EPIPE, os.strerror(errno.EPIPE))
+
+    monkeypatch.setattr("otsync.cli.match.Match.run", breaks)
+    assert main(["match", "a.npz", "b.npz"]) == 2
+    assert "Broken pipe" in capsys.readouterr().err
+
+
 def test_no_progress_bar_when_the_output_is_no_terminal(world, tmp_path):
     two = sorted(world.glob("*.npz"))[:2]
     done = shell("sync", *map(str, two), "--out", str(tmp_path))

@@ -21,7 +21,7 @@ def test_the_distance_at_equal_times_is_the_mean_over_the_frames_that_both_see(l
     seen_b[3, 5:] = False  # shares less than is asked for
     a, b = (TrackSet(x, seen, fps=30, frame="w") for x, seen in ((xa, seen_a), (xb, seen_b)))
     found = SynchronousDistance(late / 30, scale=1.0, cap=1e9, min_overlap=10 / 30).matrix(a, b)
-    unit = scene_scale(a.positions(), b.positions())
+    unit = scene_scale(a, b)
     k = np.arange(max(0, -late), min(30, 40 - late))
     for i in range(4):
         for j in range(5):

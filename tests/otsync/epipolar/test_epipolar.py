@@ -235,7 +235,7 @@ def test_curve_distance_against_brute_force():
     seen = rng.random((4, 30)) < 0.7
     a, b = lifted(xa, visible=seen), lifted(xb)
     cost = CurveDistance(share=1.0, cap=1e9, samples=100, scale=1.0).matrix(a, b)
-    unit = scene_scale(a.positions(), b.positions())
+    unit = scene_scale(a, b)
     for i in range(4):
         for j in range(5):
             d = np.linalg.norm(xa[i, seen[i]][:, None] - xb[j][None], axis=2)
