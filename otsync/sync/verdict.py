@@ -41,7 +41,7 @@ CAPTURED = 3.0 * FRAME
 SHARED = 0.35
 """Share of a pair's variance that its two videos have in all their pairs. Of the answers to worlds of four and eight
 videos, mid and hard (37 worlds each, seeds 620-644), 69 to 73 % lie within one sigma with .2, 71 to 75 % with .3, 73 to
-79 % with .4, 75 to 82 % with .5. Recordings share more than simulated tracks: 80 % with .25 (basketball, with depth)."""
+79 % with .4, 75 to 82 % with .5. Recordings share more than simulated tracks: 80 % with .25 (basketball with depth)."""
 
 ROUNDS = 2
 
