@@ -113,6 +113,8 @@ REFINER_OPTIONS = slot("refiner", "SplineRefine", windows="0.3 0.2", smoothing=3
         "correlation": "2",
         "blur": "-1",
         "wander": "-9",
+        "unsteady": "-1",
+        "untold": "-1",
         "overlap": "1e9",
         "matches": "1e9",
     }.items()
@@ -144,6 +146,8 @@ NOT_READ = {
             "correlation",
             "blur",
             "wander",
+            "unsteady",
+            "untold",
             "overlap",
             "matches",
             "disagreement",
@@ -154,7 +158,7 @@ NOT_READ = {
     },
     **{
         f"{SCAN}.trust.{name}": "aligner"
-        for name in ("moved", "spread", "correlation", "blur", "wander", "rate_sigmas")
+        for name in ("moved", "spread", "correlation", "blur", "wander", "unsteady", "untold", "rate_sigmas")
     },
     **{f"{FIT}.trust.{name}": "refiner" for name in ("disagreement", "alias", "motion", "rate_gain")},
 }
