@@ -123,7 +123,27 @@ def prior(option: str) -> Any:
 
 
 @dataclass(frozen=True)
-class RecordingOptions:
+class PriorOptions:
+    """What finds masks and tracks in the images."""
+
+    masks: prior("masks") = None
+    """What moves, where the scene has no masks."""
+    points: prior("points") = None
+    """The tracker of points."""
+    flow: prior("flow") = None
+    """Optical flow that the tracker follows."""
+    width: int | None = None
+    """Pixels of width that videos are tracked at; default: 640. More of it sees smaller things, and takes longer."""
+
+    def priors(self) -> dict[str, Any]:
+        """Those that were named, as the shell spells them: arguments of ``stages_from``."""
+        from ..recordings.stages import PRIORS
+
+        return {n: value for n in (*PRIORS, "width") if (value := getattr(self, n, None)) is not None}
+
+
+@dataclass(frozen=True)
+class RecordingOptions(PriorOptions):
     """How ``otsync sync`` treats a recording."""
 
     route: Literal["auto", "tracks", "epipolar", "stereo"] = "auto"
@@ -134,19 +154,11 @@ class RecordingOptions:
     """Folder where stages are kept; default: stages in --out."""
     allow_outside: bool = False
     """Let the scene name files outside its folder."""
-    masks: prior("masks") = None
-    """What moves, where the scene has no masks."""
-    points: prior("points") = None
-    """The tracker of points."""
-    flow: prior("flow") = None
-    """Optical flow that the tracker follows."""
     features: prior("features") = None
     """What describes a track."""
     selection: Annotated[str | None, tyro.conf.arg(metavar="FIELD=VALUE,...")] = None
     """Which tracks are kept: count, min_life (frames at 30 fps), extent and apart (pixels at 640 of width), enough
     (tracks, below which the limits are lowered)."""
-    width: int | None = None
-    """Pixels of width that videos are tracked at; default: 640. More of it sees smaller things, and takes longer."""
     workers: int = 0
     """Threads; 0: one per core."""
 
@@ -154,14 +166,7 @@ class RecordingOptions:
         """The objects of every stage. ValueError names a prior that there is not."""
         from ..recordings.stages import stages_from
 
-        return stages_from(
-            masks=self.masks,
-            points=self.points,
-            flow=self.flow,
-            features=self.features,
-            selection=self.selection,
-            width=self.width,
-        )
+        return stages_from(**self.priors(), selection=self.selection)
 
     def threads(self) -> int:
         """How many threads. ValueError for fewer than none."""

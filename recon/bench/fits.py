@@ -41,6 +41,7 @@ from recon.observe.effects import Effect
 from recon.observe.recorded import optics, with_declared
 from recon.pipeline.plan import Plan
 from recon.pipeline.prepare import Prepared, prepare
+from recon.pipeline.readings import read_by
 from recon.pipeline.starts import world_footprint
 from recon.scene.device import device_of
 from recon.scene.gaussians4d import Gaussians4D
@@ -89,6 +90,11 @@ class Protocol:
             check_whole("lengths", steps, 0)
         if fit.save_every != FitOptions.save_every:
             raise ValueError("save_every: expected in a single fit; a benchmark keeps whole rows, not parts of a fit.")
+        if self.plan.features is not None and "features" not in read_by(fit.losses, self.plan.features):
+            raise ValueError(
+                f"features, losses: expected the loss feature beside {self.plan.features}, or no row would heed it. "
+                "Add it to --losses, or leave --features out."
+            )
         if not 0 <= self.held_out_tracks < 1:
             raise ValueError(f"held_out_tracks: expected a share in 0..1; found {self.held_out_tracks}.")
 

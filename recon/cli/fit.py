@@ -8,6 +8,7 @@ from typing import Annotated
 
 import tyro
 
+from otsync.cli.recordings import PriorOptions
 from recon.cli.common import deadline_of, opened, reconstructed, with_length
 from recon.pipeline.plan import Plan
 
@@ -39,6 +40,8 @@ class Fit:
     """truth.json of a simulated world: adds errors to table and report."""
     plan: Annotated[Plan, tyro.conf.arg(name="")] = field(default_factory=Plan)
     """How it is reconstructed: without --steps and --budget the fit takes 300 seconds."""
+    recording: PriorOptions = field(default_factory=PriorOptions)
+    """What finds masks and tracks in the images."""
     view: bool = False
     """Show the fit as it goes on in a browser on this machine (extra view). It ends with the fit."""
     cache: Path | None = None
@@ -59,6 +62,12 @@ class Fit:
     def _run(self) -> int:
         from otsync.types import Offsets, TrackSet
 
+        named = [f"--recording.{name}" for name in ("points", "flow") if getattr(self.recording, name) is not None]
+        if self.tracks and named:
+            raise ValueError(
+                f"{named[0]}, --tracks: expected one of them, since tracks that are given are not tracked; found both. "
+                "Leave one out."
+            )
         deadline = deadline_of(self.plan)
         scene = opened(self.scene, self.allow_outside)
         offsets = Offsets.load(self.offsets)
@@ -77,6 +86,7 @@ class Fit:
                 held_out=self.held_out,
                 tracks=tracks,
                 truth=self.truth,
+                priors=self.recording.priors(),
                 cache=self.cache,
                 workers=self.workers,
                 as_json=self.json,

@@ -28,6 +28,8 @@ class Run:
 
     The paper's method, refined from the images: otsync run recording/ --method paper
 
+    Its first stage, too, dense feature tracks of every video: otsync run recording/ --method paper --features dinov3
+
     Stopped at any moment, the same command continues. Look at the scene with recon render and recon export.
     """
 
@@ -66,18 +68,17 @@ class Run:
         from otsync.priors.stereo import EmptyHull
         from otsync.progress import Progress, tell
         from otsync.recordings.routes import synchronize_scene
+        from otsync.recordings.stages import with_method
         from otsync.report.frames import write_recording_report
         from recon.cli.common import deadline_of, opened, reconstructed, with_length
         from recon.fit.run import Diverged
+        from recon.pipeline.dense_tracks import synchronized_by_features
+        from recon.pipeline.feature_maps import maps_from
         from recon.pipeline.intake import given_clocks, readable
+        from recon.pipeline.stages import NoDepth
         from recon.pipeline.verb import check_effects_of
 
-        for name in ("masks", "points", "flow", "features", "selection", "width"):
-            if getattr(self.recording, name) is not None:
-                raise ValueError(
-                    f"--recording.{name}: expected without it, since the reconstruction tracks by its own; found "
-                    f"{getattr(self.recording, name)}. Synchronise with otsync sync, then reconstruct with recon fit."
-                )
+        stages = self.recording.stages()  # before the work, not after it
         threads, method, deadline = self.recording.threads(), self.slots.chosen(), deadline_of(self.plan)
         doubts = prepared(
             self.scene,
@@ -119,13 +120,31 @@ class Run:
                 train,
                 route=self.recording.route,
                 method=method,
+                stages=stages,
                 reference=reference,
                 cache=cache,
                 map=pool.map,
                 tell=tell,
                 deadline=deadline,
             )
-        progress.seconds |= {f"synchronise: {stage}": s for stage, s in coarse.seconds.items()}
+            progress.seconds |= {f"synchronise: {stage}": s for stage, s in coarse.seconds.items()}
+            if self.plan.features is not None:
+                try:
+                    coarse = synchronized_by_features(
+                        train,
+                        coarse,
+                        maps_from(self.plan.features),
+                        width=self.plan.width,
+                        reference=reference,
+                        stages=stages if method is None else with_method(stages, "tracks", method),
+                        cache=cache,
+                        map=pool.map,
+                        progress=progress,
+                    )
+                except (NoDepth, EmptyHull) as error:
+                    if method is not None and method.slots():
+                        raise
+                    progress.note(f"no dense tracks: {error} The answer of sparse ones stands")
         if not self.json:
             print(table(coarse.offsets))
         coarse.offsets.save(self.out / "offsets_coarse.json")
@@ -150,6 +169,7 @@ class Run:
                 with_length(self.plan),
                 held_out=self.held_out,
                 truth=self.truth,
+                priors=self.recording.priors(),
                 cache=self.recording.cache,
                 workers=self.recording.workers,
                 as_json=self.json,

@@ -1,17 +1,20 @@
-"""Feature maps for lifting, from OpenCV: for the slot of :func:`recon.features.tracks.feature_tracks`.
+"""Feature maps for lifting: for the slot of :func:`recon.features.tracks.feature_tracks`.
 
-Any callable of an image and its soft mask fits there, such as one that runs a network; these need no weights.
+Any callable of an image and its soft mask fits there. Those of OpenCV need no weights; a backbone reads its cells.
 """
 
 from __future__ import annotations
 
+from collections import OrderedDict
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from threading import Lock
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from recon.footage.footage import FOREGROUND
+from recon.footage.footage import FOREGROUND, Footage
 
 
 @dataclass(frozen=True)
@@ -87,3 +90,78 @@ class DaisyMaps:
             _, descriptors = daisy.compute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), points)
             out[row, column] = np.nan_to_num(descriptors)
         return out
+
+
+@dataclass(frozen=True)
+class Backbone:
+    """Cells of a backbone, read between them at every pixel: unit vectors, foreground or not.
+
+    Args:
+        of: an object with ``dense(image) -> (rows, columns, C)``, such as :class:`otsync.priors.learned.Dinov3`.
+    """
+
+    of: Any
+
+    def __call__(self, image: UInt8[np.ndarray, "h w 3"], mask: UInt8[np.ndarray, "h w"]) -> Float[np.ndarray, "h w C"]:
+        """ValueError where the image becomes a single row or column of cells."""
+        import cv2
+
+        cells = np.ascontiguousarray(self.of.dense(image), np.float32)
+        if min(cells.shape[:2]) < 2:
+            raise ValueError(
+                f"features: expected 2 x 2 cells and more of an image of {mask.shape[1]} x {mask.shape[0]} pixels; "
+                f"found {cells.shape[1]} x {cells.shape[0]}. Use a larger scale, or a larger --width."
+            )
+        rows, columns = np.indices(mask.shape, np.float32)
+        h, w = mask.shape
+        x = (columns + 0.5) * (cells.shape[1] / w) - 0.5
+        y = (rows + 0.5) * (cells.shape[0] / h) - 0.5
+        out = np.empty((h, w, cells.shape[2]), np.float32)
+        for first in range(0, cells.shape[2], CHANNELS):
+            part = np.ascontiguousarray(cells[..., first : first + CHANNELS])
+            whole = cv2.remap(part, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            out[..., first : first + CHANNELS] = whole.reshape(h, w, -1)
+        return out / np.maximum(np.linalg.norm(out, axis=-1, keepdims=True), 1e-12)
+
+
+CHANNELS = 4
+"""Channels that OpenCV's ``remap`` takes at once."""
+
+
+class KeptMaps(Mapping[int, np.ndarray]):
+    """The feature maps [h,w,C] of one video by frame, made when they are asked for; the last ones are kept.
+
+    Args:
+        footage: with masks. maps: the extractor. most: bytes of half-precision maps that are kept.
+    """
+
+    def __init__(self, footage: Footage, maps: Any, most: int = 256 << 20):
+        self._footage, self._maps, self._most = footage, maps, most
+        self._frames = [int(k) for k in np.flatnonzero(~footage.bad)]
+        self._there = frozenset(self._frames)
+        self._kept: OrderedDict[int, np.ndarray] = OrderedDict()
+        self._lock = Lock()
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._frames)
+
+    def __contains__(self, k: object) -> bool:
+        return k in self._there
+
+    def __getitem__(self, k: int) -> np.ndarray:
+        if k not in self._there:
+            raise KeyError(k)
+        with self._lock:
+            if k in self._kept:
+                self._kept.move_to_end(k)
+                return self._kept[k].astype(np.float32)
+        assert self._footage.masks is not None
+        found = self._maps(self._footage.images[k], self._footage.masks[k]).astype(np.float16)
+        with self._lock:
+            self._kept[k] = found
+            while len(self._kept) > 1 and sum(m.nbytes for m in self._kept.values()) > self._most:
+                self._kept.popitem(last=False)
+        return found.astype(np.float32)  # in half precision, kept or not: the same fit comes out

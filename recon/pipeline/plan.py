@@ -11,6 +11,7 @@ from otsync.types.checks import check_whole
 from recon.fit.options import FitOptions
 from recon.motion import ScaffoldOptions
 from recon.observe import Effect, MotionBlur
+from recon.pipeline.feature_maps import maps_from
 from recon.pipeline.readings import read_by
 from recon.scene.device import device_of
 from recon.scene.seed import Seeding
@@ -34,6 +35,10 @@ class Plan:
     """How the motion is built."""
     seeding: Seeding = field(default_factory=Seeding)
     """How densely Gaussians begin."""
+    features: str | None = None
+    """Feature maps, lifted into the Gaussians: lab, daisy, a backbone (dinov3, dinov2, transformers, onnx), each with
+    :FIELD=VALUE,... where needed. The loss feature trains what is lifted; otsync run matches dense tracks by it.
+    """
     backdrop_steps: int = 1500
     """Steps of the fit of the static part, before anything moves."""
     views: int = 50
@@ -48,7 +53,9 @@ class Plan:
             raise ValueError(f"frames: expected first < stop, from 0; found {self.frames[0]} {self.frames[1]}.")
         if self.exposure and any(isinstance(effect, MotionBlur) for effect in self.fit.effects):
             raise ValueError("exposure, effects: expected motion blur from one of them; found it in both.")
-        read_by(self.fit.losses)
+        read_by(self.fit.losses, self.features)
+        if self.features is not None:
+            maps_from(self.features)
         device_of(self.device)
         _ = self.effects
 

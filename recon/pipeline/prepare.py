@@ -13,15 +13,17 @@ from otsync.compute.threads import MapLike
 from otsync.io import Scene
 from otsync.io.mend import cut, on_mended_clocks
 from otsync.progress import Deadline, Progress
+from otsync.recordings.stages import Stages
 from otsync.sync.breaks import mended
 from otsync.types import Clock, Offsets, TrackSet
 from recon.backdrop.fit import StaticFit, with_backdrop
 from recon.footage.footage import Footage
 from recon.observe.recorded import check_effects
+from recon.pipeline.feature_maps import maps_from
 from recon.pipeline.intake import readable, split
 from recon.pipeline.plan import Plan
 from recon.pipeline.readings import read_by, with_readings
-from recon.pipeline.stages import NoDepth, backdrop_of_scene, initial_scene, lifted_tracks, read_footage
+from recon.pipeline.stages import NoDepth, backdrop_of_scene, featured, initial_scene, lifted_tracks, read_footage
 from recon.pipeline.starts import FromImages, Given, OnScaffold, Start
 from recon.pipeline.track_sets import tracks_of
 from recon.scene.gaussians4d import Gaussians4D
@@ -64,6 +66,7 @@ def prepare(
     held_out: Sequence[str] = (),
     backdrop: StaticFit | None = None,
     start: Start | None = None,
+    stages: Stages | None = None,
     cache: Any = None,
     map: MapLike = map,
     progress: Progress | None = None,
@@ -80,6 +83,7 @@ def prepare(
         start: how the moving part begins; default: on a scaffold, and on visual hulls of the masks where no track can
             be lifted. One that reads neither tracks nor depth is not given
             any, nor is the static part.
+        stages: whose masks, point tracks and stereo are used; which tracks are kept is the scaffold's own affair.
         cache: an :class:`otsync.files.cache.Cache`. map: any map-like callable; two threads use two cores.
         deadline: of the whole job; the static part takes at most a share of what is left.
 
@@ -88,6 +92,7 @@ def prepare(
     from otsync.files.cache import Cache
 
     plan, progress, cache, start = plan or Plan(), progress or Progress(), cache or Cache(), start or OnScaffold()
+    stages = stages or Stages()
     for video in scene.videos:
         check_effects(plan.effects, video.times)
     if plan.frames is not None:
@@ -108,7 +113,7 @@ def prepare(
     elif tracks is None:
         with progress.stage("tracks"):
             try:
-                tracks = lifted_tracks(train, offsets, cache, map, progress)
+                tracks = lifted_tracks(train, offsets, cache, map, progress, stages)
             except NoDepth as error:
                 # images and calibration alone still tell where masks meet, also for few cameras and for moving ones
                 progress.note(
@@ -120,24 +125,28 @@ def prepare(
         own = [at_frame_times(t) for t in tracks_of(train, tracks, held_out, progress.note)]
         tracks = tuple(mended(t, offsets.breaks[offsets.names.index(t.name)]) for t in own)
     with progress.stage("footage"):
-        footage = read_footage(train, plan.width, cache, map, progress)
-        held = () if others is None else read_footage(others, plan.width, cache, map, progress)
+        footage = read_footage(train, plan.width, cache, map, progress, stages)
+        held = () if others is None else read_footage(others, plan.width, cache, map, progress, stages)
     if not any((f.boxes[:, 2] > f.boxes[:, 0]).any() for f in footage):
         raise ValueError("scene: expected something that moves; the masks are empty in every frame of every video.")
     with progress.stage("backdrop"):
         static = backdrop
         if static is None:
-            static = backdrop_of_scene(train, tracks, footage, plan, cache, progress, deadline)
+            static = backdrop_of_scene(train, tracks, footage, plan, cache, progress, deadline, stages)
     with progress.stage("initial scene"):
         gains = np.ones((len(footage), 3)) if static is None else static.gains
-        given = Given(train, offsets, tuple(tracks), footage, gains, plan, cache, map, progress)
+        given = Given(train, offsets, tuple(tracks), footage, gains, plan, cache, map, progress, stages)
         initial = initial_scene(given, static, start)
     if static is not None:
         footage = tuple(
             f if f.background is None else with_backdrop(static, f, gains[v]) for v, f in enumerate(footage)
         )
-    wanted = read_by(plan.fit.losses)
+    maps = None if plan.features is None else maps_from(plan.features)
+    if maps is not None:
+        with progress.stage("features"):
+            initial = featured(given, initial, footage, maps)
+    wanted = read_by(plan.fit.losses, plan.features)
     if wanted:
-        footage = with_readings(wanted, train, footage, tracks, initial, offsets, plan.width)
+        footage = with_readings(wanted, train, footage, tracks, initial, offsets, plan.width, maps)
     left_out = tuple(n for n in scene.names if n not in train.names and n not in held_out)
     return Prepared(footage, held, clocks, offsets, tuple(tracks), initial, gains, scene.frame, left_out)

@@ -18,12 +18,17 @@ import torch
 from otsync.compute.threads import MapLike
 from otsync.files.digest import content_key
 from otsync.io import Scene
+from otsync.priors.masks import MedianBackground
+from otsync.priors.slots import cache_key
 from otsync.priors.stereo import EmptyHull
 from otsync.progress import Deadline, Progress
+from otsync.recordings.stages import Stages
 from otsync.types import Offsets, TrackSet, Video
 from recon.backdrop.fit import StaticFit, fit_backdrop
+from recon.features.tracks import FeatureMaps
 from recon.footage.depth import working_depth
 from recon.footage.footage import Footage, footage_of
+from recon.pipeline.feature_maps import key_of, with_features
 from recon.pipeline.intake import only
 from recon.pipeline.plan import Plan
 from recon.pipeline.starts import Given, Start
@@ -34,11 +39,17 @@ MANY: dict[str, Any] = {"count": 700, "min_life": 10, "apart": 4.0, "enough": 0}
 """Tracks for a scaffold: more and shorter ones than synchronisation asks for, since every limb must have some."""
 
 
+STAGES = Stages()
+"""What tracks and masks are made by, where nothing else is asked for."""
+
+
 class NoDepth(ValueError):
     """No track can be lifted into space: no depth is given, and none can be measured."""
 
 
-def lifted_tracks(scene: Scene, offsets: Offsets, cache: Any, map: MapLike, progress: Progress) -> tuple[TrackSet, ...]:
+def lifted_tracks(
+    scene: Scene, offsets: Offsets, cache: Any, map: MapLike, progress: Progress, stages: Stages = STAGES
+) -> tuple[TrackSet, ...]:
     """Tracks in space of every video that has some: by given depth, else by hull and stereo at the offsets.
 
     :class:`NoDepth` where no video has some.
@@ -46,7 +57,7 @@ def lifted_tracks(scene: Scene, offsets: Offsets, cache: Any, map: MapLike, prog
     from otsync.recordings import routes as recordings
     from otsync.recordings.tracking import Selection
 
-    stages = replace(recordings.Stages(), selection=Selection(**MANY))
+    stages = replace(stages, selection=Selection(**MANY))
     raw = recordings.track_all(scene, stages, cache, map, progress.tell)
     flat: list[TrackSet | None] = []
     for video, one in zip(scene.videos, raw, strict=True):
@@ -95,13 +106,13 @@ def lifted_tracks(scene: Scene, offsets: Offsets, cache: Any, map: MapLike, prog
     return tuple(out)
 
 
-def read_footage(scene: Scene, width: int, cache: Any, map: MapLike, progress: Progress) -> tuple[Footage, ...]:
+def read_footage(
+    scene: Scene, width: int, cache: Any, map: MapLike, progress: Progress, stages: Stages = STAGES
+) -> tuple[Footage, ...]:
     """Frames, masks and backgrounds of every video at working size."""
-    from otsync.recordings.routes import Stages
-
-    tracking = Stages().tracking
+    tracking = stages.tracking
     measured = [v.name for v, m in zip(scene.videos, scene.masks, strict=True) if m is None]
-    if measured:
+    if measured and isinstance(tracking.masker, MedianBackground):
         progress.note(
             f"no masks given for {', '.join(measured)}: what differs from the median over time counts as moving, "
             "so shadows do, and what stands still for half of the clip does not. Masks of your own mend that"
@@ -114,12 +125,10 @@ def read_footage(scene: Scene, width: int, cache: Any, map: MapLike, progress: P
     return tuple(map(one, list(zip(scene.videos, scene.masks, strict=True))))
 
 
-def scene_key(scene: Scene, tracks: Sequence[TrackSet]) -> tuple[Any, ...]:
+def scene_key(scene: Scene, tracks: Sequence[TrackSet], stages: Stages = STAGES) -> tuple[Any, ...]:
     """What the pixels, masks, poses, depth maps and tracks are, for the cache."""
-    from otsync.recordings.routes import Stages
-
-    tracking = Stages().tracking
-    rows = []
+    tracking = stages.tracking
+    rows: list[Any] = [(cache_key(tracking.masker), tracking.width)]
     for video, masks in zip(scene.videos, scene.masks, strict=True):
         c, depth = video.camera, "none"
         if video.depth is not None:
@@ -140,6 +149,7 @@ def backdrop_of_scene(
     cache: Any,
     progress: Progress,
     deadline: Deadline | None = None,
+    stages: Stages = STAGES,
 ) -> StaticFit | None:
     """Static Gaussians fitted to what the cameras see behind the things that move, kept; None where nothing shows."""
     at_most = None if deadline is None else BACKDROP_SHARE * deadline.left
@@ -164,7 +174,7 @@ def backdrop_of_scene(
         parts = {n: getattr(static.gaussians, n).numpy() for n in GAUSSIAN}
         return {**parts, "gains": static.gains, "near": np.array(static.near), "psnr": static.psnr}
 
-    key = (*scene_key(scene, tracks), plan.width, plan.backdrop_steps, plan.fit.seed)
+    key = (*scene_key(scene, tracks, stages), plan.width, plan.backdrop_steps, plan.fit.seed)
     if plan.device != "cpu":  # rounds otherwise
         key = (*key, plan.device)
     if deadline is not None:
@@ -188,11 +198,29 @@ POINTS = 2000
 GAUSSIAN = tuple(f.name for f in fields(Gaussians))
 
 
+def featured(given: Given, initial: Gaussians4D, footage: Sequence[Footage], maps: FeatureMaps) -> Gaussians4D:
+    """The scene with features lifted from all videos; kept."""
+    offsets = given.offsets
+    clocks = (np.round(offsets.seconds, 6).tolist(), np.round(offsets.rates, 9).tolist(), offsets.reference)
+    moving = replace(initial, static=None)
+    key = (*scene_key(given.scene, (), given.stages), clocks, given.plan.width, key_of(maps))
+    key = (*key, content_key(*scene_arrays(moving).values()))
+
+    def build() -> dict[str, np.ndarray]:
+        features = with_features(moving, footage, offsets, maps).features
+        assert features is not None
+        return {"features": np.array(features.numpy(), order="C")}
+
+    kept = torch.from_numpy(np.array(given.cache.arrays("features", key, build)["features"]))
+    given.progress.tell(f"features: {kept.shape[1]} channels of {int((kept != 0).any(1).sum())} Gaussians")
+    return replace(initial, features=kept)
+
+
 def initial_scene(given: Given, static: StaticFit | None, start: Start) -> Gaussians4D:
     """The scene before any refinement, as ``start`` begins it; kept."""
     offsets, plan = given.offsets, given.plan
     clocks = (np.round(offsets.seconds, 6).tolist(), np.round(offsets.rates, 9).tolist(), offsets.reference)
-    key = (*scene_key(given.scene, given.tracks), clocks, given.gains.tolist())
+    key = (*scene_key(given.scene, given.tracks, given.stages), clocks, given.gains.tolist())
     key = (*key, plan.width, plan.scaffold, plan.seeding, plan.fit.seed, start)
 
     def build() -> dict[str, np.ndarray]:

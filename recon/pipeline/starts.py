@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -15,6 +15,7 @@ import numpy as np
 from otsync.compute.threads import MapLike
 from otsync.io import Scene
 from otsync.progress import Progress
+from otsync.recordings.stages import Stages
 from otsync.types import Offsets, TrackSet
 from recon.footage.depth import working_depth
 from recon.footage.footage import Footage
@@ -32,7 +33,8 @@ class Given:
 
     Args:
         scene, footage: of the training videos. offsets: of those, believed. gains: (V,3) factors of their colours.
-        tracks: in space; none where a start reads none. cache, map, progress: as of :func:`recon.pipeline.prepare`.
+        tracks: in space; none where a start reads none. cache, map, progress, stages: as of
+            :func:`recon.pipeline.prepare`.
     """
 
     scene: Scene
@@ -44,6 +46,7 @@ class Given:
     cache: Any
     map: MapLike
     progress: Progress
+    stages: Stages = field(default_factory=Stages)
 
     @property
     def frame_step(self) -> float:
@@ -165,12 +168,10 @@ def world_footprint(tracks: Sequence[TrackSet], footage: Sequence[Footage]) -> f
     return float(np.median(values))
 
 
-def without_depth(scene: Scene) -> set[str]:
+def without_depth(scene: Scene, stages: Stages) -> set[str]:
     """Names of videos that came without depth and for which none can be measured."""
-    from otsync.recordings.routes import Stages
-
     static = [v.name for v in scene.videos if v.camera.w2c.ndim == 2]
-    measured = set(static) if len(static) >= Stages().stereo.min_views else set()
+    measured = set(static) if len(static) >= stages.stereo.min_views else set()
     return {v.name for v in scene.videos if v.depth is None} - measured
 
 
@@ -180,13 +181,13 @@ def _seeded(given: Given, motion: Motion, footprint: float, bind: Bind) -> Gauss
 
     scene, offsets, footage, width = given.scene, given.offsets, given.footage, given.plan.width
     times = moments(given.span, given.frame_step)
-    blind = without_depth(scene)
+    blind = without_depth(scene, given.stages)
     shown = zip(*(shown_at(footage, offsets, float(t), given.frame_step) for t in times), strict=True)
     wanted = [
         [] if v.name in blind else sorted({k for k in frames if k is not None})
         for v, frames in zip(scene.videos, shown, strict=True)
     ]
-    maps = depth_maps(scene, offsets, wanted, width=width, cache=given.cache, map=given.map)
+    maps = depth_maps(scene, offsets, wanted, width=width, stages=given.stages, cache=given.cache, map=given.map)
     depth = [
         working_depth(v, dict(zip(k, m, strict=True)).get, width=width)
         for v, k, m in zip(scene.videos, wanted, maps, strict=True)

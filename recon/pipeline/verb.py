@@ -5,7 +5,7 @@ A run that was killed continues from its stages and its checkpoint, and ends wit
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from otsync.io import Scene
 from otsync.io.mend import cut, on_mended_clocks
 from otsync.metrics import offset_error
 from otsync.progress import Deadline, Progress
+from otsync.recordings.stages import stages_from
 from otsync.types import Clock, Offsets, TrackSet, Video
 from recon.evaluate.lpips import Lpips
 from recon.evaluate.views import ViewScore, view
@@ -92,6 +93,7 @@ def reconstruct(
     tracks: Sequence[TrackSet] | None = None,
     held_out: Sequence[str] = (),
     truth: Offsets | None = None,
+    priors: Mapping[str, Any] | None = None,
     cache: Any = None,
     map: MapLike = map,
     progress: Progress | None = None,
@@ -108,6 +110,8 @@ def reconstruct(
         tracks: in space, of training videos; default: tracked and lifted here.
         held_out: names of videos that only the evaluation sees.
         truth: true offsets of at least the training videos.
+        priors: of masks, tracks and depth, as the shell spells them
+            (:func:`otsync.recordings.stages.stages_from`); run.json keeps them.
         cache: an :class:`otsync.files.cache.Cache`; default: ``stages`` in ``out``. map: any map-like callable.
         deadline: of the whole job, whose seconds ``plan.fit.budget`` then are. The static part gets a share of what is
             left, the fit the rest. What that leaves out is noted.
@@ -116,6 +120,7 @@ def reconstruct(
     from otsync.files.cache import Cache
 
     plan, progress, cache = plan or Plan(), progress or Progress(), cache or Cache(out / "stages")
+    stages = stages_from(**(priors or {}))
     # what is lacking is said before the work, not after it
     train = trained(scene, offsets, held_out)
     careful, why = clocks_kept(plan.fit, scene, train)
@@ -133,6 +138,7 @@ def reconstruct(
         tracks,
         plan=plan,
         held_out=held_out,
+        stages=stages,
         cache=cache,
         map=map,
         progress=progress,
@@ -155,7 +161,7 @@ def reconstruct(
     with progress.stage("views"):
         videos, scores = compared(fitted, effects, ready, plan, progress)
     outcome = Outcome(fitted, ready.offsets, scores, ready.left_out, true, Lpips().reason)
-    _write(out, outcome, videos, effects, ready, plan, progress)
+    _write(out, outcome, videos, effects, ready, plan, priors or {}, progress)
     return outcome
 
 
@@ -216,6 +222,7 @@ def _write(
     effects: Sequence[Effect],
     ready: Prepared,
     plan: Plan,
+    priors: Mapping[str, Any],
     progress: Progress,
 ) -> None:
     """The rest of the result folder; run.json last but for the report, since with it the folder counts as finished."""
@@ -230,6 +237,7 @@ def _write(
         "seed": plan.fit.seed,
         "freeze": list(plan.fit.freeze),
         "layered": ready.layered,
+        "priors": dict(priors),
         "optics": kept([own for effect in effects if (own := effect.alone(None, fitted.parameters)) is not None]),
     }
     strips = _strips(ready, progress)
@@ -344,7 +352,9 @@ def evaluate(
     part = readable(part, cache, map, progress)
     known = {v.name: v for v in result.videos}
     scores = []
-    for footage in read_footage(part, int(result.options["width"]), cache, map, progress):
+    priors = result.options.get("priors", {})
+    stages = stages_from(masks=priors.get("masks"), width=priors.get("width"))  # all that footage asks for
+    for footage in read_footage(part, int(result.options["width"]), cache, map, progress, stages):
         own = known.get(footage.name)
         clock, gain = (None, None) if own is None else (own.clock, own.gain)
         clock = told.get(footage.name, clock)

@@ -235,6 +235,9 @@ def _options(given: dict[str, Any]) -> dict[str, Any]:
         and 0 <= frames[0] < frames[1]
     ):
         raise ValueError(f"options.frames: expected null, or first and last frame; found {frames!r}")
+    priors = options.get("priors", {})
+    if not isinstance(priors, dict) or not all(isinstance(v, str | int) for v in priors.values()):
+        raise ValueError(f"options.priors: expected what --recording.masks and the like were told; found {priors!r}")
     return options
 
 

@@ -44,7 +44,7 @@ SCENE = (
     Group("own_knots", 0.075, "footprints", "gaussians", axis=1),
     Group("knot_quats", 2e-3, rows="nodes", axis=1),
     Group("own_quats", 2e-3, rows="gaussians", axis=1),
-    Group("features", rows="gaussians"),
+    Group("features", 5e-3, rows="gaussians"),
     Group("static.means", unit="footprints"),
 )
 """Of a scene. Rates are the study's metres and colours, expressed so; other static groups are in their own units."""

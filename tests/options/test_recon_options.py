@@ -79,6 +79,7 @@ PLAN = {
     "fit.densify:Densify.nodes": "densify:densify --densify.nodes 5",
     "fit.seed": "--seed 3",
     "exposure": "--exposure 0.01",
+    "features": "--features lab --losses photometric mask feature",
     "scaffold.unit": "--scaffold.unit 20",
     "scaffold.second_pick": "--scaffold.second-pick 1",
     "scaffold.fewest": "--scaffold.fewest 9",
@@ -285,6 +286,37 @@ def test_a_fit_of_other_things(fitted, world, outside, home):
     refused(recon.cli.main, fitting(world, home / "o", "--workers", "-1"), "--workers")
 
 
+def test_priors_of_a_fit(world, home):
+    """On the world without its masks: what is tracked, and where things move."""
+    bare = elsewhere(world, home / "bare")
+    document = json.loads((bare / "scene.json").read_text())
+    for video in document["videos"]:
+        video.pop("masks", None)
+    (bare / "scene.json").write_text(json.dumps(document))
+    shutil.copy(world / "start.json", bare)
+
+    def asked(*more: str) -> tuple[Any, ...]:
+        out = home / f"priors{'-'.join(more).replace(':', '-')}"
+        done(recon.cli.main, fitting(bare, out, "--allow-outside", *more, tracks=False))
+        return {k: content_key(v) for k, v in read_npz(out / "scene.npz").items()}
+
+    base = asked()
+    for name, value in (
+        ("points", "chained-flow:every=4"),
+        ("masks", "flow-residual"),
+        ("flow", "dis-flow:preset=fast"),
+    ):
+        assert base != asked(f"--recording.{name}", value), name
+    # these images are no wider than the least that is tracked: that more pixels change tracks is told by otsync sync
+    asked("--recording.width", "64")
+    assert json.loads((home / "priors--recording.width-64" / "run.json").read_text())["options"]["priors"] == {
+        "width": 64
+    }
+    refused(recon.cli.main, fitting(world, home / "o", "--recording.width", "9"), "--recording.width")
+    for name, value in (("points", "blobs"), ("flow", "dis-flow")):
+        refused(recon.cli.main, fitting(world, home / "o", f"--recording.{name}", value), name, "--tracks")
+
+
 def test_how_long_and_where_a_fit_runs(fitted, world, home, monkeypatch):
     monkeypatch.setattr("recon.fit.verb.CALIBRATION", (2, 5))
     assert fitted("--budget", "0.01")[:3] not in (fitted()[:3], fitted("--steps", "5")[:3])
@@ -441,9 +473,13 @@ def each_field_counts(name: str, values: dict[str, Any], fitted_with: Callable[[
             assert fitted_with(spelled(**{field: value})) != begin, field
 
 
-def test_features_are_not_made_of_a_recording():
-    with pytest.raises(ValueError, match="losses: Feature compares with features"):
-        Plan(fit=FitOptions(losses=(made("feature", available("losses", LOSSES), "--losses"),)))
+def test_the_feature_loss_asks_for_maps():
+    fit = FitOptions(losses=(made("feature", available("losses", LOSSES), "--losses"),))
+    with pytest.raises(ValueError, match="losses, features: expected feature maps"):
+        Plan(fit=fit)
+    assert Plan(fit=fit, features="lab")
+    with pytest.raises(ValueError, match="--features: expected some of lab, daisy, dinov3"):
+        Plan(features="sift")
 
 
 def test_scaffolds_of_a_given_unit_choose_none():
@@ -462,12 +498,12 @@ def arriving(world, monkeypatch) -> Callable[..., dict[str, Any]]:
 
     def synchronised(scene, **options):
         seen["sync"] = [(v.name, len(v.frames)) for v in scene.videos], options["route"], options["reference"]
-        seen["cache"], seen["method"] = options["cache"], options["method"]
+        seen["cache"], seen["method"], seen["stages"] = options["cache"], options["method"], options["stages"]
         return SimpleNamespace(offsets=only(start, scene.names), route="tracks", why=(), seconds={})
 
     def reconstructed(scene, offsets, out, **options):
         seen["fit"] = {"names": scene.names, "from": offsets.seconds.tolist()} | {
-            k: v for k, v in options.items() if k in ("plan", "held_out", "truth")
+            k: v for k, v in options.items() if k in ("plan", "held_out", "truth", "priors")
         }
         raise Reached
 
@@ -527,15 +563,14 @@ def test_the_other_options_of_a_run(arriving, world, outside, home):
         assert asked(option, scene=outside)["fit"]["names"] == base["fit"]["names"]
     refused(otsync.cli.main, running(outside, home / "r"), "outside")
     refused(otsync.cli.main, running(world, home / "r", "--recording.workers", "-1"), "--recording.workers")
-    for name, value in (
-        ("masks", "a"),
-        ("points", "a"),
-        ("flow", "a"),
-        ("features", "daisy"),
-        ("selection", "count=9"),
-        ("width", "99"),
-    ):
-        refused(otsync.cli.main, running(world, home / "r", f"--recording.{name}", value), f"--recording.{name}")
+    named = {"masks": "flow-residual", "points": "chained-flow", "flow": "dis-flow", "features": "daisy", "width": "99"}
+    for name, value in named.items():  # both stages are told; what they do is tested with otsync sync and recon fit
+        told = asked(f"--recording.{name}", value)
+        assert told["fit"]["priors"] == {name: int(value) if name == "width" else value}
+        assert (told["stages"] != base["stages"]) == (name != "flow")  # that flow is the default
+        refused(otsync.cli.main, running(world, home / "r", f"--recording.{name}", "a"), name)
+    told = asked("--recording.selection", "count=9")  # which tracks a scaffold begins with is its own affair
+    assert told["stages"].selection.count == 9 and not told["fit"]["priors"]
 
 
 def test_a_run_tells_json_only_where_it_is_asked_to(world, home, monkeypatch):
@@ -605,6 +640,7 @@ def test_the_plan_of_a_benchmark_reaches_its_fits(options, measuring, world, hom
 def test_what_a_benchmark_does_not_heed_it_refuses(measuring, world, home):
     refused(recon.cli.main, benching(world, home / "b", "--device", "abacus"), "device")
     refused(recon.cli.main, benching(world, home / "b", "--save-every", "3"), "save_every")
+    refused(recon.cli.main, benching(world, home / "b", "--features", "lab"), "features, losses")
     for option, row in (("--scaffold.unit", "w/o scaffold"), ("--seeding.support", "Sync-NeRF style")):
         refused(recon.cli.main, benching(world, home / "b", option, "9", "--rows", row), option.strip("-"))
     for option in ("--gate", "--rebase"):  # what they do: tests/recon/bench/test_bench.py
@@ -891,7 +927,8 @@ def rows() -> set[str]:
     """Every option that a test above exercises, refuses, or gives a reason for."""
     plan = {*PLAN, *OF_A_FIT}
     others = {
-        "fit": "scene offsets out held_out tracks truth view cache json allow_outside",
+        "fit": "scene offsets out held_out tracks truth view cache json allow_outside recording.masks recording.points "
+        "recording.flow recording.width",
         "run": "scene out held_out reference truth json allow_outside recording.route recording.cameras "
         "recording.cache recording.allow_outside recording.masks recording.points recording.flow recording.features "
         "recording.selection recording.width",
