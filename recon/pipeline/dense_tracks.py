@@ -114,6 +114,7 @@ def synchronized_by_features(
     *,
     width: int,
     reference: int | Literal["auto"] = 0,
+    options: Alone | None = None,
     stages: Stages | None = None,
     cache: Any = None,
     map: MapLike = map,
@@ -129,7 +130,15 @@ def synchronized_by_features(
 
     stages, cache, progress = stages or Stages(), cache or Cache(), progress or Progress()
     dense = dense_tracks(
-        scene, coarse.offsets, maps, width=width, stages=stages, cache=cache, map=map, progress=progress
+        scene,
+        coarse.offsets,
+        maps,
+        width=width,
+        options=options,
+        stages=stages,
+        cache=cache,
+        map=map,
+        progress=progress,
     )
     chosen = [thinned(t, stages.selection) for t in dense]
     with progress.stage("synchronise dense tracks"):

@@ -25,6 +25,7 @@ from recon.simulate.capture import synthetic
 from recon.simulate.recording import write_capture
 
 FRAMES, SIZE, LATE = 40, (96, 64), (0.0, 3.0, -2.0)
+SHORT = Alone(steps=40)
 FEW = Stages(selection=Selection(count=80, min_life=8))
 
 
@@ -119,14 +120,14 @@ def test_dense_tracks_answer_by_the_method_of_lifted_ones(recording, known, cach
     scene = open_scene(recording)
     nothing = Offsets.known(scene.names, np.zeros(3), 30.0)  # given depth needs no clock
     coarse = Synchronized(nothing, (), "tracks", ("as asked",))
-    found = synchronized_by_features(scene, coarse, LabMaps(), width=SIZE[0], stages=FEW, cache=cache)
+    found = synchronized_by_features(scene, coarse, LabMaps(), width=SIZE[0], options=SHORT, stages=FEW, cache=cache)
     assert found.route == "tracks, dense features" and "dense feature tracks" in found.why[-1]
     assert found.first is nothing and all(len(t) >= 20 for t in found.tracks)
     true = known.seconds - known.seconds[0]
     off = np.abs(found.offsets.seconds - true) * 30
     sigma = found.offsets.sigma * 30
     assert (off[1:] < np.maximum(0.5, 3 * sigma[1:])).all(), (off, sigma)
-    again = dense_tracks(scene, nothing, LabMaps(), width=SIZE[0], stages=FEW, cache=cache)
+    again = dense_tracks(scene, nothing, LabMaps(), width=SIZE[0], options=SHORT, stages=FEW, cache=cache)
     chosen = [thinned(t, FEW.selection) for t in again]
     for a, b in zip(chosen, found.tracks, strict=True):
         np.testing.assert_array_equal(a.xyz, b.xyz)
@@ -146,17 +147,31 @@ def test_videos_without_depth_are_named(recording, cache):
         dense_tracks(some, nothing, LabMaps(), width=SIZE[0], stages=FEW, cache=cache)
 
 
+def shown_by(command, args, out):
+    """The features of the scene that a run writes."""
+    assert command([*args, "--out", str(out)]) in (0, 1)
+    assert json.loads((out / "sync.json").read_text())["route"] == "tracks, dense features"
+    return np.load(out / "scene.npz")["features"]
+
+
 @pytest.mark.slow
 def test_a_run_with_features_from_the_shell(recording, tmp_path):
-    args = ["run", str(recording), "--out", str(tmp_path), "--width", str(SIZE[0]), "--features", "lab"]
+    args = [
+        "run",
+        str(recording),
+        "--recording.cache",
+        str(tmp_path / "stages"),
+        "--width",
+        str(SIZE[0]),
+        "--features",
+        "lab",
+    ]
     args += ["--steps", "8", "--backdrop-steps", "5", "--views", "2"]
     losses = ["photometric", "mask", "scale-hinge", "arap", "length", "velocity", "acceleration", "feature"]
-    assert otsync([*args, "--losses", *losses]) in (0, 1)
-    told = json.loads((tmp_path / "sync.json").read_text())
-    assert told["route"] == "tracks, dense features"
-    trained = np.load(tmp_path / "scene.npz")["features"]
-    assert otsync([*args, "--rates", "features=0", "--losses", *losses]) in (0, 1)
-    held = np.load(tmp_path / "scene.npz")["features"]
+    trained, held = (
+        shown_by(otsync, [*args, *more, "--losses", *losses], tmp_path / f"{len(more)}")
+        for more in ([], ["--rates", "features=0"])
+    )
     assert trained.shape == held.shape and not np.array_equal(trained, held)
     lengths = np.linalg.norm(held, axis=1)
     assert np.all((np.abs(lengths - 1) < 1e-4) | (lengths == 0))
