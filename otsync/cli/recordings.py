@@ -142,6 +142,8 @@ class RecordingOptions:
     """Optical flow that the tracker follows."""
     features: prior("features") = None
     """What describes a track."""
+    depth: prior("depth") = None
+    """What estimates depth, tied to the poses by points of the background; it goes before depth that came along."""
     selection: Annotated[str | None, tyro.conf.arg(metavar="FIELD=VALUE,...")] = None
     """Which tracks are kept: count, min_life (frames at 30 fps), extent and apart (pixels at 640 of width), enough
     (tracks, below which the limits are lowered)."""
@@ -159,6 +161,7 @@ class RecordingOptions:
             points=self.points,
             flow=self.flow,
             features=self.features,
+            depth=self.depth,
             selection=self.selection,
             width=self.width,
         )
@@ -196,7 +199,13 @@ def sync_recording(
     own = frames == "own"
     if own:
         refuse_unused(options, ("route",), "a recording with --frames own, which has one route,")
+        refuse_unused(options, ("depth",), "a recording with --frames own, whose poses are not known to tie it to,")
     stages, threads = options.stages(), options.threads()  # before the work, not after it
+    if options.depth is not None and options.route in ("epipolar", "stereo"):
+        raise ValueError(
+            f"--recording.depth: expected a route that reads it (auto, tracks); found --recording.route "
+            f"{options.route}. Leave one of both out."
+        )
     solve: Callable[..., Synchronized]
     if own:
         scene, document = open_without_poses(path, allow_outside=options.allow_outside)

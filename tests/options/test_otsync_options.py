@@ -728,7 +728,7 @@ def rows() -> set[str]:
         "graph.extra graph.complete "
         "graph.curves graph.starts graph.seed recording.route recording.cameras recording.cache "
         "recording.allow_outside recording.workers recording.masks recording.points recording.flow recording.features "
-        "recording.selection recording.width",
+        "recording.depth recording.selection recording.width",
         "simulate": "out motion preset videos frames fps max_offset own_frames seed",
         "film": "out phones gap handheld walk frames fps width height max_offset contrast seed",
         "calibrate": "folder out force options.intrinsics options.board options.distance options.key_frames "

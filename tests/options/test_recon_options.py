@@ -894,7 +894,7 @@ def rows() -> set[str]:
         "fit": "scene offsets out held_out tracks truth view cache json allow_outside",
         "run": "scene out held_out reference truth json allow_outside recording.route recording.cameras "
         "recording.cache recording.allow_outside recording.masks recording.points recording.flow recording.features "
-        "recording.selection recording.width",
+        "recording.depth recording.selection recording.width",
         "bench": "scene truth rows out cache name lpips_weights json allow_outside gate rebase protocol.held_out "
         "protocol.cameras protocol.amplitudes protocol.seeds protocol.lengths protocol.held_out_tracks",
         "lifting": "scene out cache json allow_outside lifting.cameras lifting.steps lifting.seed lifting.width "

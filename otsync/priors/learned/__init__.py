@@ -4,9 +4,11 @@ loading.py    weights and packages: found, or refused with what to install and w
 tiles.py      large images in tiles that overlap
 backbones.py  features of transformers' backbones and of ONNX models
 raft.py       torchvision's RAFT
+depth.py      transformers' estimators of depth
 """
 
 from .backbones import Dinov2, Dinov3, Onnx, Transformers
+from .depth import DepthAnything2, TransformersDepth
 from .raft import Raft
 
-__all__ = ["Dinov2", "Dinov3", "Onnx", "Raft", "Transformers"]
+__all__ = ["DepthAnything2", "Dinov2", "Dinov3", "Onnx", "Raft", "Transformers", "TransformersDepth"]
