@@ -198,9 +198,10 @@ def brought(x: Float[np.ndarray, " N"], y: Float[np.ndarray, " N"], *, shift: bo
         b = float(np.median(y) - a * np.median(x))
     else:
         a, b = float(np.median(y) / np.median(x)) if np.median(x) > 0 else 1.0, 0.0
+    least = 0.01 * float(np.std(y)) + 1e-300  # of a sky, which is 0 in both, nothing may depend on the last bits
     for _ in range(10):
         left = np.abs(a * x + b - y)
-        sigma = 1.4826 * np.median(left) + 1e-9 * np.abs(y).max() + 1e-300
+        sigma = 1.4826 * np.median(left) + least
         weight = np.minimum(1.0, HUBER * sigma / np.maximum(left, 1e-300))
         a, b = _weighted(x, y, weight, shift, (a, b))
     return a, b

@@ -1,4 +1,4 @@
-"""Scale and shift of estimated depth: made up with their answers, with noise, outliers, flicker; and what is refused."""
+"""Scale and shift of estimated depth: made up with their answers, noise, outliers and flicker; what is refused."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def test_a_moving_camera_is_tied_frame_by_frame_and_between():
     affine, line = tie_moving(d, z, np.full(M, 0.01), gives="relative")
     here = affine[:, :1] * (a / 3.0 + b) + affine[:, 1:]
     np.testing.assert_allclose(1 / here, 3.0, rtol=0.04)  # the seventh too, which lies between its neighbours
-    assert 50 < line.agree.sum()
+    assert line.agree.sum() > 50
     d[:10] = np.nan
     with pytest.raises(Untied, match="5 of 15 frames are tied, fewer than 50%"):
         tie_moving(d, z, np.full(M, 0.01), gives="relative")
@@ -140,9 +140,7 @@ def test_two_estimates_that_contradict_each_other_have_no_scale():
 
 def test_depth_is_unknown_beyond_the_farthest_and_where_nothing_is_told():
     d = np.array([[1.0, 0.1, -5.0], [np.nan, np.inf, 0.5]])
-    np.testing.assert_allclose(
-        depth_of(d, 0.5, 0.0, gives="inverse", farthest=8.0), [[2.0, 0.0, 0.0], [0.0, 0.0, 4.0]]
-    )
+    np.testing.assert_allclose(depth_of(d, 0.5, 0.0, gives="inverse", farthest=8.0), [[2.0, 0.0, 0.0], [0.0, 0.0, 4.0]])
     np.testing.assert_allclose(
         depth_of(d, 1.0, 0.0, gives="depth", farthest=8.0), [[1.0, 0.1, 0.0], [0.0, 0.0, 0.5]], rtol=1e-6
     )

@@ -45,7 +45,8 @@ class Knowing:
 
     def __call__(self, images: Any, cameras: Any) -> np.ndarray:
         self.calls.append(len(images))
-        assert all((c.width, c.height) == i.shape[1::-1] and c.w2c.shape == (4, 4) for c, i in zip(cameras, images))
+        for camera, image in zip(cameras, images, strict=True):
+            assert (camera.width, camera.height) == image.shape[1::-1] and camera.w2c.shape == (4, 4)
         out = []
         for image in images:
             key = content_key(image)
@@ -193,7 +194,9 @@ def test_estimated_depth_goes_before_given_and_given_serves_where_nothing_ties(r
     given = [[np.full(SIZE[::-1], 7.0, np.float32)] * FRAMES for _ in depth]
     brought = replace(scene, videos=tuple(replace(v, depth=d) for v, d in zip(scene.videos, given, strict=True)))
     assert with_depth(brought, Stages()).scene is brought
-    assert off(with_depth(brought, Stages(depth=knowing())).scene.videos[0].depth, depth[0], scene.masks[0], 9)[0] < 0.03
+    assert (
+        off(with_depth(brought, Stages(depth=knowing())).scene.videos[0].depth, depth[0], scene.masks[0], 9)[0] < 0.03
+    )
     strict = Stages(depth=knowing(), depth_limits=Limits(least=5000))
     heard: list[str] = []
     kept = with_depth(brought, strict, tell=heard.append)
@@ -205,7 +208,9 @@ def test_estimated_depth_goes_before_given_and_given_serves_where_nothing_ties(r
 def test_a_video_that_nothing_ties_is_named_with_the_reason():
     plain = replace(room := draw_room(5), pictures=tuple(np.full_like(p, 128) for p in room.pictures))
     scene, _, knowing = filmed(Tripod(), (-65, -42), plain, frames=6)
-    bare = replace(scene, videos=tuple(replace(v, frames=[np.full_like(f, 128) for f in v.frames]) for v in scene.videos))
+    bare = replace(
+        scene, videos=tuple(replace(v, frames=[np.full_like(f, 128) for f in v.frames]) for v in scene.videos)
+    )
     prior = knowing()
     found = with_depth(bare, Stages(depth=prior))
     assert not prior.calls  # no model looks at what nothing ties
