@@ -18,7 +18,7 @@ from ..files.cache import Cache
 from .blobs import Blobs, BySize
 from .features import Daisy, LabHistogram
 from .flow import DISFlow
-from .learned import DepthAnything2, Dinov2, Dinov3, Onnx, Raft, Transformers, TransformersDepth
+from .learned import DepthAnything2, DepthAnything3, Dinov2, Dinov3, Onnx, Raft, Transformers, TransformersDepth
 from .masks import FlowResidual, GivenMasks, MedianBackground
 from .points import ChainedFlow
 from .slots import DepthEstimator, Describer, Flow, Masker, Tracker
@@ -60,5 +60,5 @@ FLOWS = (DISFlow, Raft)
 DESCRIBERS = (LabHistogram, Daisy, Dinov3, Dinov2, Transformers, Onnx)
 """Describers of tracks that the shell offers; plugins come on top."""
 
-DEPTHS = (DepthAnything2, TransformersDepth)
+DEPTHS = (DepthAnything2, DepthAnything3, TransformersDepth)
 """Estimators of depth that the shell offers; plugins come on top."""
