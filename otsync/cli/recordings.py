@@ -199,7 +199,7 @@ def sync_recording(
     own = frames == "own"
     if own:
         refuse_unused(options, ("route",), "a recording with --frames own, which has one route,")
-        refuse_unused(options, ("depth",), "a recording with --frames own, whose poses are not known to tie it to,")
+        refuse_unused(options, ("depth",), "a recording with --frames own, without poses to tie it to,")
     stages, threads = options.stages(), options.threads()  # before the work, not after it
     if options.depth is not None and options.route in ("epipolar", "stereo"):
         raise ValueError(

@@ -18,7 +18,17 @@ from ..files.cache import Cache
 from .blobs import Blobs, BySize
 from .features import Daisy, LabHistogram
 from .flow import DISFlow
-from .learned import DepthAnything2, DepthAnything3, Dinov2, Dinov3, Onnx, Raft, Transformers, TransformersDepth
+from .learned import (
+    CoTracker,
+    DepthAnything2,
+    DepthAnything3,
+    Dinov2,
+    Dinov3,
+    Onnx,
+    Raft,
+    Transformers,
+    TransformersDepth,
+)
 from .masks import FlowResidual, GivenMasks, MedianBackground
 from .points import ChainedFlow
 from .slots import DepthEstimator, Describer, Flow, Masker, Tracker
@@ -51,7 +61,7 @@ __all__ = [
 MASKERS = (MedianBackground, FlowResidual)
 """Maskers that the shell offers; plugins come on top."""
 
-TRACKERS = (BySize, ChainedFlow, Blobs)
+TRACKERS = (BySize, ChainedFlow, Blobs, CoTracker)
 """Trackers of points that the shell offers; plugins come on top."""
 
 FLOWS = (DISFlow, Raft)

@@ -131,12 +131,13 @@ def with_depth(
     prior, cache = stages.depth, cache or Cache()
     if prior is None or all(_is_from(video, prior) for video in scene.videos):
         return Estimated(scene, {}, ())
+    weights = cache_key(prior)  # first: what is missing is said before anything is computed
     masks = list(map(lambda n: stages.tracking.masks(scene.videos[n], scene.masks[n], cache), range(len(scene.videos))))
     points = _points(scene, masks, stages, cache, map)
     videos, untied, notes = [], {}, []
     for n, video in enumerate(scene.videos):  # one after the other: an estimator uses all there is
         frames = WorkingFrames(video.frames, (video.camera.width, video.camera.height), stages.tracking.width)
-        key = (stages.tracking.key(video, scene.masks[n]), stages.tracking.width, cache_key(prior))
+        key = (stages.tracking.key(video, scene.masks[n]), stages.tracking.width, weights)
         raw = RawMaps(frames, video.camera, prior, key, cache)
         try:
             depth = tied(raw, video, masks[n], points[n], stages, cache)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -208,6 +209,41 @@ def test_missing_packages_name_the_extra(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "transformers", None)
     with pytest.raises(ModuleNotFoundError, match=r"pip install 'otsync\[learned\]'"):
         TransformersDepth(model=str(tmp_path / "weights")).loaded()
+
+
+def test_the_shell_runs_them_and_says_what_nothing_ties(folder, tmp_path, capsys):
+    """A random network tells no depth that the poses agree with: it is named, and the other route answers."""
+    from otsync.cli import main
+    from tests.recording_world import write_recording
+
+    write_recording(tmp_path / "recording", [0.0, 3.0], frames=40)
+    command = ["sync", str(tmp_path / "recording"), "--out", str(tmp_path / "out"), "--recording.depth"]
+    estimator = f"transformers-depth:model={folder('depth_anything')},tile=112,batch=8,device=cpu"
+    assert main([*command, estimator]) in (0, 1)
+    written = json.loads((tmp_path / "out/sync.json").read_text())
+    assert written["route"] == "epipolar" and "depth" in written["seconds"]
+    assert any("is not tied to the poses" in line for line in written["why"])
+    capsys.readouterr()
+    assert main([*command, estimator, "--recording.route", "tracks", "--out", str(tmp_path / "o")]) == 2
+    assert "route tracks: estimated depth of" in capsys.readouterr().err
+
+
+def test_the_shell_refuses_what_would_not_be_read(tmp_path, capsys, monkeypatch):
+    from otsync.cli import main
+    from tests.recording_world import write_recording
+
+    monkeypatch.setenv("OTSYNC_WEIGHTS", str(tmp_path / "nowhere"))
+    write_recording(tmp_path / "recording", [0.0, 3.0], frames=6)
+    command = ["sync", str(tmp_path / "recording"), "--out", str(tmp_path / "out"), "--recording.depth"]
+    for more, says in (
+        (["depth-anything2", "--recording.route", "epipolar"], "--recording.depth: expected a route that reads it"),
+        (["depth-anything2", "--frames", "own"], "--depth: a recording with --frames own, without poses"),
+        (["depth-anything9"], "--depth: expected some of"),
+        (["depth-anything2:tile=few"], "tile"),
+        (["depth-anything2"], "nowhere"),
+    ):
+        assert main([*command, *more]) == 2, more
+        assert says in capsys.readouterr().err.replace("\n", " "), more
 
 
 def test_the_shell_offers_them_by_name():
