@@ -222,9 +222,11 @@ def _static(
     raw: RawMaps, camera: Camera, masks: Sequence[np.ndarray], points: Points, stages: Stages
 ) -> dict[str, np.ndarray]:
     z = camera.to_camera(points.xyz[:, None])[:, 0, 2]
-    grid = _grid(raw.frames.size)
-    seen = raw.frames.from_full(points.uv)
-    at, behind = _sampled(raw, masks, lambda k: seen), _sampled(raw, masks, lambda k: grid)
+    places = np.concatenate([raw.frames.from_full(points.uv), _grid(raw.frames.size)])
+    seen = _sampled(
+        raw, masks, lambda k: places
+    )  # in one pass: without a cache maps are made as often as they are read
+    at, behind = np.split(seen, [len(points)], axis=1)
     affine, line = tie_static(at, behind, z, points.sigma, gives=raw.prior.gives, limits=stages.depth_limits)
     return _told(affine, line.agree, line.error, float(z[line.agree].max()))
 
