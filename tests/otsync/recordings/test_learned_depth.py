@@ -17,7 +17,7 @@ from otsync.priors.depth_scale import Limits
 from otsync.recordings import Stages, depth_maps, synchronize_scene, with_depth
 from otsync.recordings.learned_depth import TiedMaps, pose_at
 from otsync.recordings.own_frames import synchronize_own_scene
-from otsync.recordings.static_points import static_points
+from otsync.recordings.static_points import View, matched, static_points
 from otsync.simulate.phones import Hand, Tripod
 from otsync.simulate.room import RoomCamera, draw_room
 from otsync.types import Camera, Offsets, Video
@@ -116,6 +116,37 @@ def test_points_of_the_background_lie_on_it(rig, hands):
             share = np.abs(z / still[first, y, x] - 1)
             assert np.median(share) < 0.02 and (share < 0.1).mean() > 0.9
             assert np.median(share / points.sigma) < 2  # sigma tells how far they are off
+
+
+def views(xyz: np.ndarray, moved: np.ndarray | float = 0.0) -> tuple[View, View]:
+    """Two views of points, each with a word of its own; ``moved``: pixels by which the second one's lie off."""
+    rng = np.random.default_rng(3)
+    K = np.array([[500.0, 0, 320], [0, 500, 180], [0, 0, 1]])
+    words = rng.random((len(xyz), 128))
+    words = np.sqrt(words / words.sum(1, keepdims=True)).astype(np.float32)
+    out = []
+    for n, x in enumerate((0.0, -0.8)):
+        w2c = np.eye(4)
+        w2c[0, 3] = x
+        camera = Camera(K, w2c, 640, 360)
+        uv = camera.project(xyz[:, None])[:, 0] + n * moved
+        out.append(View(n, -1, camera, uv, uv, words))
+    return out[0], out[1]
+
+
+def test_features_that_look_alike_count_where_they_obey_the_geometry():
+    rng = np.random.default_rng(4)
+    xyz = np.stack([*rng.uniform(-1, 1, (2, 300)), rng.uniform(3, 8, 300)], 1)
+    good, off = np.arange(200), np.arange(200, 300)
+    moved = np.zeros((300, 2))
+    moved[off, 1] = 2.6  # across the lines, which run along the rows here: near enough to triangulate
+    found = matched(*views(xyz, moved))
+    np.testing.assert_array_equal(found[:, 0], found[:, 1])
+    assert set(found[:, 0]) == set(good)
+    # of views of different things what looks alike lies on its line by chance alone
+    one, other = views(xyz)
+    strange = replace(other, uv=rng.permutation(other.uv))
+    assert len(matched(one, strange)) == 0
 
 
 @pytest.mark.parametrize("gives", ["relative", "inverse", "depth"])
