@@ -19,6 +19,7 @@ from ..compute.threads import MapLike
 from ..files.cache import Cache
 from ..files.digest import content_key
 from ..geometry import distort
+from ..io.frames import FrameRange, LazyFrames
 from ..io.scene import Scene
 from ..priors.depth_scale import Untied, depth_of, tie_moving, tie_static
 from ..priors.slots import DepthEstimator, cache_key
@@ -80,7 +81,7 @@ class RawMaps(Sequence[np.ndarray]):
         return {"maps": (maps / unit[:, None, None]).astype(np.float16), "unit": unit}
 
 
-class TiedMaps(Sequence[np.ndarray]):
+class TiedMaps(LazyFrames):
     """Depth along z of every frame, world units, 0 unknown, as a recording brings it.
 
     affine: (T,2) scale and shift of inverse depth a frame. told: how it was tied, in words.
@@ -92,12 +93,7 @@ class TiedMaps(Sequence[np.ndarray]):
     def __len__(self) -> int:
         return len(self.raw)
 
-    def __getitem__(self, k: Any) -> Any:
-        if isinstance(k, slice):
-            return [self[n] for n in range(len(self))[k]]
-        if not -len(self) <= k < len(self):
-            raise IndexError(f"frame {k} of {len(self)}")
-        k = int(k) % len(self)
+    def frame(self, k: int) -> Float[np.ndarray, "h w"]:
         scale, shift = (float(x) for x in self.affine[k])
         return depth_of(self.raw[k], scale, shift, gives=self.raw.prior.gives, farthest=self.farthest)
 
@@ -164,7 +160,10 @@ def remedy(untied: dict[str, str]) -> str:
 
 
 def _is_from(video: Video, prior: DepthEstimator) -> bool:
-    return isinstance(video.depth, TiedMaps) and cache_key(video.depth.prior) == cache_key(prior)
+    depth = video.depth
+    while isinstance(depth, FrameRange):  # a part of it
+        depth = depth.base
+    return isinstance(depth, TiedMaps) and cache_key(depth.prior) == cache_key(prior)
 
 
 def pose_at(camera: Camera, k: int, size: tuple[int, int]) -> Camera:

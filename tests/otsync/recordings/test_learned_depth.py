@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from otsync.files.digest import content_key
+from otsync.files.digest import content_key, sequence_key
+from otsync.io.mend import cut
 from otsync.io.scene import Scene
 from otsync.priors import Cache
 from otsync.priors.depth_scale import Limits
@@ -207,6 +208,10 @@ def test_maps_are_made_once_and_kept_by_prior(rig, tmp_path):
     np.testing.assert_array_equal(a[-1], a[FRAMES - 1])
     with pytest.raises(IndexError):
         a[FRAMES]
+    part = cut(first.scene, 5, 9)
+    assert with_depth(part, Stages(depth=prior), cache=cache).scene is part
+    np.testing.assert_array_equal(part.videos[1].depth[2], a[7])
+    assert sequence_key(part.videos[1].depth) != a.digest()
 
 
 def test_the_estimators_that_look_at_several_frames_get_them(rig):
