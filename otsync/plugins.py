@@ -37,6 +37,7 @@ GROUPS: dict[str, str] = {
     "trackers": "callables (WorkingFrames, masks, fps) -> point tracks",
     "flows": "optical flow: objects with pair(before, after) -> flow there, flow back",
     "describers": "callables (WorkingFrames, masks, uv, fps) -> a feature per track",
+    "depths": "depth up to scale: callables (images, cameras) -> a map per image, with gives",
     "readers": "layouts of recordings: objects with claims(folder) and describe(folder)",
     "exporters": "formats of a reconstruction: objects with write(scene, out, ...)",
     "losses": "what a fit of the 4D scene minimises",

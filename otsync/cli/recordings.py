@@ -132,6 +132,8 @@ class PriorOptions:
     """The tracker of points."""
     flow: prior("flow") = None
     """Optical flow that the tracker follows."""
+    depth: prior("depth") = None
+    """What estimates depth, tied to the poses by points of the background; it goes before depth that came along."""
     width: int | None = None
     """Pixels of width that videos are tracked at; default: 640. More of it sees smaller things, and takes longer."""
 
@@ -201,7 +203,13 @@ def sync_recording(
     own = frames == "own"
     if own:
         refuse_unused(options, ("route",), "a recording with --frames own, which has one route,")
+        refuse_unused(options, ("depth",), "a recording with --frames own, without poses to tie it to,")
     stages, threads = options.stages(), options.threads()  # before the work, not after it
+    if options.depth is not None and options.route in ("epipolar", "stereo"):
+        raise ValueError(
+            f"--recording.depth: expected a route that reads it (auto, tracks); found --recording.route "
+            f"{options.route}. Leave one of both out."
+        )
     solve: Callable[..., Synchronized]
     if own:
         scene, document = open_without_poses(path, allow_outside=options.allow_outside)

@@ -60,6 +60,8 @@ def from_places(places: Mapping[str, str]) -> dict[str, Load]:
 
 def missing_package(error: ModuleNotFoundError) -> str:
     """Which package is not there, and what to install."""
+    if remedy := getattr(error, "remedy", ""):
+        return f"needs {error.name}. {remedy}"
     if not error.name:
         return f"needs a package that is not installed: {error}"
     package = error.name.partition(".")[0]

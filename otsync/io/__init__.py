@@ -10,6 +10,7 @@ pose2sim.py     Pose2Sim's and Caliscope's .toml, Qualisys' .qca.txt
 footage.py      video files and folders of images
 frames.py       frames of a video without holding the video
 images.py       single images, masks, labels and depth maps from files
+masks/          masks as segmenters write them
 keypoints/      detections and keypoints of other programs
 mend.py         a scene without some of its frames
 """

@@ -13,6 +13,9 @@ from ..files.arrays import check_declared, existing, read_npz
 MAX_PIXELS = 64 * 2**20
 """Largest image that is decoded (64 megapixels, 8K x 8K)."""
 
+MOST_INSTANCES = 64
+"""Largest value of a mask whose values are numbers of instances: what is black and white is bright somewhere."""
+
 FORMATS = ("JPEG", "PNG", "BMP")
 """Decoders that are offered a stranger's bytes; Pillow knows thirty more."""
 
@@ -42,16 +45,30 @@ def read_image(path: str | os.PathLike[str]) -> UInt8[np.ndarray, "H W 3"]:
 def read_mask(path: str | os.PathLike[str]) -> Bool[np.ndarray, "H W"]:
     """Foreground where an image is brighter than half of its own maximum (files hold 0/1 as well as 0/255).
 
-    An image, ``.npy``, or ``.npz`` with one array.
+    An image, ``.npy``, or ``.npz`` with one array. Numbers of a palette or of 16 bits are instances: all but 0 count.
+    ValueError for small numbers that can only be instances too, where some of them would be lost.
     """
-    if os.path.splitext(path)[1].lower() in (".npy", ".npz"):
+    suffix = os.path.splitext(path)[1].lower()
+    exact = suffix not in (".jpg", ".jpeg")
+    if suffix in (".npy", ".npz"):
         values = _array(path, "mask")
+        exact = values.dtype.kind in "iu"
         if values.ndim != 2 or values.dtype.kind not in "biuf":
             raise ValueError(f"{path}: expected a mask (H,W); found {values.dtype} of {values.shape}. Write it again.")
         values = np.nan_to_num(values.astype(np.float32))
     else:
-        values = np.asarray(_decode(path).convert("L"))
-    return values > values.max(initial=0) / 2
+        image = _decode(path)
+        if image.mode == "P" or image.mode.startswith("I"):
+            return np.asarray(image) != 0
+        values = np.asarray(image.convert("L"))
+    most = values.max(initial=0)
+    if exact and most <= MOST_INSTANCES and ((values > 0) & (values < most)).any():
+        some = ", ".join(f"{x:g}" for x in np.unique(values)[:5])
+        raise ValueError(
+            f"{path}: expected a mask of two values; found {some}, ..., which look like numbers of instances. Say so "
+            'in scene.json: "masks": {"frames": ..., "kind": "labels"}, with "kind": "stack" for .npy and .npz.'
+        )
+    return values > most / 2
 
 
 def read_labels(path: str | os.PathLike[str]) -> Int[np.ndarray, "H W"]:

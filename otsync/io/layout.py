@@ -39,6 +39,15 @@ class DepthFile(Document, frozen=True, kw_only=True):
     scale: float = 1.0
 
 
+class MasksFile(Document, frozen=True, kw_only=True):
+    """Masks of a video as segmenters write them: a file a frame, or one of all."""
+
+    frames: Files | UnsetType = UNSET
+    file: Text | UnsetType = UNSET
+    kind: Literal["binary", "labels", "stack", "coco"] | UnsetType = UNSET
+    ids: Annotated[list[Count], Meta(min_length=1, max_length=10_000)] | UnsetType = UNSET
+
+
 class PointsFile(Document, frozen=True, kw_only=True):
     """Points of a video that another program found: a file, or one a frame."""
 
@@ -66,7 +75,7 @@ class VideoFile(Document, frozen=True, kw_only=True):
     range: Annotated[list[Count], Meta(min_length=2, max_length=2)] | None = None
     camera: CameraFile | None = None
     depth: DepthFile | None = None
-    masks: Files | None = None
+    masks: Files | MasksFile | None = None
     labels: Files | None = None
     points: PointsFile | None = None
     tracks: TracksFile | None = None

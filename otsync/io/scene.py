@@ -14,7 +14,8 @@ Paths are relative to the file's folder and may not leave it. ``w2c`` is world-t
 frame. ``range`` [first, stop) keeps some frames; a video file's clock comes from its container unless fps or
 timestamps are given. ``points``: what another program found in the video, in place of our own tracks: a file of
 DeepLabCut, SLEAP, COCO or a table, or OpenPose's files (:mod:`otsync.io.keypoints`); ``least`` is the lowest score that
-counts. ``labels``: images of whole numbers that mean the same thing or class in every video, 0 none.
+counts. ``masks``: black and white images, or an object for label images, stacks and run lengths
+(:mod:`otsync.io.masks`). ``labels``: images of whole numbers that mean the same thing or class in every video, 0 none.
 
 A camera may have ``distortion`` (OpenCV's coefficients) and ``readout``: the seconds that a rolling shutter takes from
 the image's first to its last row (phones: 0.005 to 0.03; measure it, or leave it out, as for images that were turned
@@ -40,6 +41,7 @@ from .frames import ArrayFrames, FrameRange, ImageFrames, LazyFrames, VideoFrame
 from .images import read_depth, read_image, read_labels, read_mask
 from .keypoints import KEYPOINTS, Detections, read_detections
 from .layout import LEAST_SCORE, MAX_FILES, SceneFile
+from .masks import read_masks
 from .order import natural
 from .readers import describe_folder
 from .tracks import TrackFile
@@ -214,7 +216,7 @@ def _video(
             return sequence if len(used) == len(sequence) else FrameRange(sequence, used)
 
         depth = cut(_depth(entry.get("depth"), paths), "depth")
-        masks = cut(_images(entry.get("masks"), paths, read_mask, "mask"), "masks")
+        masks = cut(_masks(entry.get("masks"), paths), "masks")
         labels = cut(_images(entry.get("labels"), paths, read_labels, "labels"), "labels")
         video = Video(cut(frames, "frames") or frames, camera, fps, timestamps, name, depth)
         return video, masks, labels, _points(entry.get("points"), paths, len(frames), used)
@@ -319,6 +321,18 @@ def _tracks(entry: dict[str, Any], paths: Paths) -> TrackFile | None:
 
 def _images(value: Any, paths: Paths, read: Callable[[Path], np.ndarray], kind: str) -> LazyFrames | None:
     return None if value is None else ImageFrames(paths.many(value), read, kind)
+
+
+def _masks(value: Any, paths: Paths) -> LazyFrames | None:
+    """Black and white images, or what the object says (:mod:`otsync.io.masks`)."""
+    if not isinstance(value, dict):
+        return _images(value, paths, read_mask, "mask")
+    if ("file" in value) == ("frames" in value):
+        raise ValueError(
+            "masks: expected either 'frames' (a file a frame) or 'file' (one of all); found both or neither."
+        )
+    files = paths.one(value["file"]) if "file" in value else paths.many(value["frames"])
+    return read_masks(files, value.get("kind"), value.get("ids", ()))
 
 
 def _range(entry: dict[str, Any], n: int) -> range:

@@ -8,8 +8,9 @@ points.py       point tracks by optical flow
 blobs.py        tracks of things too small for flow, and the choice by their size
 linking.py      detections of single frames joined to tracks
 features.py     descriptors of tracks
+depth_scale.py  scale and shift of estimated depth, from points of known depth
 stereo.py       depth of tracked points of a rig by visual hull and correlation
-learned/        features, flow, tracks of learned models
+learned/        features, flow, depth of learned models
 dense.py        the same at every pixel of a mask
 """
 
@@ -17,13 +18,24 @@ from ..files.cache import Cache
 from .blobs import Blobs, BySize
 from .features import Daisy, LabHistogram
 from .flow import DISFlow
-from .learned import Dinov2, Dinov3, Onnx, Raft, Transformers
+from .learned import (
+    CoTracker,
+    DepthAnything2,
+    DepthAnything3,
+    Dinov2,
+    Dinov3,
+    Onnx,
+    Raft,
+    Transformers,
+    TransformersDepth,
+)
 from .masks import FlowResidual, GivenMasks, MedianBackground
 from .points import ChainedFlow
-from .slots import Describer, Flow, Masker, Tracker
+from .slots import DepthEstimator, Describer, Flow, Masker, Tracker
 from .working import WorkingFrames
 
 __all__ = [
+    "DEPTHS",
     "DESCRIBERS",
     "FLOWS",
     "MASKERS",
@@ -34,6 +46,7 @@ __all__ = [
     "ChainedFlow",
     "DISFlow",
     "Daisy",
+    "DepthEstimator",
     "Describer",
     "Flow",
     "FlowResidual",
@@ -48,7 +61,7 @@ __all__ = [
 MASKERS = (MedianBackground, FlowResidual)
 """Maskers that the shell offers; plugins come on top."""
 
-TRACKERS = (BySize, ChainedFlow, Blobs)
+TRACKERS = (BySize, ChainedFlow, Blobs, CoTracker)
 """Trackers of points that the shell offers; plugins come on top."""
 
 FLOWS = (DISFlow, Raft)
@@ -56,3 +69,6 @@ FLOWS = (DISFlow, Raft)
 
 DESCRIBERS = (LabHistogram, Daisy, Dinov3, Dinov2, Transformers, Onnx)
 """Describers of tracks that the shell offers; plugins come on top."""
+
+DEPTHS = (DepthAnything2, DepthAnything3, TransformersDepth)
+"""Estimators of depth that the shell offers; plugins come on top."""

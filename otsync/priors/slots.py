@@ -10,9 +10,10 @@ from collections.abc import Sequence
 from typing import Any, Protocol
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 
 from ..types import Camera
+from .depth_scale import Gives
 from .working import WorkingFrames
 
 
@@ -57,6 +58,28 @@ class Describer(Protocol):
         self, frames: WorkingFrames, masks: Sequence[np.ndarray], uv: Float[np.ndarray, "N T 2"], fps: float
     ) -> Float[np.ndarray, "N D"]:
         """One vector a track, compared by its direction; none is all zeros. ``uv`` as a :class:`Tracker` gives it."""
+        ...
+
+
+class DepthEstimator(Protocol):
+    """The ``depth`` slot: inverse depth of every pixel, up to what points of known depth tell afterwards.
+
+    One that declares ``together`` is always given so many frames at once (the last ones fewer), since what it says of
+    one depends on the others.
+    """
+
+    @property
+    def gives(self) -> Gives:
+        """What its values are: see :mod:`otsync.priors.depth_scale`."""
+        ...
+
+    def __call__(
+        self, images: Sequence[UInt8[np.ndarray, "H W 3"]], cameras: Sequence[Camera]
+    ) -> Float[np.ndarray, "B h w"]:
+        """A map of any size an image, with the image's field of view; not finite where it tells nothing.
+
+        ``cameras``: of the images at their size, each with one pose.
+        """
         ...
 
 

@@ -5,6 +5,8 @@ lift.py         positions in space from pixels and depth
 stages.py       the slots of a run, and what stands in them
 routes.py       which way from a scene to offsets, in which stages
 kept_pairs.py   pairs of videos kept on disk
+static_points.py  points of the background, whose depth is known from poses alone
+learned_depth.py  estimated depth, tied to the poses by these points
 dense_depth.py  depth maps of synchronised recordings
 placement.py    which cameras may stand elsewhere than the scene says
 audit.py        otsync audit: which camera of a rig is not in sync
@@ -14,7 +16,17 @@ check.py        otsync check: what commonly goes wrong in a recording
 from .audit import audit_scene
 from .check import check_scene
 from .dense_depth import depth_maps
+from .learned_depth import with_depth
 from .routes import Synchronized, synchronize_scene
 from .stages import Stages, stages_from
 
-__all__ = ["Stages", "Synchronized", "audit_scene", "check_scene", "depth_maps", "stages_from", "synchronize_scene"]
+__all__ = [
+    "Stages",
+    "Synchronized",
+    "audit_scene",
+    "check_scene",
+    "depth_maps",
+    "stages_from",
+    "synchronize_scene",
+    "with_depth",
+]

@@ -14,6 +14,7 @@ from ..priors.dense import DenseStereo, mask_pixels
 from ..priors.stereo import HullStereo
 from ..priors.working import WorkingFrames
 from ..types import Offsets, Video
+from .learned_depth import with_depth
 from .routes import rig_at
 from .stages import Stages
 
@@ -30,10 +31,10 @@ def depth_maps(
 ) -> list[Float[np.ndarray, "F h w"]]:
     """Depth along z of the moving foreground, in world units, 0 unknown; float32, one stack of maps per video.
 
-    Videos that came with depth maps keep theirs, reduced to ``width`` (0 where a frame has None); the others are
-    measured by visual hull and stereo over the videos that ``offsets`` puts on the reference's clock. A map has its
-    image's field of view, lens distortion included. Videos whose clock is unknown, and moments that too few videos
-    saw, have empty maps.
+    Videos that came with depth maps, or get estimated ones (``stages.depth``), keep these, reduced to ``width`` (0
+    where a frame has None); the others are measured by visual hull and stereo over the videos that ``offsets`` puts on
+    the reference's clock. A map has its image's field of view, lens distortion included. Videos whose clock is unknown,
+    and moments that too few videos saw, have empty maps.
 
     Measured on basketball, 14 cameras x 7 frames of 320 x 180, two cores: 8 s for 7 common moments, 9 s for 98
     unrelated frames, .5 GB. Against the maps of cameras up to 60 degrees away: median difference .62 %, p90 5.9 %;
@@ -46,6 +47,7 @@ def depth_maps(
         map: any map-like callable; two threads use two cores.
     """
     stages, cache = stages or Stages(), cache or Cache()
+    scene = with_depth(scene, stages, cache=cache, map=map).scene
     if not isinstance(stages.stereo, HullStereo):
         raise ValueError(f"stages.stereo: expected HullStereo for dense maps; found {stages.stereo!r}. Leave it out.")
     dense = DenseStereo(stages.stereo, width)

@@ -62,6 +62,11 @@ def synchronize_own_scene(
     ``method``: the matcher of first matches and the graph; ValueError names a slot that own frames have no use for. It
     also names the videos without depth: pixels alone have no distances that could be compared.
     """
+    if stages is not None and stages.depth is not None:
+        raise ValueError(
+            "stages.depth: expected no estimator, since without poses nothing ties its scale to the world; found "
+            f"{type(stages.depth).__name__}. Add depth maps of one scale, or calibrate the cameras."
+        )
     flat = [v.name for v in scene.videos if v.depth is None]
     if flat:
         raise ValueError(

@@ -40,6 +40,7 @@ from ..sync.verb import synchronize
 from ..types import Offsets, Status, TrackSet, Video
 from .given import names_of, tracks_of
 from .kept_pairs import KeptPairs
+from .learned_depth import remedy, with_depth
 from .lift import depth_at
 from .placement import misplaced, with_doubts
 from .stages import Stages, with_labels, with_method
@@ -87,7 +88,8 @@ def synchronize_scene(
         method: what stands in the slots of the stage that gives the answer (matcher, aligner, refiner, graph, rematch,
             rate); what it leaves out is the route's own. On the stereo route the epipolar stage before it keeps its
             own. ValueError names what does not go with the route.
-        stages: the objects of every stage.
+        stages: the objects of every stage. Depth is estimated (``stages.depth``) on the routes auto and tracks, which
+            read it.
         cache: where stages are kept; a run that was killed continues from what is there, with the same result.
         map: any map-like callable; two threads use two cores.
         tell: receives one line per stage.
@@ -96,7 +98,10 @@ def synchronize_scene(
     for video in scene.videos:
         check_within_a_frame(video.camera.readout, video.times, f"camera.readout of {video.name!r}")
     stages, cache = with_labels(stages or Stages(), scene), cache or Cache()
+    progress = Progress(tell)
+    scene, doubts = estimated(scene, route, stages, cache, map, tell, progress)
     chosen, why = choose_route(scene, route, stages)
+    why = (*why, *doubts)
     named = method is not None and bool(method.slots())
     if method is not None:
         stages = with_method(stages, chosen, method)
@@ -104,7 +109,6 @@ def synchronize_scene(
         why = (*why, method.told())
     for line in why:
         tell(line)
-    progress = Progress(tell)
     with progress.stage("tracks"):
         raw = track_all(scene, stages, cache, map, tell)
     if chosen == "tracks":
@@ -151,6 +155,23 @@ def synchronize_scene(
         return replace(epipolar, why=(*why, doubt))
     offsets = replace(offsets, sigma=np.hypot(offsets.sigma, INHERITED * first.sigma)).judged_by_sigma()
     return Synchronized(offsets, tuple(lifted), chosen, why, first, progress.seconds)
+
+
+def estimated(
+    scene: Scene, route: Route, stages: Stages, cache: Cache, map: MapLike, tell: Tell, progress: Progress
+) -> tuple[Scene, tuple[str, ...]]:
+    """The scene with estimated depth where an estimator and no route without depth is named; what to say about it.
+
+    ValueError where it is not tied to the poses and the route asks for depth.
+    """
+    if stages.depth is None or route in ("epipolar", "stereo"):
+        return scene, ()
+    with progress.stage("depth"):
+        found = with_depth(scene, stages, cache=cache, map=map, tell=tell)
+    lacking = {v.name: found.untied[v.name] for v in found.scene.videos if v.depth is None and v.name in found.untied}
+    if lacking and route == "tracks":
+        raise ValueError(f"route tracks: {remedy(lacking)}.")
+    return found.scene, (remedy(lacking),) if lacking else ()
 
 
 def choose_route(scene: Scene, route: Route, stages: Stages) -> tuple[str, tuple[str, ...]]:

@@ -18,8 +18,10 @@ from ..io.scene import Scene
 from ..match.slot import Matcher
 from ..match.unbalanced import UnbalancedOT
 from ..plugins import available, made
-from ..priors import DESCRIBERS, FLOWS, MASKERS, TRACKERS
+from ..priors import DEPTHS, DESCRIBERS, FLOWS, MASKERS, TRACKERS
 from ..priors.blobs import BySize
+from ..priors.depth_scale import Limits
+from ..priors.slots import DepthEstimator
 from ..priors.stereo import HullStereo, TrackDepth
 from ..refine.slot import Refiner
 from ..refine.splines import SplineRefine
@@ -68,6 +70,8 @@ class Stages:
         tracking: masks, point tracks and descriptors. selection: which tracks are kept.
         stereo: depth of tracks by a rig; dense maps ask for a :class:`otsync.priors.stereo.HullStereo`.
         lift: positions from depth.
+        depth: estimates depth from images, tied to the poses (:mod:`otsync.recordings.learned_depth`); it goes before
+            depth that came along. None: there is only that. depth_limits: when points tie a video.
         pixels: how tracks in pixels are synchronised. space: how lifted tracks are.
     """
 
@@ -77,6 +81,8 @@ class Stages:
     lift: Lift = field(default_factory=Lift)
     pixels: Method = PIXELS
     space: Method = SPACE
+    depth: DepthEstimator | None = None
+    depth_limits: Limits = field(default_factory=Limits)
 
 
 PRIORS: dict[str, tuple[str, str, Iterable[Any]]] = {
@@ -84,8 +90,10 @@ PRIORS: dict[str, tuple[str, str, Iterable[Any]]] = {
     "points": ("points", "trackers", TRACKERS),
     "flow": ("flow", "flows", FLOWS),
     "features": ("features", "describers", DESCRIBERS),
+    "depth": ("depth", "depths", DEPTHS),
 }
-"""Option of the shell: field of :class:`Tracking` (flow: of its tracker), group of plugins, our own choices."""
+"""Option of the shell: field of :class:`Tracking` (flow: of its tracker; depth: of :class:`Stages`), group of plugins,
+our own choices."""
 
 
 LEAST_WIDTH = 64
@@ -99,6 +107,7 @@ def stages_from(
     points: str | None = None,
     flow: str | None = None,
     features: str | None = None,
+    depth: str | None = None,
     selection: str | None = None,
     width: int | None = None,
 ) -> Stages:
@@ -107,8 +116,8 @@ def stages_from(
     Args:
         stages: what the other slots hold; default :class:`Stages`.
         masks: of otsync's own or of the plugins in the group "maskers"; points: "trackers"; flow: "flows";
-            features: "describers". None leaves what is there. ValueError lists the choices, or names a field that does
-            not fit.
+            features: "describers"; depth: "depths". None leaves what is there. ValueError lists the choices, or names a
+            field that does not fit.
         selection: ``field=value,field=value`` of :class:`otsync.recordings.tracking.Selection`: which tracks are kept.
         width: pixels of width that videos are tracked at.
 
@@ -117,12 +126,14 @@ def stages_from(
         5
     """
     stages = stages or Stages()
-    spelled = {"masks": masks, "points": points, "flow": flow, "features": features}
+    spelled = {"masks": masks, "points": points, "flow": flow, "features": features, "depth": depth}
     chosen = {}
     for option, text in spelled.items():
         if text is not None:
             slot, group, own = PRIORS[option]
             chosen[slot] = made(text, available(group, own), f"--{option}")
+    if "depth" in chosen:
+        stages = replace(stages, depth=chosen.pop("depth"))
     if width is not None:
         check_whole("--recording.width", width, LEAST_WIDTH)
         chosen["width"] = width

@@ -148,6 +148,16 @@ class RoomCamera:
         self, w2c: Float[np.ndarray, "4 4"], t: float
     ) -> tuple[UInt8[np.ndarray, "H W 3"], Bool[np.ndarray, "H W"]]:
         """The image at world time ``t`` (s) from the pose ``w2c``, and which of its pixels show a thing that moves."""
+        image, moving, _ = self._seen(w2c, t)
+        grain = self.rng.normal(0, self.noise, image.shape[:2])[..., None] if self.noise else 0.0
+        return np.clip(image + grain, 0, 255).astype(np.uint8), moving
+
+    def depth(self, w2c: Float[np.ndarray, "4 4"], t: float) -> Float[np.ndarray, "H W"]:
+        """Depth along z of what :meth:`film` shows, m."""
+        return self._seen(w2c, t)[2]
+
+    def _seen(self, w2c: Float[np.ndarray, "4 4"], t: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The image without grain, which of its pixels show a thing that moves, and its depth."""
         rays, image, depth = self._background(w2c)
         image, depth = image.copy(), depth.copy()
         moving = np.zeros(depth.shape, bool)
@@ -155,8 +165,7 @@ class RoomCamera:
             where, hit = self._ball(w2c, rays, image, depth, centre, float(radius), b)
             image[where][hit] = 0.55 * image[where][hit] + 0.45 * self.room.colours[b]
             moving[where] |= hit
-        grain = self.rng.normal(0, self.noise, image.shape[:2])[..., None] if self.noise else 0.0
-        return np.clip(image + grain, 0, 255).astype(np.uint8), moving
+        return image, moving, depth
 
     def _background(self, w2c: Float[np.ndarray, "4 4"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         key = w2c.tobytes()

@@ -27,7 +27,7 @@ from recon.features.tracks import Alone, FeatureMaps, feature_tracks, own_clock
 from recon.footage.depth import working_depth
 from recon.footage.footage import Footage
 from recon.pipeline.feature_maps import key_of
-from recon.pipeline.stages import lifted_tracks, read_footage, scene_key
+from recon.pipeline.stages import lifted_tracks, read_footage, scene_key, with_estimated
 from recon.scene.seed import moments, shown_at
 
 APART = (16.0, 12.0, 8.0, 6.0, 4.0)
@@ -61,6 +61,7 @@ def dense_tracks(
 
     options, stages = options or Alone(), stages or Stages()
     cache, progress = cache or Cache(), progress or Progress()
+    scene = with_estimated(scene, stages, cache, map, progress)
     with progress.stage("tracks of every video"):
         sparse = {t.name: t for t in lifted_tracks(scene, offsets, cache, map, progress, stages)}
     lacking = [n for n in scene.names if n not in sparse]

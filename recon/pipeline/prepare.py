@@ -23,7 +23,15 @@ from recon.pipeline.feature_maps import maps_from
 from recon.pipeline.intake import readable, split
 from recon.pipeline.plan import Plan
 from recon.pipeline.readings import read_by, with_readings
-from recon.pipeline.stages import NoDepth, backdrop_of_scene, featured, initial_scene, lifted_tracks, read_footage
+from recon.pipeline.stages import (
+    NoDepth,
+    backdrop_of_scene,
+    featured,
+    initial_scene,
+    lifted_tracks,
+    read_footage,
+    with_estimated,
+)
 from recon.pipeline.starts import FromImages, Given, OnScaffold, Start
 from recon.pipeline.track_sets import tracks_of
 from recon.scene.gaussians4d import Gaussians4D
@@ -101,6 +109,8 @@ def prepare(
     with progress.stage("reading"):
         scene = readable(scene, cache, map, progress)
         train, others, offsets, clocks = split(scene, offsets, held_out, progress)
+    if start.reads_geometry:
+        train = with_estimated(train, stages, cache, map, progress)
     for v, video in enumerate(train.videos):
         check_effects(plan.effects, video.times, v)
     if backdrop is not None and backdrop.gains.shape != (len(train.videos), 3):

@@ -47,6 +47,20 @@ class NoDepth(ValueError):
     """No track can be lifted into space: no depth is given, and none can be measured."""
 
 
+def with_estimated(scene: Scene, stages: Stages, cache: Any, map: MapLike, progress: Progress) -> Scene:
+    """The scene with estimated depth where an estimator is named (``stages.depth``), and a note on who has none."""
+    if stages.depth is None:
+        return scene
+    from otsync.recordings.learned_depth import remedy, with_depth
+
+    with progress.stage("depth"):
+        found = with_depth(scene, stages, cache=cache, map=map, tell=progress.tell)
+    lacking = {v.name: found.untied[v.name] for v in found.scene.videos if v.depth is None and v.name in found.untied}
+    if lacking:
+        progress.note(remedy(lacking))
+    return found.scene
+
+
 def lifted_tracks(
     scene: Scene, offsets: Offsets, cache: Any, map: MapLike, progress: Progress, stages: Stages = STAGES
 ) -> tuple[TrackSet, ...]:

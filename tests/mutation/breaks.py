@@ -33,6 +33,10 @@ MOTION_LOSSES = ("tests/recon/losses/test_motion_losses.py",)
 WARP = ("tests/recon/motion/test_motion_warp.py",)
 SOLVE = ("tests/recon/motion/test_motion_solve.py",)
 OBSERVE = ("tests/recon/observe",)
+DEPTH = ("tests/otsync/priors/test_depth_scale.py",)
+TIED = ("tests/otsync/recordings/test_learned_depth.py",)
+COTRACKER = ("tests/otsync/priors/learned/test_cotracker.py",)
+RUNS = ("tests/otsync/io/test_masks.py",)
 
 
 @dataclass(frozen=True)
@@ -1046,5 +1050,61 @@ BREAKS = (
         "torch.stack(depths).mean(0)",
         OBSERVE,
         "the depth of a blurred image is not divided by alpha",
+    ),
+    Break(
+        "depth-line-least-squares",
+        "otsync/priors/depth_scale.py",
+        "weight = np.where(left <= AGREES, np.minimum(1.0, HUBER / np.maximum(left, 1e-9)), 0.0) / sigma**2",
+        "weight = np.ones_like(left) / sigma**2",
+        DEPTH,
+        "outliers pull the scale of estimated depth",
+    ),
+    Break(
+        "depth-flicker-kept",
+        "otsync/priors/depth_scale.py",
+        "out[k], known[k] = (a * out[k, 0], a * out[k, 1] + b), True",
+        "known[k] = True",
+        DEPTH,
+        "a static camera's depth flickers as the estimator does",
+    ),
+    Break(
+        "depth-not-inverted",
+        "otsync/priors/depth_scale.py",
+        "return np.where(np.isfinite(d) & (d > 0), 1 / d, np.nan)",
+        "return np.where(np.isfinite(d) & (d > 0), d, np.nan)",
+        DEPTH,
+        "metric depth is taken for inverse depth",
+    ),
+    Break(
+        "static-points-from-chance",
+        "otsync/recordings/static_points.py",
+        "kept = pairs[on_line]",
+        "kept = pairs",
+        TIED,
+        "matches off their epipolar lines become points of known depth",
+    ),
+    Break(
+        "tied-points-behind-what-moves",
+        "otsync/recordings/learned_depth.py",
+        "free = inside & ~mask[np.minimum(y, mask.shape[0] - 1), np.minimum(x, mask.shape[1] - 1)]",
+        "free = inside",
+        TIED,
+        "points of the background are read where something covers them",
+    ),
+    Break(
+        "cotracker-window-unshifted",
+        "otsync/priors/learned/cotracker.py",
+        "places, seen = run(np.concatenate([np.full((len(seeds), 1), k - start), seeds], 1))",
+        "places, seen = run(np.concatenate([np.full((len(seeds), 1), 0), seeds], 1))",
+        COTRACKER,
+        "seeds of later frames are asked for in the first one of the window",
+    ),
+    Break(
+        "run-lengths-by-rows",
+        "otsync/io/masks/run_lengths.py",
+        "return np.repeat(np.arange(len(runs)) % 2 == 1, runs).reshape(width, height).T",
+        "return np.repeat(np.arange(len(runs)) % 2 == 1, runs).reshape(height, width)",
+        RUNS,
+        "COCO's masks are read along the rows",
     ),
 )

@@ -477,6 +477,13 @@ def test_options_of_recordings(recording, tmp_path):
         assert first != answer([*base, f"--recording.{priors[0]}", priors[1]]), priors
         code, _, err = run([*base, f"--recording.{priors[0]}", "nothing"])
         assert code == 2 and f"--{priors[0]}" in err
+    for depth, more, says in (
+        ("nothing", [], "--depth: expected some of"),
+        ("depth-anything2", ["--recording.route", "epipolar"], "--recording.depth: expected a route that reads it"),
+        ("depth-anything2:model=nowhere", [], "expected weights at"),
+    ):  # what it does: tests/otsync/recordings/test_learned_depth.py
+        code, _, err = run([*base, "--recording.depth", depth, *more])
+        assert code == 2 and says in " ".join(err.split())
     for option, other, wrong in (("selection", "count=20", "pace=3"), ("width", "200", "8")):
         assert first != answer([*base, f"--recording.{option}", other]), option
         code, _, err = run([*base, f"--recording.{option}", wrong])
@@ -728,7 +735,7 @@ def rows() -> set[str]:
         "graph.extra graph.complete "
         "graph.curves graph.starts graph.seed recording.route recording.cameras recording.cache "
         "recording.allow_outside recording.workers recording.masks recording.points recording.flow recording.features "
-        "recording.selection recording.width",
+        "recording.depth recording.selection recording.width",
         "simulate": "out motion preset videos frames fps max_offset own_frames seed",
         "film": "out phones gap handheld walk frames fps width height max_offset contrast seed",
         "calibrate": "folder out force options.intrinsics options.board options.distance options.key_frames "

@@ -313,6 +313,7 @@ def test_priors_of_a_fit(world, home):
         "width": 64
     }
     refused(recon.cli.main, fitting(world, home / "o", "--recording.width", "9"), "--recording.width")
+    refused(recon.cli.main, fitting(world, home / "o", "--recording.depth", "a"), "--depth: expected some of")
     for name, value in (("points", "blobs"), ("flow", "dis-flow")):
         refused(recon.cli.main, fitting(world, home / "o", f"--recording.{name}", value), name, "--tracks")
 
@@ -928,10 +929,10 @@ def rows() -> set[str]:
     plan = {*PLAN, *OF_A_FIT}
     others = {
         "fit": "scene offsets out held_out tracks truth view cache json allow_outside recording.masks recording.points "
-        "recording.flow recording.width",
+        "recording.flow recording.depth recording.width",
         "run": "scene out held_out reference truth json allow_outside recording.route recording.cameras "
         "recording.cache recording.allow_outside recording.masks recording.points recording.flow recording.features "
-        "recording.selection recording.width",
+        "recording.depth recording.selection recording.width",
         "bench": "scene truth rows out cache name lpips_weights json allow_outside gate rebase protocol.held_out "
         "protocol.cameras protocol.amplitudes protocol.seeds protocol.lengths protocol.held_out_tracks",
         "lifting": "scene out cache json allow_outside lifting.cameras lifting.steps lifting.seed lifting.width "

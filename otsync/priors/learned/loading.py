@@ -20,12 +20,25 @@ HOME = Path("~/.cache/otsync/weights")
 """The folder where there is no such variable."""
 
 
-def package(name: str, extra: str) -> Any:
-    """The imported package. ModuleNotFoundError says which extra brings it, and its name what is not there."""
+class Missing(ModuleNotFoundError):
+    """A package that no extra brings is not there. remedy: what to do, as a sentence."""
+
+    def __init__(self, text: str, name: str, remedy: str):
+        super().__init__(f"{text} {remedy}", name=name)
+        self.remedy = remedy
+
+
+def package(name: str, extra: str = "", remedy: str = "") -> Any:
+    """The imported package. ModuleNotFoundError says which extra brings it, and its name what is not there.
+
+    ``remedy``: how to install it, where no extra of ours brings it (:class:`Missing`).
+    """
     try:
         return importlib.import_module(name)
     except ModuleNotFoundError as error:
         missing = (error.name or name).partition(".")[0]
+        if remedy:
+            raise Missing(f"{name}: expected the package {missing}; not installed.", missing, remedy) from None
         raise ModuleNotFoundError(
             f"{name}: expected the package {missing}; not installed. pip install 'otsync[{extra}]'.", name=missing
         ) from None
