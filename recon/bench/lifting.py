@@ -29,15 +29,16 @@ from otsync.types import Offsets, TrackSet, Video
 from otsync.types.checks import check_whole
 from recon.bench.fits import Protocol, material_of
 from recon.features.lift import FeatureFrame, lift_features
-from recon.features.maps import DaisyMaps, LabMaps
 from recon.features.tracks import Alone, FeatureMaps, fit_alone, gaussian_tracks, lifted_frames, seen_weights
 from recon.footage.footage import Footage
+from recon.pipeline.feature_maps import maps_from
 from recon.pipeline.plan import Plan
 from recon.raster import render, set_threads
 from recon.scene.gaussians4d import Gaussians4D, join
 
 Row = dict[str, Any]
-MAPS: dict[str, FeatureMaps] = {"Lab": LabMaps(), "DAISY": DaisyMaps()}
+TOLD = {"lab": "Lab", "daisy": "DAISY"}
+"""How tables name extractors; others by what the shell calls them."""
 APART = (16.0, 12.0, 8.0, 6.0, 4.0)
 """Pixels at 640 of width between tracks: the first that leaves :data:`COUNT`, so that they cover all that moves. The 16
 that synchronisation asks for leave some fifty in a clip of 1.6 s."""
@@ -63,6 +64,8 @@ class Lifting:
     """First and last (exclusive) frame of every video to use; default: all."""
     held_out: tuple[str, ...] = ()
     """Names of videos that take no part."""
+    features: tuple[str, ...] = ("lab", "daisy")
+    """Extractors of feature maps that are compared, as ``otsync run --features`` names them."""
     channels: int = 64
     """Feature channels of the map whose lifting is timed."""
     repeats: int = 15
@@ -71,6 +74,17 @@ class Lifting:
     def __post_init__(self) -> None:
         for name, least in (("cameras", 2), ("steps", 0), ("seed", 0), ("width", 1), ("channels", 1), ("repeats", 1)):
             check_whole(name, getattr(self, name), least)
+        if not self.features:
+            raise ValueError("features: expected one extractor or more; found none.")
+        _ = self.maps
+
+    @property
+    def maps(self) -> dict[str, FeatureMaps]:
+        """The extractors by the names that tables give them. ValueError for one that there is not, or two of a name."""
+        heads = [text.partition(":")[0] for text in self.features]
+        if len(set(heads)) < len(heads):
+            raise ValueError(f"features: expected extractors of different names; found {', '.join(heads)}.")
+        return {TOLD.get(h, h): maps_from(text) for h, text in zip(heads, self.features, strict=True)}
 
     @property
     def protocol(self) -> Protocol:
@@ -145,7 +159,7 @@ def sources_of(
     weights = seen_weights(scene, footage)
 
     out = {}
-    for name, maps in MAPS.items():
+    for name, maps in lifting.maps.items():
         lifted = thinned(gaussian_tracks(scene, footage, flow, maps, options=options, weights=weights))
         out[f"flow, {name} averaged"] = averaged(thinned(flow), footage, maps, options.every)
         out[f"Gaussians, {name} averaged"] = averaged(lifted, footage, maps, options.every)

@@ -35,7 +35,6 @@ from otsync.io import open_scene
 from otsync.plugins import available, entries, made
 from otsync.types import Offsets, TrackSet
 from recon.cli.commands import OWN
-from recon.features.maps import LabMaps
 from recon.fit.optimize import every_group, rates_on
 from recon.fit.options import FitOptions
 from recon.fit.verb import fit
@@ -716,12 +715,12 @@ def lifted(synchronous, home, monkeypatch) -> Callable[..., Any]:
 
     monkeypatch.setattr("recon.bench.lifting.matched", compared)
     monkeypatch.setattr("recon.bench.lifting._median_ms", once)
-    monkeypatch.setattr("recon.bench.lifting.MAPS", {"Lab": LabMaps()})
 
     def ask(*more: str, scene: Path = synchronous) -> Any:
         timed.clear()
         args = ["lifting", str(scene), "--out", str(home / "lifting"), "--cache", str(home / "stages"), "--json"]
-        args += ["--width", str(SIZE[0]), "--cameras", "2", "--steps", "1", *more]
+        args += ["--width", str(SIZE[0]), "--cameras", "2", "--steps", "1"]
+        args += [*(() if "--features" in more else ("--features", "lab")), *more]
         return plain(json.loads(done(recon.cli.main, args))), list(timed)
 
     return ask
@@ -738,6 +737,7 @@ def test_options_of_lifting(lifted, synchronous, home):
         ["--frames", "1", "10"],
         ["--held-out", "cam1", "cam2"],
         ["--channels", "9"],
+        ["--features", "lab:bins=3"],
         ["--repeats", "2"],
     ):
         assert lifted(*more) != base, more
@@ -936,7 +936,7 @@ def rows() -> set[str]:
         "bench": "scene truth rows out cache name lpips_weights json allow_outside gate rebase protocol.held_out "
         "protocol.cameras protocol.amplitudes protocol.seeds protocol.lengths protocol.held_out_tracks",
         "lifting": "scene out cache json allow_outside lifting.cameras lifting.steps lifting.seed lifting.width "
-        "lifting.frames lifting.held_out lifting.channels",
+        "lifting.frames lifting.held_out lifting.channels lifting.features",
         "render": "result camera every_camera path times frames turns fps width out",
         "eval": "result scene held_out offsets truth views lpips_weights out json allow_outside",
         "export": "result format at fps out",
