@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import importlib.util
 import io
 import json
 import logging
@@ -789,6 +790,10 @@ def test_options_of_export(result, fitted, home):
             done(recon.cli.main, ["export", str(of), "--format", kind, "--out", str(folder / "x"), *more])
             return contents(folder)
 
+        if kind == "4dgs" and importlib.util.find_spec("fourdgs") is None:
+            refused(recon.cli.main, ["export", str(result), "--format", kind], "pip install 'otsync[4dgs]'")
+            written.add(kind)
+            continue
         base = export()
         written.add(str(base))
         assert base != export(of=fitted("--seed", "3")[-1])
