@@ -814,6 +814,7 @@ def test_options_of_simulate(home):
 
     base = world()
     for more in (
+        ["--layout", "sync-nerf"],
         ["--cameras", "3"],
         ["--held-out", "0"],
         ["--frames", "5"],
@@ -909,7 +910,7 @@ def rows() -> set[str]:
         "export": "result format at fps out",
         "demo": "out seed steps",
         "view": "what port stages allow_outside",
-        "simulate": "out cameras held_out frames width height max_offset gain noise exposure readout sheen seed",
+        "simulate": "out layout cameras held_out frames width height max_offset gain noise exposure readout sheen seed",
     }
     slots = {f"run {o}" for o in options_of(SYNC["sync"]) if slotted(o)}
     shared = (

@@ -1,4 +1,4 @@
-"""``otsync bench shifts`` on a small filmed rig: shifts come back, by tracks, by keypoints, and by Pose2Sim's own code."""
+"""``otsync bench shifts`` on a small filmed rig: shifts come back, by tracks, by keypoints, by Pose2Sim's own code."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def recording(tmp_path_factory) -> Path:
     """Balls before a wall, all cameras at the same moments; and a "person" of 33 points as Pose2Sim keeps keypoints."""
     home = tmp_path_factory.mktemp("rig")
     write_recording(home, [0.0] * CAMERAS, frames=FRAMES, balls=5)
-    points = paths(np.arange(FRAMES) / FPS, POINTS, 3) + [0, 0.4, 0]
+    points = paths(np.arange(FRAMES) / FPS, POINTS, 3) + np.array([0, 0.4, 0])
     for v, camera in enumerate(ring(CAMERAS)):
         folder = home / "pose" / f"cam{v}_json"
         folder.mkdir(parents=True)
