@@ -79,8 +79,8 @@ class Simulate:
         )
         if self.layout == "sync-nerf":
             names = write_sync_nerf(capture, self.out)
-            held = names[: self.held_out]
-            print(f"{self.out}: {len(names)} videos, held out: {' '.join(held) or 'none'}; truth.json, start.json")
+            first = " ".join(names[: self.held_out])
+            print(f"{self.out}: {len(names)} videos, held out: {first or 'none'}; truth.json, start.json")
             print(f"try: otsync sync {self.out} --truth {self.out}/truth.json --out synchronised")
             return 0
         write_capture(capture, self.out)
