@@ -48,8 +48,8 @@ class Bench:
     suite: tyro.conf.Positional[suite_names()]
     """Which benchmark; "all": every one that needs no recording, but for films and thresholds, which take hours."""
     scene: tyro.conf.Positional[Path | None] = None
-    """A truly synchronised recording (its folder or scene.json): of panoptic and audit; if you like, of chain,
-    own-frames and calibrate."""
+    """A truly synchronised recording (its folder or scene.json): of panoptic, audit and shifts; if you like, of
+    chain, own-frames and calibrate."""
     out: Path = Path("bench/out")
     """Folder for CSV, JSON and plots."""
     gate: bool = False
@@ -60,11 +60,11 @@ class Bench:
     """For sync and match: measure what is promised, on fresh seeds, instead of the tables; for trust: exit code 1 where
     it is not kept."""
     first_seed: int | None = None
-    """For core, match, sync, panoptic, chain, own-frames, trust, thresholds, calibrate and audit: where they begin;
-    default: the suite's own."""
+    """For core, match, sync, panoptic, chain, own-frames, trust, thresholds, calibrate, audit and shifts: where they
+    begin; default: the suite's own."""
     seeds: int | None = None
-    """For core, match, sync, chain, own-frames, trust, thresholds, calibrate and audit: how many; default: the suite's
-    own."""
+    """For core, match, sync, chain, own-frames, trust, thresholds, calibrate, audit and shifts: how many; default: the
+    suite's own."""
     only: tuple[str, ...] = ()
     """For match, hard-cases and chain: names of the solvers to run; for calibrate of the worlds, for trust of the
     classes, for thresholds of the limits; default: all."""
@@ -75,8 +75,8 @@ class Bench:
     json: bool = False
     """For panoptic and own-frames: one line of JSON on standard output instead of tables."""
     cache: Path | None = None
-    """For panoptic, chain, own-frames, calibrate and audit: where tracks and depth are kept; default: stages in
-    --out."""
+    """For panoptic, chain, own-frames, calibrate, audit and shifts: where tracks and depth are kept; default: stages
+    in --out."""
 
     def run(self) -> int:
         self._check()

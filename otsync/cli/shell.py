@@ -29,6 +29,7 @@ EXTRAS = {
     "poselib": "calibrate",
     "gsplat": "cuda",
     "viser": "view",
+    "fourdgs": "4dgs",
     "transformers": "learned",
     "torchvision": "learned",
     "onnxruntime": "learned",

@@ -193,6 +193,13 @@ class VideoFrames(LazyFrames):
         self._decoded = self._container.decode(stream)
         self._next = k
 
+    @property
+    def turned(self) -> int:
+        """Degrees (0 to 359) by which players turn the image clockwise; frames are as they are stored all the same."""
+        with self._lock, self._errors(), self._open() as container:
+            first = next(container.decode(container.streams.video[0]), None)
+            return -int(getattr(first, "rotation", 0)) % 360
+
     def digest(self) -> str:
         return file_digest(self.path)
 

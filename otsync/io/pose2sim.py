@@ -37,6 +37,7 @@ class Pose2Sim:
 
     name = "pose2sim"
     looks_for = "a .toml of cameras (matrix, rotation, translation) or a .qca.txt, in the folder or in calibration/"
+    brings = "cameras, distortion; the clock of videos"
 
     def claims(self, folder: Path) -> bool:
         return bool(_videos(folder)) and _calibration(folder) is not None

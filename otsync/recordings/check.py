@@ -128,6 +128,8 @@ def check_scene(
             remedy = document["calibration"]["cameras"][name].get("remedy") or "Find it anew: otsync calibrate."
             findings.append(Finding("warning", name, f"its camera is doubtful: {doubt.rstrip('.')}.", remedy))
         findings += _intrinsics(one.videos[0])
+        if "calibration" not in document:  # otsync calibrate knows how a phone was held
+            findings += _held(one.videos[0])
         findings += _files(one, every_frame)
         findings += _clock(entry, one.videos[0], Paths(root, allow_outside))
     cameras = _cameras(entries)
@@ -335,6 +337,21 @@ def _intrinsics(video: Video) -> Iterable[Finding]:
     if not SQUARE[0] < K[0, 0] / K[1, 1] < SQUARE[1]:
         yield Finding(
             "warning", video.name, f"focal lengths {K[0, 0]:.4g} and {K[1, 1]:.4g} differ a lot.", "Check K's rows."
+        )
+
+
+def _held(video: Video) -> Iterable[Finding]:
+    """Videos that players turn: a camera that another program calibrated on turned images is not that of ours."""
+    turned = 0
+    with suppress(ValueError):  # frames that do not decode are told by _files
+        turned = video.frames.turned if isinstance(video.frames, VideoFrames) else 0
+    if turned:
+        yield Finding(
+            "warning",
+            video.name,
+            f"players turn it by {turned} degrees; otsync takes the image as it is stored.",
+            "K and w2c must be of the stored image. If they were found on the turned one, as OpenCV shows it, turn the "
+            "pixels for good: ffmpeg -i old.mp4 new.mp4.",
         )
 
 

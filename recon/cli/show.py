@@ -205,8 +205,8 @@ class Export:
     """Folder that recon fit or otsync run wrote."""
     format: one_of("exporters", EXPORTERS) = "ply"
     """ply, supersplat (upright there) and splat hold a moment, ply-sequence every frame, checkpoint the whole scene,
-    tracks an otsync track set, tapvid3d the same as TAPVid-3D, dynamic3dgs params.npz of Dynamic3DGaussians, page an
-    HTML file that plays the scene in a browser."""
+    tracks an otsync track set, tapvid3d the same as TAPVid-3D, dynamic3dgs params.npz of Dynamic3DGaussians, 4dgs
+    the span as .4dgs (extra 4dgs), page an HTML file that plays the scene in a browser."""
     at: float | None = None
     """World second of the moment; default: the middle."""
     fps: float | None = None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import tyro
 
@@ -14,10 +15,15 @@ class Simulate:
     """Film a small simulated scene with unsynchronised cameras, and write it as a recording with its truth.
 
     Example: recon simulate world --cameras 5 --seed 3
+
+    As a Blender scene of Sync-NeRF: recon simulate walkers --layout sync-nerf --cameras 13 --max-offset 10
     """
 
     out: tyro.conf.Positional[Path]
     """Folder for scene.json, images, masks, depth, tracks and truth.json."""
+    layout: Literal["scene", "sync-nerf"] = "scene"
+    """scene: ours, with all that was measured; sync-nerf: videos and transforms.json, as Sync-NeRF's Blender scenes
+    come, and the truth; cameras that are held out come first there."""
     cameras: int = 5
     held_out: int = 1
     """Cameras between the others, for evaluation: they film at true world time."""
@@ -51,6 +57,7 @@ class Simulate:
         from recon.simulate.capture import synthetic
         from recon.simulate.effects import Blur, Exposure, MoreNoise, Rolling, Sheen
         from recon.simulate.recording import write_capture
+        from recon.simulate.sync_nerf import write_sync_nerf
 
         wanted = (
             (Sheen, self.sheen),
@@ -70,6 +77,12 @@ class Simulate:
             offsets=self.max_offset,
             effects=tuple(effect(size) for effect, size in wanted if size),
         )
+        if self.layout == "sync-nerf":
+            names = write_sync_nerf(capture, self.out)
+            first = " ".join(names[: self.held_out])
+            print(f"{self.out}: {len(names)} videos, held out: {first or 'none'}; truth.json, start.json")
+            print(f"try: otsync sync {self.out} --truth {self.out}/truth.json --out synchronised")
+            return 0
         write_capture(capture, self.out)
         held = " ".join(f.name for f in capture.held_out)
         print(f"{self.out}: {len(capture.footage)} cameras, held out: {held or 'none'}; truth.json, start.json")

@@ -1,6 +1,7 @@
 """The folder of a reconstruction, and ways to show it: images, video, exports, the report page."""
 
 from recon.result.export import Checkpoint, Exporter, Ply, PlySequence, Splat, Tracks
+from recon.result.four_dgs import FourDgs
 from recon.result.others import Dynamic3DGaussians, SuperSplat, TapVid3D
 from recon.result.page import Page
 
@@ -13,6 +14,7 @@ EXPORTERS: tuple[Exporter, ...] = (
     Tracks(),
     TapVid3D(),
     Dynamic3DGaussians(),
+    FourDgs(),
     Page(),
 )
 """Our own formats."""
@@ -22,6 +24,7 @@ __all__ = [
     "Checkpoint",
     "Dynamic3DGaussians",
     "Exporter",
+    "FourDgs",
     "Page",
     "Ply",
     "PlySequence",

@@ -6,6 +6,7 @@ camera.py     a camera that films the world
 estimates.py  tracks and depth maps with errors
 capture.py    synthetic(): all of it at once
 recording.py  a capture as a recording on disk, and the scene that a fit of it begins with
+sync_nerf.py  a capture in Sync-NeRF's Blender layout
 """
 
 from recon.simulate.capture import Capture, synthetic

@@ -61,3 +61,10 @@ def test_four_phones(run):
     pytest.importorskip("pycolmap")
     printed = run("11_four_phones.py", "--frames", "75", "--walk", "200")
     assert "phone3: to be trusted" in printed and "offsets: off by" in printed
+
+
+@pytest.mark.slow
+def test_a_set_in_the_layout_of_sync_nerf(run):
+    small = ["--cameras", "5", "--frames", "40", "--width", "160", "--max-offset", "2"]
+    printed = run("12_sync_nerf.py", *small, "--steps", "10", "--backdrop-steps", "10")
+    assert "| refined" in printed and "| PSNR" in printed

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import importlib.util
 import io
 import json
 import logging
@@ -826,6 +827,10 @@ def test_options_of_export(result, fitted, home):
             done(recon.cli.main, ["export", str(of), "--format", kind, "--out", str(folder / "x"), *more])
             return contents(folder)
 
+        if kind == "4dgs" and importlib.util.find_spec("fourdgs") is None:
+            refused(recon.cli.main, ["export", str(result), "--format", kind], "pip install 'otsync[4dgs]'")
+            written.add(kind)
+            continue
         base = export()
         written.add(str(base))
         assert base != export(of=fitted("--seed", "3")[-1])
@@ -846,6 +851,7 @@ def test_options_of_simulate(home):
 
     base = world()
     for more in (
+        ["--layout", "sync-nerf"],
         ["--cameras", "3"],
         ["--held-out", "0"],
         ["--frames", "5"],
@@ -942,7 +948,7 @@ def rows() -> set[str]:
         "export": "result format at fps out",
         "demo": "out seed steps",
         "view": "what port stages allow_outside",
-        "simulate": "out cameras held_out frames width height max_offset gain noise exposure readout sheen seed",
+        "simulate": "out layout cameras held_out frames width height max_offset gain noise exposure readout sheen seed",
     }
     slots = {f"run {o}" for o in options_of(SYNC["sync"]) if slotted(o)}
     shared = (

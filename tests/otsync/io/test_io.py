@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -243,6 +244,32 @@ def write_video(path: Path, times: list[int], b_frames: int = 2) -> None:
             out.mux(packet)
 
 
+@pytest.mark.parametrize("turned", [0, 90, 180, 270])
+def test_a_phones_video_is_read_as_it_is_stored(tmp_path, turned):
+    """B-frames, a late start, sound beside it, and a flag by which players turn the image."""
+    with av.open(str(tmp_path / "v.mp4"), "w") as out:
+        stream = out.add_stream("libx264", rate=30, options={"crf": "1", "bf": "2", "g": "12"})
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        stream.set_display_rotation(-turned)
+        sound = out.add_stream("aac", rate=48000, layout="mono")
+        for k in range(20):
+            image = np.full((48, 64, 3), 4 * k + 20, np.uint8)
+            image[:12, :16] = 250  # top left
+            frame = av.VideoFrame.from_ndarray(image, format="rgb24")
+            frame.pts = k + 15
+            out.mux(stream.encode(frame))
+        out.mux(stream.encode())
+        tone = av.AudioFrame.from_ndarray(np.zeros((1, 4096), np.float32), format="fltp", layout="mono")
+        tone.sample_rate = 48000
+        out.mux(sound.encode(tone))
+        out.mux(sound.encode())
+    video = VideoFrames(tmp_path / "v.mp4")
+    assert (video.width, video.height, len(video), video.turned) == (64, 48, 20, turned)
+    np.testing.assert_allclose(video.timestamps, (np.arange(20) + 15) / 30, atol=1e-4)
+    for k in (19, 0, 7):
+        assert video[k][:8, :12].mean() > 240 and abs(float(video[k][24:].mean()) - (4 * k + 20)) < 4, k
+
+
 def test_video_frames_keep_the_containers_clock(tmp_path):
     times = [3000 * k + (1500 if k % 7 == 3 else 0) for k in range(50)]
     write_video(tmp_path / "v.mp4", times)
@@ -358,10 +385,19 @@ def test_panoptic_layout(tmp_path):
     np.testing.assert_allclose(scene.videos[1].camera.center, cameras[1].center)
     assert scene.masks[0] is not None and not scene.masks[0][0].any()
     assert any("30 fps" in note for note in scene.notes)
-    meta["w2c"] = [[c.w2c.tolist() for c in cameras]] * 3
-    (tmp_path / "train_meta.json").write_text(json.dumps(meta))
-    with pytest.raises(ValueError, match=r"train_meta\.json"):
-        open_scene(tmp_path)
+    mirrored = [(np.linalg.inv(c.w2c) @ np.diag([1.0, 1, -1, 1])).tolist() for c in cameras]
+    zoomed = [[c.K.tolist() for c in cameras]] * 3 + [[(2 * c.K).tolist() for c in cameras]]
+    for change, words in (
+        ({"w2c": [[c.w2c.tolist() for c in cameras]] * 3}, "do not agree.*Mend"),
+        ({"w2c": [mirrored] * 4}, r"camera 0: .*det.*\+1"),
+        ({"k": zoomed}, "zoom is not supported"),
+        ({"cam_id": [[1, 1]] * 4}, "expected every camera once; found 1 again.*Mend"),
+        ({"cam_id": None}, "expected w, h, fn, k, w2c and cam_id"),
+        ({"fn": [*meta["fn"][:3], ["0/000003.jpg"]]}, "do not agree"),
+    ):
+        (tmp_path / "train_meta.json").write_text(json.dumps(meta | change))
+        with pytest.raises(ValueError, match=r"train_meta\.json.*" + words):
+            open_scene(tmp_path)
 
 
 def test_the_papers_scene_opens(data):

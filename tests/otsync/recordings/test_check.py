@@ -6,6 +6,7 @@ import copy
 import json
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 from PIL import Image
@@ -46,6 +47,27 @@ def text(found) -> str:
 
 def test_a_sound_scene_has_no_findings(sound):
     assert findings(sound) == []
+
+
+def test_a_video_that_players_turn_is_told(tmp_path, sound):
+    _, document = sound
+    for name, turned in (("level", 0), ("upside", 180)):
+        with av.open(str(tmp_path / f"{name}.mp4"), "w") as out:
+            stream = out.add_stream("libx264", rate=30)
+            stream.width, stream.height, stream.pix_fmt = 32, 18, "yuv420p"
+            stream.set_display_rotation(turned)
+            for k in range(50):
+                image = np.full((18, 32, 3), 5 * k, np.uint8)
+                out.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+            out.mux(stream.encode())
+    videos = [
+        {"name": n, "file": f"{n}.mp4", "camera": document["videos"][v]["camera"]}
+        for v, n in enumerate(("level", "upside"))
+    ]
+    told = [f for f in findings((tmp_path, document | {"videos": videos})) if "players" in f.what]
+    assert [(f.severity, f.video) for f in told] == [("warning", "upside")] and "by 180 degrees" in told[0].what
+    document = document | {"videos": videos, "calibration": {"method": "global", "unit": "metres", "cameras": {}}}
+    assert not [f for f in findings((tmp_path, document)) if "players" in f.what]
 
 
 def each_pose(videos, function):

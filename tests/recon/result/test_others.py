@@ -65,6 +65,16 @@ def test_tracks_of_tapvid3d_project_where_the_gaussians_are(result, scene, tmp_p
     assert inside.any()
     np.testing.assert_array_equal(np.isfinite(uv[..., 0]), inside)
     np.testing.assert_allclose(uv[inside], expected[inside], atol=1e-3)
+    # as TAPVid-3D's own loaders read it: (T,N,3) in the camera's axes, projected by fx, fy, cx, cy
+    with np.load(tmp_path / "tapvid3d.npz") as told:
+        xyz, seen, (fx, fy, cx, cy) = told["tracks_XYZ"], told["visibility"], told["fx_fy_cx_cy"]
+        queries = told["queries_xyt"]
+    assert xyz.shape == (3, 40, 3) and seen.shape == (3, 40) and queries.shape == (40, 3)
+    at = np.stack([fx * xyz[..., 0] / xyz[..., 2] + cx, fy * xyz[..., 1] / xyz[..., 2] + cy], -1)
+    np.testing.assert_array_equal(seen.T, inside)
+    np.testing.assert_allclose(at.transpose(1, 0, 2)[inside], expected[inside], atol=1e-3)
+    for n in np.flatnonzero(inside.any(1)):
+        np.testing.assert_allclose(queries[n, :2], expected[n, int(queries[n, 2])], atol=1e-3)
     with pytest.raises(ValueError, match="needs a camera"):
         export(scene, TapVid3D(), tmp_path / "x.npz", TIMES)
 
