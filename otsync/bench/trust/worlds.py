@@ -65,11 +65,14 @@ class World:
             known = np.isfinite(clock)
             order = np.argsort(clock[known], kind="stable")
             true = np.interp(found, clock[known][order], first[known][order], left=np.nan, right=np.nan)
-            asked = np.isfinite(found) & np.isfinite(true) & steady(own, self.tracks[v].times)
-            asked &= ~near(found, clock, ~steady(first, self.tracks[0].times))
-            if not asked.any():
+            common = np.isfinite(found) & np.isfinite(true)
+            if not common.any():
                 ends[v - 1] = worst[v - 1] = np.inf  # nothing that is claimed to be common is
                 continue
+            asked = common & steady(own, self.tracks[v].times)
+            asked &= ~near(found, clock, ~steady(first, self.tracks[0].times))
+            if not asked.any():  # a clock that is a steep staircase all along: its middle is asked for, everywhere
+                asked = common
             error = np.abs(levelled(true - own, asked, self.tracks[v].times)) * FPS
             ends[v - 1], worst[v - 1] = max(error[0], error[-1]), error.max()
         return ends, worst

@@ -29,12 +29,6 @@ FAULTS = st.one_of(
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(
-    strict=True,
-    raises=AssertionError,
-    reason="found and open: a clock that wanders by frames within a clip of 2 s (clean boxes, seed 0, 20 tracks, 60 "
-    "frames, Repeats(15) and ClockDrift(.125) in the first video) is trusted at .22, 2.25 frames off at an end",
-)
 @settings(
     max_examples=WORLDS,
     derandomize=True,

@@ -13,6 +13,7 @@ from otsync.bench.trust.diagram import reliability
 from otsync.bench.trust.run import acceptance, interval, run, summarise, wrong
 from otsync.bench.trust.worlds import CLASSES, FPS, World
 from otsync.simulate import simulate
+from otsync.simulate.effects import In, Repeats
 from otsync.types import Break, Offsets
 
 
@@ -36,6 +37,18 @@ def test_a_break_that_is_not_told_is_an_error_behind_it():
 
     told = dataclasses.replace(plain, breaks=((), (Break(at, -1.0, 1.0),)))
     assert world.errors(told)[0][0] < 0.01
+
+
+def test_a_steep_staircase_is_asked_for_its_middle():
+    """Fifteen pictures a second shown at twenty in a file of thirty: no frame is steady, but the clock has a middle."""
+    fast = (In(0, Repeats(15.0)), In(0, Repeats(20.0)))
+    tracks, truth = simulate("boxes", preset="clean", videos=2, frames=60, tracks=20, effects=fast, seed=0)
+    world = World(tuple(tracks), truth.shown)
+    late = float(np.mean(truth.shown[0] - truth.shown[0][0] - tracks[0].times)) + truth.shown[0][0]
+    true = truth.shown[1][0] - late
+    for off in (0.0, 0.1, -0.8):
+        ends, _ = world.errors(Offsets.known(("a", "b"), np.array([0.0, true + off]), FPS))
+        assert ends[0] == pytest.approx(abs(off) * FPS, abs=0.7), off
 
 
 def test_where_there_is_no_truth_every_answer_is_wrong():
