@@ -67,9 +67,14 @@ def export_ply_sequence(scene: Gaussians4D, times: Sequence[float], folder: str 
 def scene_tracks(scene: Gaussians4D, times: Sequence[float], name: str = "scene", frame: str = "world") -> TrackSet:
     """The trajectories of all moving Gaussians at world ``times`` as a track set on the world's clock.
 
-    frame: name of the world frame that the recording declares. Features are the Gaussians' own, where lifted.
+    frame: name of the world frame that the recording declares. Features are the Gaussians' own, where lifted, as unit
+    vectors; of Gaussians that no camera saw, equal entries, as of tracks that no frame was looked at for.
     """
-    features = None if scene.features is None else scene.features.detach().cpu().numpy()
+    features = None
+    if scene.features is not None:
+        own = scene.features.detach().cpu().double().numpy()
+        own = np.where(np.linalg.norm(own, axis=1, keepdims=True) > 1e-9, own, 1.0)
+        features = own / np.linalg.norm(own, axis=1, keepdims=True)
     return TrackSet(scene.tracks(times), features=features, timestamps=np.asarray(times, float), name=name, frame=frame)
 
 
