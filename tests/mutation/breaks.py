@@ -37,6 +37,7 @@ DEPTH = ("tests/otsync/priors/test_depth_scale.py",)
 TIED = ("tests/otsync/recordings/test_learned_depth.py",)
 COTRACKER = ("tests/otsync/priors/learned/test_cotracker.py",)
 RUNS = ("tests/otsync/io/test_masks.py",)
+DENSE = ("tests/recon/pipeline/test_dense_tracks.py",)
 
 
 @dataclass(frozen=True)
@@ -1106,5 +1107,37 @@ BREAKS = (
         "return np.repeat(np.arange(len(runs)) % 2 == 1, runs).reshape(height, width)",
         RUNS,
         "COCO's masks are read along the rows",
+    ),
+    Break(
+        "features-on-own-clock",
+        "recon/pipeline/feature_maps.py",
+        "world = offsets.clock(v).world(one.times)",
+        "world = one.times",
+        DENSE,
+        "features are lifted from frames as if all videos had begun together",
+    ),
+    Break(
+        "features-of-background",
+        "recon/pipeline/feature_maps.py",
+        "weight = one.masks[k] / np.float32(255)",
+        "weight = None",
+        DENSE,
+        "what stands behind a limb is lifted into it, too",
+    ),
+    Break(
+        "backbone-half-a-cell-off",
+        "recon/features/maps.py",
+        "x = (columns + 0.5) * (cells.shape[1] / w) - 0.5",
+        "x = (columns + 0.5) * (cells.shape[1] / w)",
+        DENSE,
+        "cells are read half a cell beside where they lie",
+    ),
+    Break(
+        "kept-maps-in-full",
+        "recon/features/maps.py",
+        "return found.astype(np.float32)  # in half precision, kept or not: the same fit comes out",
+        "return self._maps(self._footage.images[k], self._footage.masks[k])",
+        DENSE,
+        "a map that is made anew differs from one that was kept",
     ),
 )

@@ -102,9 +102,11 @@ def test_features_of_a_scene_are_those_of_its_surfaces():
     scene = fit_alone(capture.footage[0], capture.tracks[0], capture.depth[0].__getitem__, options=Alone(steps=20))
 
     def colours(image, mask):
-        return image / np.float32(255) - 0.5
+        """Those of the foreground; something loud behind it, which must not be lifted."""
+        return np.where(mask[..., None] > 0, image / np.float32(255) - 0.5, np.float32([30, -30, 30]))
 
-    offsets = Offsets.known([f.name for f in capture.footage], np.zeros(3), 30.0)
+    names = [f.name for f in capture.footage]
+    offsets = Offsets.known(names, np.zeros(3), 30.0)
     found = with_features(scene, capture.footage, offsets, colours).features
     length = found.norm(dim=1)
     assert torch.all((length - 1).abs().lt(1e-5) | length.eq(0)) and (length > 0).float().mean() > 0.8
@@ -112,6 +114,15 @@ def test_features_of_a_scene_are_those_of_its_surfaces():
     alike = torch.nn.functional.cosine_similarity(found, own, dim=1)[length > 0]
     by_chance = torch.nn.functional.cosine_similarity(found, own.flip(0), dim=1)[length > 0]
     assert alike.median() > 0.9 and alike.median() > by_chance.median() + 0.2
+    # what is told by an offset may as well be told by the frames' times
+    late = Offsets.known(names, np.array([0.0, 0.1, -0.05]), 30.0)
+    moved = [replace(f, times=f.times + s) for f, s in zip(capture.footage, late.seconds, strict=True)]
+    by_offset, by_times = (
+        with_features(scene, footage, clock, colours).features
+        for footage, clock in ((capture.footage, late), (moved, offsets))
+    )
+    np.testing.assert_allclose(by_offset, by_times, atol=1e-5)
+    assert not np.allclose(by_offset, found, atol=1e-3)
     with pytest.raises(ValueError, match="features: expected masks"):
         with_features(scene, [replace(f, masks=None) for f in capture.footage], offsets, colours)
 
