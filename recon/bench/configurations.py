@@ -45,7 +45,7 @@ from recon.motion import PerGaussian, Sampled, Scaffold
 from recon.observe import EFFECTS, Effect
 from recon.observe.recorded import all_effects
 from recon.pipeline.plan import Plan
-from recon.pipeline.readings import SUPPLIED
+from recon.pipeline.readings import OF_ITSELF
 from recon.pipeline.starts import FromImages, OnScaffold, OnTracks, Start
 from recon.scene.gaussians4d import Gaussians4D
 
@@ -230,7 +230,7 @@ def configurations() -> dict[str, Configuration]:
     for name, kind in available("losses", LOSSES).items():
         if kind in usual:
             rows[f"without {name}"] = Configuration(change=without_loss(kind))
-        elif getattr(kind, "reads", None) in (None, *SUPPLIED):
+        elif getattr(kind, "reads", None) in (None, *OF_ITSELF):
             rows[f"with {name}"] = Configuration(change=with_loss(kind))
     for name, effect in all_effects().items():
         if effect not in EFFECTS:

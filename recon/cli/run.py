@@ -72,7 +72,7 @@ class Run:
         from otsync.report.frames import write_recording_report
         from recon.cli.common import deadline_of, opened, reconstructed, with_length
         from recon.fit.run import Diverged
-        from recon.pipeline.dense_tracks import synchronized_by_features
+        from recon.pipeline.dense_tracks import NoDenseTracks, synchronized_by_features
         from recon.pipeline.feature_maps import maps_from
         from recon.pipeline.intake import given_clocks, readable
         from recon.pipeline.stages import NoDepth
@@ -141,7 +141,7 @@ class Run:
                         map=pool.map,
                         progress=progress,
                     )
-                except (NoDepth, EmptyHull) as error:
+                except (NoDepth, NoDenseTracks, EmptyHull) as error:
                     if method is not None and method.slots():
                         raise
                     progress.note(f"no dense tracks: {error} The answer of sparse ones stands")

@@ -34,6 +34,10 @@ APART = (16.0, 12.0, 8.0, 6.0, 4.0)
 """Pixels at 640 of width between tracks, in turn: the first that leaves as many as the selection asks for."""
 
 
+class NoDenseTracks(ValueError):
+    """A video has no dense tracks: nothing of it can be lifted, or nothing lives and moves enough."""
+
+
 def dense_tracks(
     scene: Scene,
     offsets: Offsets,
@@ -55,7 +59,7 @@ def dense_tracks(
         options: how each video is fitted; its steps, and which Gaussians count as seen.
 
     Raises:
-        ValueError: names videos that have no depth, or nothing that moves.
+        NoDepth: no video has depth. NoDenseTracks: names those that lack it.
     """
     from otsync.files.cache import Cache
 
@@ -66,7 +70,7 @@ def dense_tracks(
         sparse = {t.name: t for t in lifted_tracks(scene, offsets, cache, map, progress, stages)}
     lacking = [n for n in scene.names if n not in sparse]
     if lacking:
-        raise ValueError(
+        raise NoDenseTracks(
             f"--features: expected tracks in space of every video; {', '.join(lacking)} have none. Add depth maps, or "
             "leave these videos out (--recording.cameras)."
         )
@@ -165,7 +169,7 @@ def thinned(tracks: TrackSet, selection: Selection) -> TrackSet:
         if len(chosen) >= selection.count:
             break
     if len(chosen) == 0:
-        raise ValueError(
+        raise NoDenseTracks(
             f"video {tracks.name}: expected dense tracks that live and move enough; found none of {len(tracks)}. Lower "
             "the limits (--recording.selection), or leave out --features."
         )

@@ -18,8 +18,11 @@ from recon.losses import ImageLoss, Loss
 from recon.losses.image import Sightings, tie_tracks
 from recon.scene.gaussians4d import Gaussians4D
 
-SUPPLIED = ("depth", "tracks", "features")
-"""Fields of footage that a recording fills, where a loss reads them; features where an extractor is named."""
+OF_ITSELF = ("depth", "tracks")
+"""Fields of footage that a recording fills, where a loss reads them."""
+
+SUPPLIED = (*OF_ITSELF, "features")
+"""The same, and what it fills where an extractor is named."""
 
 REACH = 8.0
 """Footprints from a tracked point to the last of the Gaussians that carry it: some three voxels of the seeding."""

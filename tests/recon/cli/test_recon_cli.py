@@ -201,7 +201,7 @@ def test_eval_repeats_the_figures_of_the_run(world, result, tmp_path, capsys):
         ),
         (
             ["fit", "nowhere", "--offsets", "nowhere.json", "--losses", "photometric", "feature"],
-            "losses: Feature compares with features, which are not made of a recording",
+            "losses, features: expected feature maps for Feature to compare with",
         ),
         (
             ["fit", "nowhere", "--offsets", "nowhere.json", "--losses", "photometric", "track", "densify:densify"],

@@ -155,7 +155,6 @@ def test_depth_is_measured_where_the_reference_sees_nothing_that_moves(given, mo
     scene, offsets, _ = given
     flat = replace(scene, videos=tuple(replace(v, depth=None) for v in scene.videos))
     few = replace(Stages(), stereo=replace(Stages().stereo, min_views=2))
-    monkeypatch.setattr(recordings, "Stages", lambda: few)
     still = flat.videos[0].name
     choose, at = recordings.select, []
 
@@ -171,7 +170,7 @@ def test_depth_is_measured_where_the_reference_sees_nothing_that_moves(given, mo
     monkeypatch.setattr(recordings, "select", select)
     monkeypatch.setattr(recordings, "stereo_depth", depth)
     progress = Progress()
-    tracks = lifted_tracks(flat, offsets, Cache(), map, progress)
+    tracks = lifted_tracks(flat, offsets, Cache(), map, progress, few)
     assert {t.name for t in tracks} == {"cam1", "cam2"} and still in progress.notes[0]
     np.testing.assert_array_equal(at[0].seconds, offsets.seconds[1:])
 
