@@ -128,15 +128,16 @@ def synchronized_by_features(
     """The answer of dense feature tracks, by the method of lifted tracks (``stages.space``).
 
     Args:
-        coarse: an answer of the same videos; where depth is measured by stereo, it is measured there. The rest is as
-            of :func:`dense_tracks`.
+        coarse: an answer of the same videos. Depth by stereo is measured at the offsets from pixels that it went on
+            from, whatever the method made of them: so an ablation of methods compares answers to the same tracks. The
+            rest is as of :func:`dense_tracks`.
     """
     from otsync.files.cache import Cache
 
     stages, cache, progress = stages or Stages(), cache or Cache(), progress or Progress()
     dense = dense_tracks(
         scene,
-        coarse.offsets,
+        coarse.offsets if coarse.first is None else coarse.first,
         maps,
         width=width,
         options=options,
