@@ -127,6 +127,11 @@ class Run:
             if r.pull is not None:
                 self._pull += r.pull
 
+    def reach(self, group: str) -> float:
+        """How far Adam's steps so far can have moved an entry of a group, in the group's own unit."""
+        steps = range(self.step)
+        return self.adam.rates.get(group, 0.0) * sum(self.decay(k / self.total if self.total else 0.0) for k in steps)
+
     def look(self, values: dict[str, Tensor], video: int, frame: int, later: float = 0.0) -> Tensor:
         """The image [h,w,3] of a frame's box as the scene gives it, ``later`` seconds after the frame, without a
         graph.

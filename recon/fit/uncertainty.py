@@ -7,8 +7,9 @@ At the end of a fit each frame of a video proposes one Gauss-Newton step of that
 with the residuals r of its pixels. Pixels of one frame err together (a wrong shape, a highlight), frames further apart
 much less: so frames, not pixels, are taken as independent (a sandwich estimate, White 1980). What the frames agree on
 beyond the answer is a bias that the fit did not follow, and is added. The motion is held, so this is a lower bound:
-what a short fit has not settled yet is added too (:func:`unsettled`), and the clock that the fit began with, where it
-has a sigma of its own, is the other witness (:func:`reconciled`).
+what a short fit has not settled yet is added too (:func:`unsettled`), and what it could not have reached
+(:func:`unreached`); the clock that the fit began with, where it has a sigma of its own, is the other witness
+(:func:`reconciled`).
 """
 
 from __future__ import annotations
@@ -68,6 +69,19 @@ def unsettled(history: np.ndarray, reference: int) -> np.ndarray:
     relative = history[:, 1:] - history[:, 1 + reference, None]
     early = np.flatnonzero(history[:, 0] <= 2 / 3 * history[-1, 0])  # the start is always among them
     return np.abs(relative[early[-1] :] - relative[-1]).max(0)
+
+
+def unreached(start_sigma: np.ndarray, reach: float) -> np.ndarray:
+    """[V] seconds by which each start may be off and that a fit had no steps to go: what it says is not heeded there.
+
+    An optimiser moves an offset by its rate a step at most. A fit of a few steps stays where it began, whatever the
+    pictures say, so its frames agree on the start and nothing seems unsettled.
+
+    Args:
+        start_sigma: one standard deviation of the clocks that it began with, seconds; nan or 0: no witness.
+        reach: seconds that all steps together can move an offset.
+    """
+    return np.where(np.isfinite(start_sigma), np.fmax(start_sigma - reach, 0.0), 0.0)
 
 
 def relative_sigma(sigma: np.ndarray, reference: int) -> np.ndarray:

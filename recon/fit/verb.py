@@ -31,7 +31,7 @@ from recon.fit.checkpoint import Checkpoint
 from recon.fit.options import FitOptions
 from recon.fit.problem import Problem, assemble, check_groups
 from recon.fit.run import Diverged, Run
-from recon.fit.uncertainty import reconciled, relative_sigma, repeated, unsettled
+from recon.fit.uncertainty import reconciled, relative_sigma, repeated, unreached, unsettled
 from recon.fit.undisturbed import one_thread_each, uninterrupted
 from recon.footage.footage import Footage
 from recon.observe.effects import initial_parameters
@@ -208,6 +208,7 @@ def _finish(run: Run, seconds: float) -> Reconstruction:
         before = relative_sigma(sigma, p.reference)
         together = repeated if p.offsets.stats.get(PHOTOMETRIC) else reconciled
         refined, sigma, contradicted = together(p.start, before, refined, fitted, p.reference)
+        sigma = np.hypot(sigma, unreached(before, run.reach("offsets")))
         for v in np.flatnonzero(contradicted):
             flags[p.index[v]] = in_order((*flags[p.index[v]], Status.CONTRADICTED))
     clocks = torch.as_tensor(refined).to(values["offsets"])

@@ -17,7 +17,7 @@ from ...files.arrays import read_json
 from ...files.strict import nearest
 from ..features import samples
 from ..working import WorkingFrames, bilinear
-from .loading import device_of, digest_of, dtype_of, package, weights
+from .loading import device_of, digest_of, package, pretrained, weights
 from .tiles import Run, tiled
 
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
@@ -167,19 +167,8 @@ class Onnx(Dense):
 
 @cache
 def _transformers(path: Path, device: str, dtype: str) -> Loaded:
-    transformers = package("transformers", "learned")
     torch = package("torch", "learned")
-    try:
-        model = transformers.AutoModel.from_pretrained(
-            str(path), local_files_only=True, use_safetensors=True, dtype=dtype_of(dtype)
-        )
-    except (OSError, ValueError, KeyError) as error:
-        said = " ".join(str(error).split())[:200]
-        raise ValueError(
-            f"{path}: expected a backbone of transformers (config.json and model.safetensors); {said}. Save it with "
-            "save_pretrained."
-        ) from None
-    model = model.eval().to(device)
+    model = pretrained("AutoModel", path, device, dtype, "a backbone")
     takes = inspect.signature(model.forward).parameters
     more = {"interpolate_pos_encoding": True} if "interpolate_pos_encoding" in takes else {}
     patch = getattr(model.config, "patch_size", None)

@@ -15,7 +15,7 @@ from ...files.arrays import read_json
 from ...types import Camera
 from ..depth_scale import Gives, brought
 from .backbones import MEAN, STD
-from .loading import device_of, digest_of, dtype_of, package, weights
+from .loading import device_of, digest_of, package, pretrained, weights
 from .tiles import tiled
 
 SAYS: dict[str, Gives] = {
@@ -179,19 +179,8 @@ def agreeing(d: Float[np.ndarray, "h w"], like: Float[np.ndarray, "h w"], shift:
 
 @cache
 def _estimator(path: Path, device: str, dtype: str) -> Estimator:
-    transformers = package("transformers", "learned")
     torch = package("torch", "learned")
-    try:
-        model = transformers.AutoModelForDepthEstimation.from_pretrained(
-            str(path), local_files_only=True, use_safetensors=True, dtype=dtype_of(dtype)
-        )
-    except (OSError, ValueError, KeyError) as error:
-        said = " ".join(str(error).split())[:200]
-        raise ValueError(
-            f"{path}: expected a depth estimator of transformers (config.json and model.safetensors); {said}. Save it "
-            "with save_pretrained."
-        ) from None
-    model = model.eval().to(device)
+    model = pretrained("AutoModelForDepthEstimation", path, device, dtype, "a depth estimator")
     config = model.config
     told: dict[str, Any] = {}
     if (path / "preprocessor_config.json").is_file():

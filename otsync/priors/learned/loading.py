@@ -89,6 +89,25 @@ def dtype_of(text: str) -> Any:
     return known[text]
 
 
+def pretrained(kind: str, path: Path, device: str, dtype: str, what: str) -> Any:
+    """A model of ``transformers`` from a local folder, of the class ``kind``, ready to answer.
+
+    what: it is, for errors: ValueError names the file and what was expected in it.
+    """
+    transformers = package("transformers", "learned")
+    try:
+        model = getattr(transformers, kind).from_pretrained(
+            str(path), local_files_only=True, use_safetensors=True, dtype=dtype_of(dtype)
+        )
+    except (OSError, ValueError, KeyError) as error:
+        said = " ".join(str(error).split())[:200]
+        raise ValueError(
+            f"{path}: expected {what} of transformers (config.json and model.safetensors); {said}. Save it with "
+            "save_pretrained."
+        ) from None
+    return model.eval().to(device)
+
+
 def digest_of(path: Path) -> str:
     """A hash of the content of a file, or of all files of a folder: results are kept by it, not by a name."""
     files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]

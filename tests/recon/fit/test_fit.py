@@ -566,3 +566,14 @@ def test_sigkill_at_random_moments_changes_nothing(tmp_path):
             break
     assert kills >= 3
     assert (tmp_path / "killed.json").read_bytes() == (tmp_path / "whole.json").read_bytes()
+
+
+def test_a_fit_of_few_steps_is_as_unsure_of_the_clocks_as_it_began(capture, scene):
+    """Two steps move an offset by .04 frame at most: that pictures agree on the start says nothing then."""
+    wrong = np.array([0.0, 1.0, -1.0]) / 30
+    start = replace(believed(capture, wrong), sigma=np.array([0.0, 0.7, 0.7]) / 30)
+    for steps, reach in ((0, 0.0), (2, 0.04)):
+        found = fit(scene, capture.footage, start, steps=steps).offsets
+        assert (found.sigma[1:] * 30 >= 0.7 - reach - 1e-6).all() and not any(s.ok for s in found.status[1:])
+    longer = fit(scene, capture.footage, start, steps=60).offsets
+    assert (longer.sigma[1:] < found.sigma[1:]).all()

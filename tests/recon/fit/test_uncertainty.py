@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from recon.fit.uncertainty import newton_sigma, reconciled, relative_sigma, repeated, sandwich, unsettled
+from recon.fit.uncertainty import newton_sigma, reconciled, relative_sigma, repeated, sandwich, unreached, unsettled
 
 
 def test_sandwich_is_the_variance_of_the_weighted_step():
@@ -54,6 +54,12 @@ def test_a_video_that_shows_no_motion_has_no_sigma():
     keys = np.array([(0, 0), (0, 1), (1, 0), (1, 1)])
     sigma = newton_sigma(lambda v, k, later: still, lambda v, k: still, keys, 0, 2, 1 / 30)
     assert sigma[0] == 0 and np.isnan(sigma[1])
+
+
+def test_what_a_fit_could_not_reach_stays_as_unsure_as_it_was():
+    sigma = np.array([0.0, 0.02, 0.001, np.nan])
+    np.testing.assert_allclose(unreached(sigma, 0.002), [0, 0.018, 0, 0])
+    assert not unreached(sigma, 0.1).any()
 
 
 def test_the_reference_s_own_error_counts():
