@@ -153,8 +153,7 @@ def synchronize_scene(
     if not named and (doubt := _less_sure(offsets, first)):
         tell(doubt)
         return replace(epipolar, why=(*why, doubt))
-    offsets = replace(offsets, sigma=np.hypot(offsets.sigma, INHERITED * first.sigma)).judged_by_sigma()
-    return Synchronized(offsets, tuple(lifted), chosen, why, first, progress.seconds)
+    return Synchronized(inheriting(offsets, first), tuple(lifted), chosen, why, first, progress.seconds)
 
 
 def estimated(
@@ -365,6 +364,12 @@ INHERITED = 0.55
 """Share of the errors of the pixels' offsets that the answer of lifted tracks has, since depth was built at these: in
 three recordings of ``recon simulate`` (seeds 30, 33, 36), whose depth was built at offsets that were wrong by .7 frame
 (three draws each), .29 to .86, .55 on average."""
+
+
+def inheriting(offsets: Offsets, first: Offsets) -> Offsets:
+    """The answer of tracks whose depth was measured at the offsets ``first``, with its share of their errors."""
+    return replace(offsets, sigma=np.hypot(offsets.sigma, INHERITED * first.sigma)).judged_by_sigma()
+
 
 LESS_SURE = 2.0
 """Times the sigma of the pixels' answer from which on lifted tracks are no gain. Of a mouse in a glass cylinder, 5

@@ -19,7 +19,8 @@ from otsync.geometry import seen_pixels
 from otsync.io import Scene
 from otsync.progress import Progress
 from otsync.recordings.dense_depth import depth_maps
-from otsync.recordings.routes import Synchronized, pairs_in_space, without_times
+from otsync.recordings.placement import misplaced, with_doubts
+from otsync.recordings.routes import Synchronized, inheriting, pairs_in_space, without_times
 from otsync.recordings.stages import Stages
 from otsync.recordings.tracking import Selection
 from otsync.types import Offsets, TrackSet, Video
@@ -131,13 +132,24 @@ def synchronized_by_features(
         coarse: an answer of the same videos. Depth by stereo is measured at the offsets from pixels that it went on
             from, whatever the method made of them: so an ablation of methods compares answers to the same tracks. The
             rest is as of :func:`dense_tracks`.
+
+    The doubts about cameras hold here, too, and errors of offsets that depth was measured at count in sigma.
     """
     from otsync.files.cache import Cache
 
     stages, cache, progress = stages or Stages(), cache or Cache(), progress or Progress()
+    scene = with_estimated(scene, stages, cache, map, progress)
+    flat = [v.name for v in scene.videos if v.depth is None]
+    if flat and coarse.route == "epipolar":
+        raise NoDenseTracks(
+            f"--features: expected depth of every video; {', '.join(flat)} have none, and none can be measured at the "
+            f"offsets from pixels ({coarse.why[-1]}). Add depth maps, or more cameras."
+        )
+    at = coarse.offsets if coarse.first is None else coarse.first
+    doubtful = set(scene.doubtful) | (misplaced(at) if flat else set())
     dense = dense_tracks(
         scene,
-        coarse.offsets if coarse.first is None else coarse.first,
+        at,
         maps,
         width=width,
         options=options,
@@ -148,7 +160,8 @@ def synchronized_by_features(
     )
     chosen = [thinned(t, stages.selection) for t in dense]
     with progress.stage("synchronise dense tracks"):
-        offsets = without_times(pairs_in_space(chosen, reference, stages, cache, map))
+        offsets = with_doubts(without_times(pairs_in_space(chosen, reference, stages, cache, map)), doubtful)
+    offsets = inheriting(offsets, at) if flat else offsets
     why = (
         *coarse.why,
         f"dense feature tracks of every video, {min(map(len, chosen))} and more, in place of sparse ones",

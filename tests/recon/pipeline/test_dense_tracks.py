@@ -12,13 +12,13 @@ import torch
 from otsync.cli import main as otsync
 from otsync.files.cache import Cache
 from otsync.io import open_scene
-from otsync.recordings.routes import Synchronized
+from otsync.recordings.routes import INHERITED, Synchronized
 from otsync.recordings.stages import Stages
 from otsync.recordings.tracking import Selection
-from otsync.types import Offsets
+from otsync.types import Offsets, Status
 from recon.features.maps import Backbone, DaisyMaps, KeptMaps, LabMaps
 from recon.features.tracks import Alone, fit_alone
-from recon.pipeline.dense_tracks import dense_tracks, synchronized_by_features, thinned
+from recon.pipeline.dense_tracks import NoDenseTracks, dense_tracks, synchronized_by_features, thinned
 from recon.pipeline.feature_maps import choices, key_of, maps_from, with_features
 from recon.pipeline.stages import NoDepth
 from recon.simulate.capture import synthetic
@@ -145,6 +145,32 @@ def test_dense_tracks_answer_by_the_method_of_lifted_ones(recording, known, cach
         np.testing.assert_array_equal(a.features, b.features)
     with pytest.raises(ValueError, match="dense tracks that live and move enough"):
         thinned(again[0], replace(FEW.selection, extent=1e4))
+
+
+def test_doubts_of_cameras_and_of_measured_depth_are_in_the_answer(recording, known, cache, monkeypatch):
+    """Depth that was measured at offsets carries their errors; a camera in doubt is in doubt whatever was tracked."""
+    scene = replace(open_scene(recording), doubtful={"cam1": "its focal length is a guess"})
+    options = {"width": SIZE[0], "options": SHORT, "stages": FEW, "cache": cache}
+    given = Synchronized(known, (), "tracks", ("as asked",))
+    plain = synchronized_by_features(scene, given, LabMaps(), **options).offsets
+    assert [Status.MISPLACED in f for f in plain.flags] == [False, True, False]
+    flat = replace(scene, videos=tuple(replace(v, depth=None) for v in scene.videos))
+    unsure = replace(known, sigma=np.array([0.0, 0.5, 0.5]) / 30)
+    dense = dense_tracks(scene, known, LabMaps(), **options)
+    asked: list[Offsets] = []
+
+    def measured(scene, at, maps, **rest):
+        asked.append(at)
+        return dense
+
+    monkeypatch.setattr("recon.pipeline.dense_tracks.dense_tracks", measured)
+    stereo = Synchronized(known, (), "stereo", ("static rig",), first=unsure)
+    found = synchronized_by_features(flat, stereo, LabMaps(), **options).offsets
+    np.testing.assert_allclose(found.sigma[1:], np.hypot(plain.sigma[1:], INHERITED * unsure.sigma[1:]))
+    assert asked[-1] is unsure
+    pixels = Synchronized(known, (), "epipolar", ("no stereo: the epipolar offsets are doubtful",))
+    with pytest.raises(NoDenseTracks, match="the epipolar offsets are doubtful"):
+        synchronized_by_features(flat, pixels, LabMaps(), **options)
 
 
 def test_videos_without_depth_are_named(recording, cache):
