@@ -36,6 +36,7 @@ from otsync.io import open_scene
 from otsync.plugins import available, entries, made
 from otsync.types import Offsets, TrackSet
 from recon.cli.commands import OWN
+from recon.features.maps import LabMaps
 from recon.fit.optimize import every_group, rates_on
 from recon.fit.options import FitOptions
 from recon.fit.verb import fit
@@ -508,7 +509,12 @@ def arriving(world, monkeypatch) -> Callable[..., dict[str, Any]]:
         }
         raise Reached
 
+    def by_features(scene, coarse, maps, **options):
+        seen["dense"] = maps, options["width"], options["stages"].space
+        return coarse
+
     monkeypatch.setattr("otsync.recordings.routes.synchronize_scene", synchronised)
+    monkeypatch.setattr("recon.pipeline.dense_tracks.synchronized_by_features", by_features)
     monkeypatch.setattr("otsync.report.frames.write_recording_report", lambda *args: None)
     monkeypatch.setattr("recon.pipeline.verb.reconstruct", reconstructed)
 
@@ -570,6 +576,9 @@ def test_the_other_options_of_a_run(arriving, world, outside, home):
         assert told["fit"]["priors"] == {name: int(value) if name == "width" else value}
         assert (told["stages"] != base["stages"]) == (name != "flow")  # that flow is the default
         refused(otsync.cli.main, running(world, home / "r", f"--recording.{name}", "a"), name)
+    assert "dense" not in base
+    maps, width, method = asked("--features", "lab:bins=3", "--method", "paper")["dense"]
+    assert maps == LabMaps(bins=3) and width == SIZE[0] and isinstance(method.aligner, DTW)
     told = asked("--recording.selection", "count=9")  # which tracks a scaffold begins with is its own affair
     assert told["stages"].selection.count == 9 and not told["fit"]["priors"]
 
