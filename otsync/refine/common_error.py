@@ -13,20 +13,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from ..clocks.splines import TrackSplines
-from ..compute.indices import evenly
 from ..types import Clock
-
-PIECE = 10.0
-"""Seconds that are looked at together: memory stays that of a short clip, and errors are forgotten within less."""
-
-MOST_PIECES = 24
-"""Of a longer clip so many pieces, evenly spread, stand for all."""
-
-ROBUST = 2.0
-"""Samples beyond this many noise scales count for less, as in the fit."""
+from .samples import Pieces, detrended, sample_weights
 
 FITTED = 2.5
 """Factor on the error found. Partners are chosen by how well they agree at the answer, and the fit has moved to where
@@ -71,21 +62,16 @@ def _variance(
     window: float,
 ) -> float:
     """s², from the frames of ``own``."""
-    near = max(1, round(window / own.frame))
-    size = max(round(PIECE / own.frame), 4 * near)
-    pieces = max(1, math.ceil(len(own.times) / size))
-    some = evenly(pieces, MOST_PIECES)
-    sums = Sums.empty(2 * near)
-    for first in size * some:
-        frames = slice(max(0, first - near), first + size + near)
-        middle = slice(first - frames.start, first - frames.start + size)
+    parts = Pieces.of(own, window)
+    sums = Sums.empty(2 * parts.near)
+    for frames, middle in parts:
         times = own.times[frames]
         seen = own.support(times) & other.support(there(times))
         x = own.joined(times)
         y, v = other.joined(there(times)), other.velocity(there(times))
-        r, v = (_detrended(values, seen, near)[:, middle] for values in (x - y, v))
-        sums = sums + Sums.of(r, v, _weights(r, seen[:, middle], weight), group, 2 * near)
-    return sums.variance() * len(some) / pieces
+        r, v = (detrended(values, seen, parts.near)[:, middle] for values in (x - y, v))
+        sums = sums + Sums.of(r, v, sample_weights(r, seen[:, middle], weight), group, 2 * parts.near)
+    return sums.variance() * parts.share
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,26 +128,6 @@ class Sums:
         twice = np.where(np.arange(self.speeds.shape[1]) == 0, 1.0, 2.0)
         parts = (twice * covariance * self.speeds).sum(1)
         return float(np.maximum(parts, 0).sum()) / self.information**2
-
-
-def _weights(
-    r: Float[np.ndarray, "M T 3"], seen: Bool[np.ndarray, "M T"], weight: Float[np.ndarray, " M"]
-) -> Float[np.ndarray, "M T"]:
-    """Weights of samples, by their residuals."""
-    size = np.sqrt((r**2).sum(2))
-    noise = float(np.median(size[seen])) if seen.any() else 0.0
-    return np.where(seen, weight[:, None] / (1 + (size / max(ROBUST * noise, 1e-300)) ** 2), 0.0)
-
-
-def _detrended(x: Float[np.ndarray, "M T 3"], seen: Bool[np.ndarray, "M T"], near: int) -> Float[np.ndarray, "M T 3"]:
-    """``x`` less its mean over the seen frames within ``near``; 0 where unseen."""
-    T = x.shape[1]
-    low, high = np.maximum(np.arange(T) - near, 0), np.minimum(np.arange(T) + near + 1, T)
-    known = np.where(seen[..., None], x, 0.0)
-    total = np.concatenate([np.zeros((len(x), 1, 3)), np.cumsum(known, 1)], 1)
-    count = np.concatenate([np.zeros((len(x), 1)), np.cumsum(seen, 1)], 1)
-    mean = (total[:, high] - total[:, low]) / np.maximum(count[:, high] - count[:, low], 1)[..., None]
-    return np.where(seen[..., None], known - mean, 0.0)
 
 
 def autocorrelation(x: Float[np.ndarray, "N T D"], lags: int) -> Float[np.ndarray, " L"]:

@@ -37,6 +37,9 @@ LONGEST_RATE_STEP = 0.01
 CONVERGED = 1e-4 / 30
 """Seconds; a smaller step ends the iteration."""
 
+MOST_STEPS = 60
+"""Iterations at most. Where a fifth of the motion is common to both videos, a step goes a fifth of the way."""
+
 CLUSTER = 1.0
 """Seconds of the blocks within which errors are taken as dependent."""
 
@@ -131,7 +134,7 @@ def fit_clock(
     *,
     weight: Float[np.ndarray, " M"] | None = None,
     fit_rate: bool = False,
-    iterations: int = 25,
+    iterations: int = MOST_STEPS,
     span: tuple[float, float] | None = None,
 ) -> Fit | None:
     """Minimise robustly the detrended differences of matched curves over the offset (and rate).

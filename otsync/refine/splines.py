@@ -18,6 +18,7 @@ from ..types import Alignment, Clock, Matches, Status, TrackSet, in_order
 from ..types.checks import positive
 from ..types.trust import Trust
 from .common_error import common_error
+from .common_motion import common_motion
 from .gauss_newton import GROUPS, Fit, fit_clock, neighbours, overlap_seconds, velocity_correlation
 from .seconds import Seconds
 from .slot import JUDGED_BY, Rate, Refiner
@@ -61,7 +62,19 @@ VELOCITY = 5 / 30
 """Half window, s, of the velocities whose correlation judges the fit."""
 
 
-READS = ("moved", "spread", "correlation", "blur", "wander", "unsteady", "untold", "overlap", "matches", "rate_sigmas")
+READS = (
+    "moved",
+    "spread",
+    "correlation",
+    "blur",
+    "common",
+    "wander",
+    "unsteady",
+    "untold",
+    "overlap",
+    "matches",
+    "rate_sigmas",
+)
 """The limits of :class:`otsync.Trust` that the fit's flags are raised by."""
 
 
@@ -124,6 +137,7 @@ class SplineRefine(Refiner):
                 "moved": abs(fit.clock.offset - alignment.offset),
                 "spread": spread,
                 "blur": fit.blur,
+                "common_motion": common_motion(*curves, fit.clock, fit.weights, self.windows[0]),
                 "wander": fit.wander,
                 "unsteady": seconds.unsteady(self._wanders(fit.blur)),
                 "untold": seconds.untold(),
@@ -234,7 +248,7 @@ class SplineRefine(Refiner):
     def _flags(self, stats: dict[str, float]) -> tuple[Status, ...]:
         t = self.trust
         found = {
-            Status.WEAK: stats["blur"] > t.blur or not stats["settled"],
+            Status.WEAK: stats["common_motion"] < t.common or stats["blur"] > t.blur or not stats["settled"],
             Status.MOVED: stats["moved"] > t.moved,
             Status.SPREAD: stats["spread"] > t.spread,
             Status.BROKEN_CLOCK: stats["wander"] > self._wanders(stats["blur"])

@@ -29,9 +29,12 @@ class Trust:
         moved: MOVED when the sub-frame fit ends further from the scan's peak than this, s.
         spread: SPREAD when fits with other detrending windows differ by more than this, s.
         correlation: POOR_FIT below this pooled correlation of the matched velocities at the answer.
-        blur: WEAK when the rms residual of the fit is more than this many seconds of rms motion. Brutal noise has up to
-            6.6 frames; with a limit of 7 two thirds of brutal answers are trusted instead of two fifths, and their
-            errors are 1.2 to 1.4 sigma (8 videos, boxes, seeds 5002-5004), one of 103 more than a frame.
+        blur: WEAK when the rms residual of the fit is more than this many seconds of rms motion: 160 right answers to
+            brutal noise have up to 6.4 frames.
+        common: WEAK when less than this share of the matched velocities, moment by moment, is common to both videos. Of
+            60 brutal worlds (seeds 500-559) those whose answer is right, and that no other flag refuses, have .22 and
+            more; rain, static scenes with one drift and two scenes (20 each, seeds 41000-41019) have .06, .13 and .16
+            at most.
         wander: BROKEN_CLOCK when the offsets of single seconds differ by more than this share of ``blur``: of noise
             they differ by .08 of it at most (16 pairs each, mid to brutal), in two takes of one choreography by .12 to
             .46.
@@ -55,8 +58,9 @@ class Trust:
     motion: float = 0.02
     moved: float = 2 / 30
     spread: float = 0.5 / 30
-    correlation: float = 0.55
-    blur: float = 5.6 / 30
+    correlation: float = 0.45
+    blur: float = 8 / 30
+    common: float = 0.18
     wander: float = 0.1
     unsteady: float = 2.0
     untold: float = 1 / 30

@@ -18,6 +18,7 @@ CLOCKS = ("tests/otsync/clocks/test_splines.py",)
 REFINE = ("tests/otsync/refine",)
 EPIPOLAR = ("tests/otsync/epipolar",)
 PARTS = ("tests/otsync/sync/test_parts.py",)
+COMMON = ("tests/otsync/refine/test_common_motion.py",)
 PLACES = ("tests/otsync/sync/test_places.py",)
 SECONDS = ("tests/otsync/refine/test_seconds.py",)
 TIMING = ("tests/otsync/simulate/test_timing.py",)
@@ -86,10 +87,34 @@ BREAKS = (
     Break(
         "refine-unsettled-passes",
         "otsync/refine/splines.py",
-        'Status.WEAK: stats["blur"] > t.blur or not stats["settled"],',
-        'Status.WEAK: stats["blur"] > t.blur,',
+        'or not stats["settled"],',
+        ",",
         SECONDS,
         "an answer whose fit has not settled passes",
+    ),
+    Break(
+        "refine-little-in-common-passes",
+        "otsync/refine/splines.py",
+        'stats["common_motion"] < t.common or ',
+        "",
+        SECONDS,
+        "an answer to noise that is alike by chance passes",
+    ),
+    Break(
+        "common-motion-of-one",
+        "otsync/refine/common_motion.py",
+        "for p in (u * v, u * u, v * v)",
+        "for p in (v * v, u * u, v * v)",
+        COMMON,
+        "one video's own velocities, noise and all, pass for motion in common",
+    ),
+    Break(
+        "common-motion-with-drift",
+        "otsync/refine/common_motion.py",
+        "r, u, v = (detrended(values, seen, parts.near)[:, middle] for values in (x - y, u, v))",
+        "r = detrended(x - y, seen, parts.near)[:, middle]; u, v = u[:, middle], v[:, middle]",
+        COMMON,
+        "slow drifts that both videos share pass for motion in common",
     ),
     Break(
         "places-late-sign",

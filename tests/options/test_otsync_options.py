@@ -112,6 +112,7 @@ REFINER_OPTIONS = slot("refiner", "SplineRefine", windows="0.3 0.2", smoothing=3
         "spread": "-1",
         "correlation": "2",
         "blur": "-1",
+        "common": "2",
         "wander": "-9",
         "unsteady": "-1",
         "untold": "-1",
@@ -145,6 +146,7 @@ NOT_READ = {
             "spread",
             "correlation",
             "blur",
+            "common",
             "wander",
             "unsteady",
             "untold",
@@ -158,7 +160,7 @@ NOT_READ = {
     },
     **{
         f"{SCAN}.trust.{name}": "aligner"
-        for name in ("moved", "spread", "correlation", "blur", "wander", "unsteady", "untold", "rate_sigmas")
+        for name in ("moved", "spread", "correlation", "blur", "common", "wander", "unsteady", "untold", "rate_sigmas")
     },
     **{f"{FIT}.trust.{name}": "refiner" for name in ("disagreement", "alias", "motion", "rate_gain")},
 }

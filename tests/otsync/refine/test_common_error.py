@@ -6,7 +6,7 @@ import pytest
 from otsync import Alignment, Matches, SplineRefine, Status, TrackSet, refine
 from otsync.clocks.splines import TrackSplines
 from otsync.epipolar import EpipolarRefine
-from otsync.refine import common_error as module
+from otsync.refine import samples as module
 from otsync.refine.common_error import Sums, autocorrelation, common_error
 from otsync.refine.gauss_newton import fit_clock
 from otsync.types import Clock
