@@ -12,7 +12,8 @@ The question is narrower than that of a search, and so is the answer's sigma:
   to its sigma. What tracks of a video have in common errs alike in all its pairs, and no number of pairs averages that
   out (:data:`SHARED`).
 * The cameras are declared to be of one moment. So how far most of them are apart is an error that was made, whatever
-  the pairs say: sigma is at least what that takes. Pairs that contradict each other say the same of single cameras.
+  the pairs say: sigma is at least what that takes. Pairs that contradict each other, all or those of one camera, say
+  the same.
 * A flag that asks which of many peaks is the right one (:data:`OF_PEAKS`) is settled by the sum of the curves of the
   camera's pairs with those that agree, where that has no rival.
 """
@@ -259,9 +260,10 @@ def _scatter(links: list[_Link], V: int) -> tuple[Float[np.ndarray, " V"], Float
     # a fit of n videos to E pairs takes n - 1 of their E residuals away
     free = len(links) - (len(inside) - 1)
     lost = np.sqrt(len(links) / free) if free > 0 else 1.0
+    discord = lost * float(np.sqrt(np.mean(np.minimum(z**2, CAUCHY**2))))
     for k, v in enumerate(inside):
         at = A[:, k] != 0
-        out[v] = told[k] * max(1.0, MAD * lost * float(np.median(np.abs(z[at]))))
+        out[v] = told[k] * max(1.0, discord, MAD * lost * float(np.median(np.abs(z[at]))))
         vouching = at & np.array([link.vouches for link in links])
         if vouching.any():
             jitter[v] = MAD * float(np.median(np.abs(residual[vouching])))
