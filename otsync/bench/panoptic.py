@@ -43,7 +43,7 @@ from ..priors.stereo import Rig
 from ..priors.working import WorkingFrames
 from ..progress import counted
 from ..recordings.routes import pairs_in_pixels, pairs_in_space
-from ..recordings.stages import COLOUR, Stages
+from ..recordings.stages import COLOUR, Stages, stages_from
 from ..recordings.tracking import pixel_tracks
 from ..sync.method import PAPER
 from ..sync.verb import synchronize
@@ -93,6 +93,7 @@ def run(
     cache: Path | None = None,
     first_seed: int | None = None,
     protocol: Protocol | None = None,
+    features: str | None = None,
     routes: tuple[str, ...] = ("paper", "default", "depth-free"),
     gate: bool = False,
     rebase: bool = False,
@@ -100,6 +101,7 @@ def run(
     """Measure, print the table, write CSV, JSON and a plot to ``out``; with ``json`` one line on standard output.
 
     Args:
+        features: what describes tracks, as the shell spells it; default: that of :class:`Stages`.
         gate: compare our own routes with the committed baseline, which is of the paper's basketball scene; 1 when
             something got worse. rebase: make this run the baseline. Neither measures the paper's route and the table
             of matchers.
@@ -112,10 +114,11 @@ def run(
     if first_seed is not None:
         protocol = replace(protocol, seed=first_seed)
     tell: Callable[[str], None] = (lambda text: None) if json else print
+    stages = stages_from(features=features)
     opened = open_scene(scene)
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
         kept = Cache(cache or out / "stages")
-        material = Material.of(opened, Stages(), kept, pool.map, tell)
+        material = Material.of(opened, stages, kept, pool.map, tell)
         rows, details = [], []
         for route in routes:
             row, detail = measure(material, route, protocol, pool.map)
@@ -124,7 +127,7 @@ def run(
             tell(table([row], list(row)))
         matched = []
         if protocol.matching:
-            own = type(Stages().tracking.features)
+            own = type(stages.tracking.features)
             for name, kind in available("describers", DESCRIBERS).items():
                 describer = kind() if isinstance(kind, type) else kind
                 try:
@@ -133,7 +136,9 @@ def run(
                     tell(f"table of matchers, without {name}: {lacking}")
                     continue
                 matched += matching_table(seen_by, protocol, pool.map, name, every=kind is own)
-    about = {"note": NOTE, "published": PUBLISHED, "protocol": vars(protocol), "cameras": list(opened.names)}
+    described = repr(stages.tracking.features)
+    about = {"note": NOTE, "published": PUBLISHED, "protocol": vars(protocol), "features": described}
+    about |= {"cameras": list(opened.names)}
     write_rows(out, "panoptic", rows, about)
     write_rows(out, "panoptic_pairs", details, about)
     if matched:
@@ -189,6 +194,8 @@ class Material:
 
         raw = list(map(track, range(len(scene.videos))))
         tell(f"tracks of {len(raw)} cameras: {time.perf_counter() - started:.0f} s")
+        # masks, tracks and features of each, when they were made
+        tell(f"features: {np.median([r['seconds'][2] for r in raw]):.2f} s a camera")
         wide = replace(stages.selection, count=3 * stages.selection.count, min_life=16, apart=6.0)
         chosen = [wide(r["uv"], v.camera.width, v.fps or 30.0) for r, v in zip(raw, scene.videos, strict=True)]
         rich = [r["uv"][c] for r, c in zip(raw, chosen, strict=True)]

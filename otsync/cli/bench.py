@@ -23,6 +23,7 @@ BENCH_OPTIONS = (
     "only",
     "sizes",
     "limit",
+    "features",
     "json",
     "cache",
 )
@@ -72,6 +73,8 @@ class Bench:
     """For match: numbers of tracks; default: 200 to 50,000."""
     limit: float | None = None
     """For match: CPU seconds that a matcher may take for a world; default: 60."""
+    features: str | None = None
+    """For panoptic: what describes tracks, as of --recording.features; default: the features of recordings."""
     json: bool = False
     """For panoptic and own-frames: one line of JSON on standard output instead of tables."""
     cache: Path | None = None
@@ -114,7 +117,7 @@ class Bench:
             raise ValueError(f"--sizes: expected 1 or more; found {self.sizes}.")
         if self.limit is not None and not self.limit > 0:
             raise ValueError(f"--limit: expected seconds above 0; found {self.limit}.")
-        for name in ("first_seed", "seeds", "only", "promises", "sizes", "limit"):
+        for name in ("first_seed", "seeds", "only", "promises", "sizes", "limit", "features"):
             if (self.gate or self.rebase) and getattr(self, name) not in (None, (), False):
                 raise ValueError(
                     f"{spelled(name)}: expected without --gate and --rebase: a baseline is of the suite's own runs."

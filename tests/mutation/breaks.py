@@ -35,6 +35,7 @@ WARP = ("tests/recon/motion/test_motion_warp.py",)
 SOLVE = ("tests/recon/motion/test_motion_solve.py",)
 OBSERVE = ("tests/recon/observe",)
 DEPTH = ("tests/otsync/priors/test_depth_scale.py",)
+AUDIT = ("tests/otsync/recordings/test_audit.py",)
 TIED = ("tests/otsync/recordings/test_learned_depth.py",)
 COTRACKER = ("tests/otsync/priors/learned/test_cotracker.py",)
 RUNS = ("tests/otsync/io/test_masks.py",)
@@ -60,6 +61,38 @@ class Break:
 
 
 BREAKS = (
+    Break(
+        "audit-by-the-pairs-alone",
+        "otsync/recordings/audit.py",
+        "sigma = sigma * max(1.0, MAD * float(np.median(apart)) * _small(int(agreed.sum())))",
+        "pass",
+        AUDIT,
+        "cameras that are far apart do not say that the pairs are less sure than they tell",
+    ),
+    Break(
+        "audit-averages-everything",
+        "otsync/recordings/audit.py",
+        "own = np.maximum(common**2, SHARED * sigma**2)",
+        "own = np.zeros_like(sigma)",
+        AUDIT,
+        "errors that a video has in all its pairs are averaged out",
+    ),
+    Break(
+        "audit-spares-the-reference",
+        "otsync/recordings/audit.py",
+        "if broken or offsets.breaks[v]:",
+        "if offsets.breaks[v]:",
+        AUDIT,
+        "a reference whose clock breaks is in sync by definition",
+    ),
+    Break(
+        "audit-settles-everything",
+        "otsync/recordings/audit.py",
+        "return here > 0 and here - rival >= STANDING_MARGIN * here",
+        "return here > 0",
+        AUDIT,
+        "a peak that has a rival counts as settled",
+    ),
     Break(
         "seconds-end-unseen",
         "otsync/refine/seconds.py",

@@ -706,6 +706,7 @@ def test_options_of_bench_reach_a_suite_or_are_refused(tmp_path):
             (["--only", "a", "b"], {"only": ("a", "b")}),
             (["--sizes", "20", "50"], {"sizes": (20, 50)}),
             (["--limit", "600"], {"limit": 600.0}),
+            (["--features", "daisy"], {"features": "daisy"}),
             (["--json"], {"json": True}),
             (["--cache", "kept"], {"cache": Path("kept")}),
         ):
@@ -747,7 +748,7 @@ def rows() -> set[str]:
         "import-offsets": "source recording kind sigma offsets out allow_outside",
         "check": "scene every_frame allow_outside",
         "export": "recording offsets out what cameras width fps force allow_outside",
-        "bench": "suite scene out gate rebase promises first_seed seeds only sizes limit json cache",
+        "bench": "suite scene out gate rebase promises first_seed seeds only sizes limit features json cache",
         "plugins": "json",
     }
     shared = {row.replace("match matcher", "sync matcher") for row in algorithms if "matcher:" in row}  # the same slot

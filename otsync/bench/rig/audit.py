@@ -62,10 +62,12 @@ def run(
                 lived = np.isfinite(cut["uv"][..., 0]).any(1)
                 cut = {k: x[lived] if k in ("uv", "features", "labels") else x for k, x in cut.items()}
                 tracks.append(_clip(video, cut, stages, opened.frame))
-            offsets = pairs_in_pixels(tracks, 0, stages, kept, pool.map)
+            offsets = pairs_in_pixels(tracks, "auto", stages, kept, pool.map)
             told = audit_offsets(offsets)
             at = told.cameras[moved]
             others = [c for n, c in enumerate(told.cameras) if n != moved or not move]
+            truth = [move * way if n == moved else 0 for n in range(len(chosen))]
+            far = [abs(c.frames - true) / c.sigma for c, true in zip(told.cameras, truth, strict=True)]
             rows.append(
                 {
                     "move": move * way,
@@ -77,6 +79,9 @@ def run(
                     "false_alarms": sum(c.finding == "off" for c in others),
                     "unsure": sum(c.finding == "unsure" for c in others),
                     "largest_other": round(max(abs(c.frames) for c in others), 3),
+                    "cameras": len(far),
+                    "within_sigma": sum(x <= 1 for x in far),
+                    "within_two": sum(x <= 2 for x in far),
                 }
             )
     summary = []
@@ -92,6 +97,8 @@ def run(
                 "unsure cameras": sum(r["unsure"] for r in own),
                 "mean error": round(float(np.mean(errors)), 3) if move else None,
                 "largest of the others": max(r["largest_other"] for r in own),
+                "within one sigma": round(sum(r["within_sigma"] for r in own) / sum(r["cameras"] for r in own), 3),
+                "within two": round(sum(r["within_two"] for r in own) / sum(r["cameras"] for r in own), 3),
             }
         )
     print(table(summary))

@@ -198,11 +198,13 @@ def test_a_refused_answer_exits_with_one(tmp_path, capsys):
         ),
         (
             ["bench", "panoptic", "--seeds", "3"],
-            "--seeds: benchmark panoptic does not take it. It takes scene, --gate, --rebase, --first-seed, --json, "
-            "--cache.",
+            "--seeds: benchmark panoptic does not take it. It takes scene, --gate, --rebase, --first-seed, "
+            "--features, --json, --cache.",
         ),
         (["bench", "sync", "--gate", "--first-seed", "8100"], "--first-seed: expected without --gate and --rebase"),
         (["bench", "panoptic"], "scene: expected a recording"),
+        (["bench", "panoptic", "{world}", "--features", "colour"], "--features: expected some of lab-histogram, daisy"),
+        (["bench", "panoptic", "{world}", "--gate", "--features", "daisy"], "--features: expected without --gate"),
         (["bench", "core", "somewhere"], "scene: benchmark core does not take it"),
         (["bench", "sync", "--json"], "--json: benchmark sync does not take it"),
         (["bench", "sync", "--seeds", "0"], "--seeds: expected 1 or more; found 0"),
