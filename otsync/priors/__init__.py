@@ -4,6 +4,7 @@ slots.py        what goes into the slots of tracking
 working.py      frames at the resolution that priors work at
 masks.py        which pixels move
 flow.py         optical flow between neighbouring frames
+patch_flow.py   the same where something moves
 points.py       point tracks by optical flow
 blobs.py        tracks of things too small for flow, and the choice by their size
 linking.py      detections of single frames joined to tracks
@@ -30,6 +31,7 @@ from .learned import (
     TransformersDepth,
 )
 from .masks import FlowResidual, GivenMasks, MedianBackground
+from .patch_flow import PatchFlow
 from .points import ChainedFlow
 from .slots import DepthEstimator, Describer, Flow, Masker, Tracker
 from .working import WorkingFrames
@@ -54,6 +56,7 @@ __all__ = [
     "LabHistogram",
     "Masker",
     "MedianBackground",
+    "PatchFlow",
     "Tracker",
     "WorkingFrames",
 ]
@@ -64,7 +67,7 @@ MASKERS = (MedianBackground, FlowResidual)
 TRACKERS = (BySize, ChainedFlow, Blobs, CoTracker)
 """Trackers of points that the shell offers; plugins come on top."""
 
-FLOWS = (DISFlow, Raft)
+FLOWS = (PatchFlow, DISFlow, Raft)
 """Optical flows that the shell offers; plugins come on top."""
 
 DESCRIBERS = (LabHistogram, Daisy, Dinov3, Dinov2, Transformers, Onnx)

@@ -48,13 +48,11 @@ class LabHistogram:
         bin_of = np.where(mask, (lightness * n + green) * n + blue, -1)
         size = (max(1, frames.size[0] // 4), max(1, frames.size[1] // 4))
         sigma = self.sigma * frames.unit / 4
-        planes = [
-            cv2.GaussianBlur(
-                cv2.resize((bin_of == b).astype(np.float32), size, interpolation=cv2.INTER_AREA), (0, 0), sigma
-            )
-            for b in range(n**3)
-        ]
-        return np.stack(planes, -1)
+        planes = np.zeros((n**3, size[1], size[0]), np.float32)
+        for b in np.unique(bin_of[mask]):  # few colours occur
+            share = cv2.resize((bin_of == b).astype(np.float32), size, interpolation=cv2.INTER_AREA)
+            planes[b] = cv2.GaussianBlur(share, (0, 0), sigma)
+        return planes.transpose(1, 2, 0)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int, UInt8
 
 from ..compute.indices import evenly
 from ..files.digest import sequence_key
@@ -34,12 +34,60 @@ class MedianBackground:
         import cv2
 
         picks = evenly(len(frames), self.samples)
-        background = np.median(np.stack([frames[int(k)] for k in picks]), 0).astype(np.uint8)
+        looks = {int(k): frames[int(k)] for k in picks}
+        background = median_of(list(looks.values()))
         out = np.zeros((len(frames), frames.size[1], frames.size[0]), bool)
         for k in range(len(frames)):
-            near = cv2.inRange(cv2.absdiff(frames[k], background), (0,) * 3, (self.threshold,) * 3)
+            frame = looks[k] if k in looks else frames[k]
+            near = cv2.inRange(cv2.absdiff(frame, background), (0,) * 3, (self.threshold,) * 3)
             out[k] = near == 0  # in any channel
         return tidied(out, frames.unit, self.min_area)
+
+
+AT_ONCE = 8192
+"""Values of every image that are sorted together: of 50 images they fit into the second cache."""
+
+
+def median_of(images: Sequence[UInt8[np.ndarray, "*S"]]) -> UInt8[np.ndarray, "*S"]:
+    """The median of images, value by value; of an even number the mean of both in the middle, rounded down.
+
+    Batcher's merge exchange sorts whole stretches of the images by minima and maxima: a fifth of numpy's time.
+    """
+    n = len(images)
+    out = np.empty(images[0].shape, np.uint8)
+    order, flat, rows = exchanges(n), out.reshape(-1), [np.asarray(image).reshape(-1) for image in images]
+    for start in range(0, len(flat), AT_ONCE):
+        part = [row[start : start + AT_ONCE].copy() for row in rows]
+        spare = np.empty_like(part[0])
+        for i, j in order:
+            np.minimum(part[i], part[j], out=spare)
+            np.maximum(part[i], part[j], out=part[j])
+            part[i], spare = spare, part[i]
+        low, high = part[(n - 1) // 2], part[n // 2]
+        flat[start : start + AT_ONCE] = (low.astype(np.uint16) + high) >> 1
+    return out
+
+
+def exchanges(n: int) -> list[tuple[int, int]]:
+    """Pairs (i, j) that a list of ``n`` is sorted by, the smaller to i, as far as its middle depends on them (Knuth,
+    The Art of Computer Programming 3, 5.2.2, algorithm M).
+    """
+    pairs, p = [], 1
+    while p < n:
+        k = p
+        while k:
+            for j in range(k % p, n - k, 2 * k):
+                for i in range(j, min(j + k, n - k)):
+                    if i // (2 * p) == (i + k) // (2 * p):
+                        pairs.append((i, i + k))
+            k //= 2
+        p *= 2
+    needed, kept = {(n - 1) // 2, n // 2}, []
+    for i, j in reversed(pairs):
+        if i in needed or j in needed:
+            needed |= {i, j}
+            kept.append((i, j))
+    return kept[::-1]
 
 
 @dataclass(frozen=True)
@@ -147,10 +195,8 @@ def typical_area(changed: Sequence[np.ndarray] | np.ndarray, unit: float, closin
 
 def components(mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "n 3"]:
     """Middle (pixel indices) and area of every component."""
-    import cv2
-
-    _, _, stats, middle = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
-    return np.column_stack([middle[1:], stats[1:, cv2.CC_STAT_AREA]])
+    box, _, stats, middle = _labelled(mask)
+    return np.column_stack([middle[1:] + np.array([box[1].start, box[0].start]), stats[1:, AREA]])
 
 
 def tidy(changed: Bool[np.ndarray, "h w"], unit: float, min_area: float, closing: float = CLOSING) -> np.ndarray:
@@ -158,12 +204,31 @@ def tidy(changed: Bool[np.ndarray, "h w"], unit: float, min_area: float, closing
 
     Pixels are at 640 of width; (h,w) bool.
     """
+    box, component, stats, _ = _labelled(cleaned(changed, unit, closing))
+    large = stats[:, AREA] > min_area * unit**2
+    large[0] = False
+    out = np.zeros(changed.shape, bool)
+    out[box] = large[component]
+    return out
+
+
+AREA = 4
+"""Column of OpenCV's statistics of components."""
+
+
+def _labelled(
+    mask: Bool[np.ndarray, "h w"],
+) -> tuple[tuple[slice, slice], Int[np.ndarray, "a b"], Int[np.ndarray, "n 5"], Float[np.ndarray, "n 2"]]:
+    """Components in the box around all of them: the box, their numbers there, their statistics and middles."""
     import cv2
 
-    _, component, stats, _ = cv2.connectedComponentsWithStats(cleaned(changed, unit, closing).view(np.uint8))
-    large = stats[:, cv2.CC_STAT_AREA] > min_area * unit**2
-    large[0] = False
-    return large[component]
+    pixels = mask.view(np.uint8)
+    x, y, w, h = cv2.boundingRect(pixels)
+    box = np.s_[y : y + max(h, 1), x : x + max(w, 1)]  # of nothing one pixel, since OpenCV takes no empty image
+    # twice as fast as the default
+    way = cv2.CCL_GRANA
+    _, component, stats, middle = cv2.connectedComponentsWithStatsWithAlgorithm(pixels[box], 8, cv2.CV_32S, way)
+    return box, component, stats, middle
 
 
 def cleaned(changed: Bool[np.ndarray, "h w"], unit: float, closing: float) -> Bool[np.ndarray, "h w"]:

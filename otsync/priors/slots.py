@@ -7,7 +7,7 @@ of its input and of itself: all its fields count, unless it declares ``cache_key
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -39,15 +39,28 @@ class Tracker(Protocol):
 class Flow(Protocol):
     """The ``flow`` slot: optical flow between two frames, there and back.
 
-    One that declares ``colour = True`` gets (H,W,3) instead of grey. One that declares ``whole = True`` is
-    always given whole images; others are given boxes around what moves where the tracker asks for that
-    (``ChainedFlow(boxes=True)``).
+    One that declares ``colour = True`` gets (H,W,3) instead of grey. One that has the two methods of
+    :class:`OfWhatMoves` is asked by these instead.
     """
 
     def pair(
         self, before: np.ndarray, after: np.ndarray
     ) -> tuple[Float[np.ndarray, "H W 2"], Float[np.ndarray, "H W 2"]]:
         """Pixels that each point moves by, from ``before`` to ``after`` and from ``after`` back."""
+        ...
+
+
+@runtime_checkable
+class OfWhatMoves(Protocol):
+    """A :class:`Flow` that can leave out what nobody follows."""
+
+    def prepare(self, image: np.ndarray, moves: Bool[np.ndarray, "H W"]) -> Any:
+        """A frame as it is read, once for the flow to the next one and for that to the one before."""
+        ...
+
+    def between(self, before: Any, after: Any) -> tuple[Float[np.ndarray, "h w 2"], Float[np.ndarray, "h w 2"]]:
+        """As of :meth:`Flow.pair`, from what ``prepare`` gave: right where something moves. Of any resolution, in
+        pixels of the image."""
         ...
 
 

@@ -14,15 +14,21 @@ class WorkingFrames(Sequence[np.ndarray]):
     """Frames reduced to at most ``width`` pixels of width; smaller ones stay as they are.
 
     ``scale`` is working pixels per original pixel. Frames of another size than the first are an error.
+
+    Args:
+        keep: bytes of grey images that are kept, the first that are asked for, so that who comes later need not read
+            the frames again.
     """
 
-    def __init__(self, frames: Sequence[np.ndarray], size: tuple[int, int], width: int = WIDTH):
+    def __init__(self, frames: Sequence[np.ndarray], size: tuple[int, int], width: int = WIDTH, keep: int = 0):
         self.frames = frames
         self.full = size
         self.scale = min(1.0, width / size[0])
         self.size = (max(1, round(size[0] * self.scale)), max(1, round(size[1] * self.scale)))
         #: factor for pixel constants, which are measured at 640 pixels of width
         self.unit = self.size[0] / WIDTH
+        self._most = keep // (self.size[0] * self.size[1])
+        self._gray: dict[int, np.ndarray] = {}
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -36,14 +42,19 @@ class WorkingFrames(Sequence[np.ndarray]):
                 f"frame {k}: expected {self.full[0]} x {self.full[1]} pixels as the camera says; found "
                 f"{frame.shape[1]} x {frame.shape[0]}. Correct width and height, or leave the frame out."
             )
-        if self.scale == 1.0:
-            return frame
-        return cv2.resize(frame, self.size, interpolation=cv2.INTER_AREA)
+        if self.scale != 1.0:
+            frame = cv2.resize(frame, self.size, interpolation=cv2.INTER_AREA)
+        if k not in self._gray and len(self._gray) < self._most:
+            self._gray[k] = cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY)
+        return frame
 
     def gray(self, k: int) -> UInt8[np.ndarray, "h w"]:
         import cv2
 
-        return cv2.cvtColor(self[k], cv2.COLOR_RGB2GRAY)
+        if k in self._gray:
+            return self._gray[k]
+        frame = self[k]
+        return self._gray[k] if k in self._gray else cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY)
 
     def to_full(self, uv: Float[np.ndarray, "*N 2"]) -> Float[np.ndarray, "*N 2"]:
         """Working pixels (index convention: centre of the first pixel at 0) to the camera's (+0.5 convention)."""

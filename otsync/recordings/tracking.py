@@ -23,6 +23,9 @@ from ..types.checks import positive
 TOGETHER = 5 / 30
 """Seconds that two tracks must share to be told apart, or not."""
 
+KEPT = 2**26
+"""Bytes of grey images that are kept from masks to flow: 290 frames of 640 x 360."""
+
 SHORT_CLIP = 3
 """A track that lives this part of a clip is kept too, or of short clips none would be."""
 
@@ -212,7 +215,7 @@ class Tracking:
         Each of masks and tracks is kept on its own, so that a run that was killed continues between them.
         """
         cache = cache or Cache()
-        frames = WorkingFrames(video.frames, (video.camera.width, video.camera.height), self.width)
+        frames = self._frames(video, keep=KEPT)
         fps = video.fps or 30.0
         brought = tracks if self.given else None
         follower = self.points if brought is None else brought.digest()
@@ -220,7 +223,7 @@ class Tracking:
 
         def track() -> dict[str, np.ndarray]:
             started = time.perf_counter()
-            mask = self.masks(video, masks, cache)
+            mask = self._masks(frames, video, masks, cache)
             masked = time.perf_counter()
             if brought is None:
                 uv = self.points(frames, mask, fps)
@@ -238,8 +241,14 @@ class Tracking:
         self, video: Video, given: Sequence[np.ndarray] | None = None, cache: Cache | None = None
     ) -> Sequence[np.ndarray]:
         """Foreground at working resolution, (h,w) bool per frame."""
-        cache = cache or Cache()
-        frames = WorkingFrames(video.frames, (video.camera.width, video.camera.height), self.width)
+        return self._masks(self._frames(video), video, given, cache or Cache())
+
+    def _frames(self, video: Video, keep: int = 0) -> WorkingFrames:
+        return WorkingFrames(video.frames, (video.camera.width, video.camera.height), self.width, keep)
+
+    def _masks(
+        self, frames: WorkingFrames, video: Video, given: Sequence[np.ndarray] | None, cache: Cache
+    ) -> PackedMasks:
         masker = self.masker
         if masker is None:
             moves = video.camera.w2c.ndim == 3

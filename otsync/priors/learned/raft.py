@@ -36,9 +36,6 @@ class Raft:
     colour = True
     """It sees colours where others see grey."""
 
-    whole = True
-    """A network wants context: it is never given parts of an image."""
-
     def __post_init__(self) -> None:
         if self.size not in ("small", "large"):
             raise ValueError(f"size: expected small or large; found {self.size!r}.")
