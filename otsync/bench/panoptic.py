@@ -154,7 +154,10 @@ def run(
     return record.gate("panoptic", figures, worse) if gate else 0
 
 
-WATCHED = ("pairs_mean", "pairs_p90", "pairs_max", "short_overlap_mean", "graph_mean", "graph_max", "all_cameras_mean")
+WATCHED = ("pairs_mean", "pairs_p90", "pairs_max", "short_overlap_mean", "graph_mean", "graph_max", "all_cameras_apart")
+"""``all_cameras_mean`` is told and not watched: in one draw of one reference, that camera's own error counts as often
+as there are others. On three draws of all cameras (seeds 9301-9303) it was .06 to .14 by one code, without the common
+shift .057 to .062."""
 
 
 def figures_of(rows: list[dict[str, Any]], cameras: tuple[str, ...]) -> dict[str, float]:
@@ -478,6 +481,7 @@ def _row(
         "graph_max": at(errors(graph), 1.0),
         "all_cameras_mean": mean(errors(whole)),
         "all_cameras_max": at(errors(whole), 1.0),
+        "all_cameras_apart": mean(apart(whole)),
         "pairs_in_sigma": held(details),
         "graph_in_sigma": held([*graph, *whole]),
         "missing": int(sum(d["error"] is None for d in (*details, *graph, *whole))),
@@ -485,6 +489,15 @@ def _row(
         "flagged": round(float(np.mean([bool(d["flags"]) for d in details if d["kind"].startswith("band")])), 4),
         "seconds": round(seconds, 4),
     }
+
+
+def apart(lines: list[dict[str, Any]]) -> np.ndarray:
+    """Errors of the cameras of every draw, the reference's 0 among them, less what all have in common: their median."""
+    found = []
+    for kind in dict.fromkeys(d["kind"] for d in lines):
+        late = np.array([0.0, *(LARGEST if d["error"] is None else d["error"] for d in lines if d["kind"] == kind)])
+        found.append(np.abs(late - np.median(late)))
+    return np.concatenate(found) if found else np.zeros(0)
 
 
 def error_of(line: dict[str, Any]) -> float:

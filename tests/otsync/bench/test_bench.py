@@ -12,7 +12,7 @@ import pytest
 
 from otsync import bench, plugins
 from otsync.align import ALIGNERS
-from otsync.bench import match, record, sync
+from otsync.bench import match, panoptic, record, sync
 from otsync.bench.sync_worlds import FPS, pair_case
 from otsync.match import MATCHERS
 from otsync.refine import REFINERS
@@ -198,3 +198,10 @@ def test_promises_of_matching_take_no_options_of_the_table(option, tmp_path):
 
     with pytest.raises(ValueError, match=f"{next(iter(option))}, promises"):
         run(tmp_path, promises=True, **option)
+
+
+def test_the_reference_s_own_error_does_not_count_as_often_as_there_are_others():
+    lines = [{"kind": "all 0", "error": e} for e in (0.1, 0.12, 0.08)] + [{"kind": "all 1", "error": e} for e in (0, 1)]
+    np.testing.assert_allclose(panoptic.apart(lines), [0.09, 0.01, 0.03, 0.01, 0, 0, 1], atol=1e-12)
+    missing = panoptic.apart([{"kind": "all 0", "error": e} for e in (None, 0.0, 0.0)])
+    assert missing.max() == panoptic.LARGEST and panoptic.apart([]).size == 0
