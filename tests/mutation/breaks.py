@@ -856,7 +856,7 @@ BREAKS = (
     Break(
         "refine-common-pieces",
         "otsync/refine/common_error.py",
-        "return sums.variance() * len(some) / pieces",
+        "return sums.variance() * parts.share",
         "return sums.variance()",
         REFINE,
         "a part of a long clip is taken for all of it",
