@@ -67,7 +67,7 @@ MASKERS = (MedianBackground, FlowResidual)
 TRACKERS = (BySize, ChainedFlow, Blobs, CoTracker)
 """Trackers of points that the shell offers; plugins come on top."""
 
-FLOWS = (PatchFlow, DISFlow, Raft)
+FLOWS = (DISFlow, PatchFlow, Raft)
 """Optical flows that the shell offers; plugins come on top."""
 
 DESCRIBERS = (LabHistogram, Daisy, Dinov3, Dinov2, Transformers, Onnx)
