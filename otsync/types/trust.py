@@ -31,8 +31,8 @@ class Trust:
         correlation: POOR_FIT below this pooled correlation of the matched velocities, over a third of a second, at the
             answer. Three of 60 brutal answers that were right had .45 to .53 (seeds 500-559); two scenes have .51 at
             most, and next to none in ``common``.
-        blur: WEAK when the rms residual of the fit is more than this many seconds of rms motion: right answers to brutal
-            noise (seeds 500-539) have up to 6.4 frames.
+        blur: WEAK when the rms residual of the fit is more than this many seconds of rms motion: right answers to
+            brutal noise (seeds 500-539) have up to 6.4 frames.
         common: WEAK when less than this share of the matched velocities, moment by moment, is common to both videos. Of
             40 brutal worlds (seeds 500-539) those whose answer is right, and that no other flag refuses, have .22 and
             more; rain, static scenes with one drift and two scenes (20 each, seeds 41000-41019) have .06, .13 and .16
