@@ -14,7 +14,7 @@ RefinerLike = Callable[[TrackSet, TrackSet, Matches, Alignment], Alignment]
 
 Rate = Literal["fixed", "fit"]
 
-JUDGED_BY = ("evidence", "margin", "rate_sigmas")
+JUDGED_BY = ("evidence", "margin", "rate_sigmas", "lag")
 """The limits of a refiner's ``trust`` that the graph of pairs reads."""
 
 

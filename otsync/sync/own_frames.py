@@ -21,6 +21,7 @@ from ..match.synchronous import longest_seen
 from ..types import Alignment, Clock, Matches, Similarity, Status, TrackSet, in_order
 from ..types.trust import Trust
 from .graph import Graph, Pair
+from .lags import Lag, with_lags
 from .poses import ASTRAY, Link, Poses, place
 from .verdict import Answer, Refit, Verdict, judge
 
@@ -85,6 +86,7 @@ def synchronize_own(
     *,
     solver: OwnFrames,
     graph: Graph | None = None,
+    lags: Sequence[Lag] = (),
     map: MapLike = map,
 ) -> tuple[Verdict, tuple[Similarity | None, ...]]:
     """The verdict on the clocks, and each video's similarity to the frame of its reference.
@@ -94,6 +96,7 @@ def synchronize_own(
 
     Args:
         chosen: index of the reference; None: the video that the others are best tied to. centre: of the star.
+        lags: delays among the tracks of each video; none: nobody asked.
     """
     tracks = [at_frame_times(t) for t in tracks]
     graph = graph or Graph(complete=COMPLETE)
@@ -118,6 +121,9 @@ def synchronize_own(
         starts = {job.pair: job.start for job in again}
         answers = [better(a, fresh.get(a.pair), starts.get(a.pair), solver) for a in answers]
         verdict, poses, links = decide(tracks, answers, chosen, centre, graph, trust, refit, middles)
+    doubted = with_lags(verdict.answers, lags, trust.lag)
+    if doubted is not None:
+        verdict, poses, links = decide(tracks, doubted, chosen, centre, graph, trust, refit, middles)
     return with_pose_flags(verdict, poses, links, solver), poses.frames
 
 

@@ -29,6 +29,7 @@ from ..types import Alignment, Break, Clock, Matches, Offsets, Status, TrackSet,
 from ..types.checks import check_whole
 from .breaks import MOST, Seen, Suspect, culprit, mended, remeasured, runs_on, suspects
 from .graph import Graph, Pair
+from .lags import Lag, lag_of, with_lags
 from .method import Method, with_costs
 from .own_frames import Frames, refuse_common, solver_from, synchronize_own
 from .pairs import Job, Refit, run, run_refit, with_rate
@@ -135,7 +136,11 @@ def synchronize(
             verdict = judged([_doubted(a) if breaking & set(a.pair) else a for a in verdict.answers])
     else:
         verdict = with_parts_checked(verdict, tracks, judged)
-    return to_offsets(original, verdict, time.perf_counter() - started, broken)
+    lags = list(map(lag_of, tracks))
+    doubted = with_lags(verdict.answers, lags, refining.trust.lag)
+    if doubted is not None:
+        verdict = judged(doubted)
+    return to_offsets(original, verdict, time.perf_counter() - started, broken, lags)
 
 
 def with_parts_checked(
@@ -344,8 +349,9 @@ def _without_common_frame(
     started = time.perf_counter()
     centre = most_seen(tracks) if chosen is None else chosen
     solver = solver_from(frames, matcher)
-    verdict, transforms = synchronize_own(tracks, chosen, centre, solver=solver, graph=method.graph, map=map)
-    found = to_offsets(tracks, verdict, time.perf_counter() - started)
+    lags = list(map(lag_of, tracks))
+    verdict, transforms = synchronize_own(tracks, chosen, centre, solver=solver, graph=method.graph, lags=lags, map=map)
+    found = to_offsets(tracks, verdict, time.perf_counter() - started, lags=lags)
     return dataclasses.replace(found, transforms=transforms)
 
 
@@ -400,13 +406,20 @@ def jump_sigma(found: Break, frame: float) -> float:
 
 
 def to_offsets(
-    tracks: Sequence[TrackSet], verdict: Verdict, seconds: float, broken: Mapping[int, tuple[Break, ...]] | None = None
+    tracks: Sequence[TrackSet],
+    verdict: Verdict,
+    seconds: float,
+    broken: Mapping[int, tuple[Break, ...]] | None = None,
+    lags: Sequence[Lag] = (),
 ) -> Offsets:
+    """Args: lags: delays among the tracks of each video; none: nobody asked."""
     found = tuple((broken or {}).get(v, ()) for v in range(len(tracks)))
     # the error of a jump is that of all behind it
     loose = [
         sum(jump_sigma(b, 1 / nominal_fps(t)) ** 2 for b in breaks) for breaks, t in zip(found, tracks, strict=True)
     ]
+    # and so is that of tracks that come late
+    loose = [total + lag.sigma**2 for total, lag in zip(loose, lags or [Lag(0.0, 0.0)] * len(loose), strict=True)]
     loose = [total + loose[verdict.reference] for total in loose]
     sigma = np.where(np.arange(len(tracks)) == verdict.reference, 0.0, np.hypot(verdict.sigma, np.sqrt(loose)))
     return Offsets(

@@ -387,9 +387,13 @@ def _flags(
     contradicted = len(vouching) > 0 and sum(vouching) <= len(vouching) / 2
     mismatch = sum(Status.RATE_MISMATCH in a.refined.flags for a, _ in own) > len(own) / 2
     broken = sum(Status.BROKEN_CLOCK in a.refined.flags for a, _ in own) >= max(len(own) / 2, 1)
+    # however well pairs agree: what is wrong with the tracks of a video is in all of them
+    lagging = len(own) > 0 and all(Status.LAGGING in a.refined.flags for a, _ in own)
     flags: list[Status] = []
     if broken:
         flags.append(Status.BROKEN_CLOCK)
+    if lagging:
+        flags.append(Status.LAGGING)
     if contradicted:
         flags.append(Status.INCONSISTENT)
     if mismatch:

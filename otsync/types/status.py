@@ -31,6 +31,11 @@ class Status(StrEnum):
         "Parts of the overlap have offsets of their own: a video froze, lost frames, was paused or cut. Look at the "
         "parts; give the true timestamps, or cut the recording there."
     )
+    LAGGING = (
+        "The tracks of this video, or of the reference, come late by delays of their own, as a tracker's do that "
+        "filters as it goes; by how much all of them are late nobody can tell. Track without such a filter, or take "
+        "other tracks."
+    )
     POOR_FIT = (
         "The matched motions hardly correlate at the answer. Check that both videos show the same scene, and the "
         "matches and camera poses."

@@ -20,6 +20,7 @@ EPIPOLAR = ("tests/otsync/epipolar",)
 PARTS = ("tests/otsync/sync/test_parts.py",)
 COMMON = ("tests/otsync/refine/test_common_motion.py",)
 PLACES = ("tests/otsync/sync/test_places.py",)
+LAGS = ("tests/otsync/sync/test_lags.py",)
 SECONDS = ("tests/otsync/refine/test_seconds.py",)
 TIMING = ("tests/otsync/simulate/test_timing.py",)
 FRAMES = ("tests/otsync/frames/test_fit.py", "tests/otsync/frames/test_noise.py")
@@ -92,6 +93,22 @@ BREAKS = (
         "return here > 0",
         AUDIT,
         "a peak that has a rival counts as settled",
+    ),
+    Break(
+        "lags-noise-counts",
+        "otsync/sync/lags.py",
+        "between = weight * (late.sum(1) ** 2 - (late**2).sum(1))",
+        "between = weight * late.sum(1) ** 2",
+        LAGS,
+        "what a pair of tracks says in one second vouches for itself: noise passes for delays",
+    ),
+    Break(
+        "lags-of-others",
+        "otsync/sync/lags.py",
+        "lagging & set(a.pair)",
+        "lagging & {a.pair[1]}",
+        LAGS,
+        "a reference whose tracks lag is no matter",
     ),
     Break(
         "seconds-end-unseen",

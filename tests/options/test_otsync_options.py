@@ -116,6 +116,7 @@ REFINER_OPTIONS = slot("refiner", "SplineRefine", windows="0.3 0.2", smoothing=3
         "wander": "-9",
         "unsteady": "-1",
         "untold": "-1",
+        "lag": "-1",
         "overlap": "1e9",
         "matches": "1e9",
     }.items()
@@ -133,6 +134,7 @@ EPIPOLAR_OPTIONS = slot(
     weak=1e9,
     ambiguous=9.0,
 ) | slot("refiner", "EpipolarRefine", windows="0.3 0.2", reach=1e-6, iterations=1)
+EPIPOLAR_OPTIONS |= {f"{EPIPOLAR_FIT}.trust.lag": ["--refiner.trust.lag", "-1"]}
 EPIPOLAR_OPTIONS |= {
     f"{EPIPOLAR_FIT}.scan.{name}": [f"--refiner.scan.{name.replace('_', '-')}", value]
     for name, value in {"window": "0.5", "motion_scale": "9", "position_scale": "30", "min_seen": "4"}.items()
@@ -160,7 +162,10 @@ NOT_READ = {
     },
     **{
         f"{SCAN}.trust.{name}": "aligner"
-        for name in ("moved", "spread", "correlation", "blur", "common", "wander", "unsteady", "untold", "rate_sigmas")
+        for name in (
+            *("moved", "spread", "correlation", "blur", "common", "wander", "unsteady", "untold", "rate_sigmas"),
+            "lag",
+        )
     },
     **{f"{FIT}.trust.{name}": "refiner" for name in ("disagreement", "alias", "motion", "rate_gain")},
 }

@@ -27,7 +27,7 @@ from .noise import (
     Transient,
 )
 from .timing import Cut, Drop, Freeze, In, Loop, Repeats, Reverse, SlowMotion
-from .tracker import Gaps, Hallucination, IdentitySwitch, Occlusion, Outliers, RayCompression, Smoothing
+from .tracker import Gaps, Hallucination, IdentitySwitch, Lag, Occlusion, Outliers, RayCompression, Smoothing
 
 __all__ = [
     "CameraDepthDrift",
@@ -45,6 +45,7 @@ __all__ = [
     "Hallucination",
     "IdentitySwitch",
     "In",
+    "Lag",
     "LateralJitter",
     "LimbDrift",
     "Loop",

@@ -10,6 +10,9 @@ from jaxtyping import Bool, Float
 from ..observation import Observation, Surface
 from .noise import along_ray, dtype_of, smooth_noise
 
+LAG_STEP = 1 / 120
+"""Seconds between the delays at which a world is asked where its points are."""
+
 
 @dataclass(frozen=True)
 class RayCompression:
@@ -69,6 +72,33 @@ class Smoothing:
             + np.einsum("st,nti->nsi", kernel, (obs.xyz - middle) * seen[..., None], optimize=True) / weight[..., None]
         )
         return replace(obs, xyz=np.where(obs.visible[..., None], xyz, obs.xyz))
+
+
+@dataclass(frozen=True)
+class Lag:
+    """Every track comes late by a delay of its own, as those of a tracker that filters as it goes.
+
+    Args:
+        mean: s; delays are exponentially distributed.
+    """
+
+    mean: float = 3 / 30
+
+    def __call__(self, obs: Observation, rng: np.random.Generator) -> Observation:
+        if self.mean <= 0:
+            return obs
+        delay = rng.exponential(self.mean, len(obs.xyz))
+        known = np.linspace(0.0, float(delay.max()), max(2, int(np.ceil(delay.max() / LAG_STEP)) + 1))
+        xyz = obs.xyz.copy()
+        # between two known delays a track is taken to run straight on
+        right = np.clip(np.searchsorted(known, delay), 1, len(known) - 1)
+        share = ((delay - known[right - 1]) / (known[right] - known[right - 1])).astype(obs.xyz.dtype)
+        for k, late in enumerate(known):
+            weight = np.where(right == k, share, 0) + np.where(right - 1 == k, 1 - share, 0)
+            chosen = np.flatnonzero(weight)
+            if len(chosen):
+                xyz[chosen] += weight[chosen, None, None] * obs.moved(-late)[chosen]
+        return replace(obs, xyz=xyz)
 
 
 def lost_spans(

@@ -1,0 +1,186 @@
+"""Whether the tracks of one video keep one time: what is close together moves at once, unless its tracks come late.
+
+A tracker that filters as it goes (Kalman, One Euro, a template that follows) delivers every track late by a delay of
+its own. Partners are chosen by how well they move together, so the matches of two videos hardly show it, and the fit
+says that it knows the offset well; it is off by the delays that most matches have in common. Neighbours within one
+video were not chosen so, and need no other video: each pair of them tells by how much one is late.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..clocks.splines import TrackSplines
+from ..compute.indices import evenly
+from ..costs.linear import binary_scale
+from ..refine.samples import Pieces, detrended
+from ..types import Status, TrackSet, in_order
+from .verdict import Answer
+
+NEIGHBOURS = 3
+"""Of every track, the nearest ones that it is compared with: of small things further ones are on another thing."""
+
+MOST_TRACKS = 1000
+"""Of more tracks, so many stand for all."""
+
+MOMENTS = 64
+"""Frames at most, evenly spread, that tell which tracks are neighbours; both must be seen at four of them."""
+
+WINDOW = 14 / 30
+"""Half window of detrending, s, as of the fit."""
+
+LEAST_SEEN = 20 / 30
+"""Seconds for which both neighbours must be seen."""
+
+TYPICAL = 2.0
+"""Pairs whose residual is beyond this many typical ones count for less: neighbours that part."""
+
+TOGETHER = 0.4
+"""Correlation of the detrended positions of neighbours, the median, from which on they move together. Forty things that
+each go their own way have .31 at most, tracks that lag .67 and more (mid) and .36 (hard, one of twenty below .4)."""
+
+FINE, DEPENDENT = 0.3 / 30, 0.3
+"""A pair that knows its delay to FINE seconds counts half as much as one that knows it exactly; and seconds within
+which errors of one pair depend on each other."""
+
+SURE = 2.3
+"""Standard errors from which on delays are real. Of videos without any (mid, hard, canon, unison, things that jump;
+seeds 41000-41015) those that are so sure have up to .50 frame, brutal ones .81, six cameras of a basketball scene .17;
+with delays that are exponential, of 3 frames in the mean, all 32 are so sure (mid, hard), and have .95 and more."""
+
+USUAL = 0.5 / 30
+"""Seconds that neighbours on a turning body differ by, which is no delay: sigma has only what is more."""
+
+
+@dataclass(frozen=True)
+class Lag:
+    """Delays among the tracks of one video.
+
+    Args:
+        spread: rms by which a track is late against its neighbours, s. sure: of that, in standard errors.
+    """
+
+    spread: float
+    sure: float
+
+    @property
+    def told(self) -> float:
+        """The spread, s; 0 where it may be noise."""
+        return self.spread if self.sure >= SURE else 0.0
+
+    @property
+    def sigma(self) -> float:
+        """What it may move the clock of the video by, s: the delays that most of its matches share are as large as
+        those by which they differ.
+        """
+        return math.sqrt(max(0.0, self.told**2 - USUAL**2))
+
+
+def lag_of(tracks: TrackSet) -> Lag:
+    """How much the tracks of a video lag behind each other; by positions where there are any, otherwise by pixels.
+
+    With x, y two neighbours, their mean velocity w, all without their means over ± :data:`WINDOW`, a second of delay
+    of one makes x - y grow by w. Noise is not late: what a pair says in one second has nothing to do with what it says
+    in another, while a delay is the same in all. So the spread² is the mean over pairs, and over all pairs of
+    different seconds, of the product of what both say. Nothing is told where neighbours do not move together: things
+    that each go their own way are late against each other all the time.
+    """
+    scene = _positions(tracks)
+    curves = TrackSplines(tracks.times, scene)
+    i, j = _neighbours(scene)
+    if not len(i):
+        return Lag(0.0, 0.0)
+    sums, moved = [], np.zeros((3, len(i)))
+    parts = Pieces.of(curves, WINDOW)
+    for frames, middle in parts:
+        times = curves.times[frames]
+        x, v, seen = curves.joined(times), curves.velocity(times), curves.support(times)
+        both = seen[i] & seen[j]
+        p, q, w = (detrended(d, both, parts.near)[:, middle] for d in (x[i], x[j], (v[i] + v[j]) / 2))
+        r = p - q
+        moved += [(p * q).sum((1, 2)), (p * p).sum((1, 2)), (q * q).sum((1, 2))]
+        second = np.floor(times[middle] - times[middle][0] + 1e-9).astype(int)
+        products = (r * w).sum(2), (w * w).sum(2), (r * r).sum(2), both[:, middle].astype(float)
+        sums.append(np.stack([_by(second, p) for p in products]))
+    move = moved[1] * moved[2] > 0
+    alike = moved[0, move] / np.sqrt(moved[1, move] * moved[2, move])
+    if not len(alike) or np.median(alike) < TOGETHER:
+        return Lag(0.0, 0.0)
+    return _spread(np.concatenate(sums, 2), curves.frame)
+
+
+def _spread(sums: Float[np.ndarray, "4 M S"], frame: float) -> Lag:
+    """Args: sums: of r·w, w·w, r·r and 1, of every pair, second by second."""
+    late, moving, size, seen = sums
+    count, information = seen.sum(1), moving.sum(1)
+    known = count * frame >= LEAST_SEEN
+    if not known.any() or not information[known].any():
+        return Lag(0.0, 0.0)
+    rms = np.sqrt(size.sum(1) / np.maximum(count, 1))
+    typical = float(np.median(rms[known]))
+    weight = np.where(known, 1 / (1 + (rms / max(TYPICAL * typical, 1e-300)) ** 2), 0.0)
+    noise = float(weight @ size.sum(1)) / float(weight @ count) / 3
+    weight = (weight / (information + max(noise * DEPENDENT / frame / FINE**2, 1e-300))) ** 2
+    between = weight * (late.sum(1) ** 2 - (late**2).sum(1))
+    of = float((weight * (information**2 - (moving**2).sum(1))).sum())
+    if of <= 0:
+        return Lag(0.0, 0.0)
+    error = math.sqrt(float(((between - between.mean()) ** 2).sum()))
+    total = float(between.sum())
+    return Lag(math.sqrt(max(total, 0.0) / of), total / error if error > 0 else 0.0)
+
+
+def _positions(tracks: TrackSet) -> Float[np.ndarray, "N T 3"]:
+    """Of at most :data:`MOST_TRACKS` tracks, in units of their size; nan where unseen."""
+    some = evenly(len(tracks), MOST_TRACKS)
+    if tracks.xyz is not None:
+        x = tracks.positions(some)
+    else:
+        assert tracks.uv is not None
+        uv = np.where(tracks.seen[some, :, None], tracks.uv[some], np.nan)
+        x = np.concatenate([uv, np.where(np.isfinite(uv[..., :1]), 0.0, np.nan)], 2)
+    return np.asarray(x / binary_scale(x), float)
+
+
+def _neighbours(x: Float[np.ndarray, "N T 3"]) -> tuple[Int[np.ndarray, " M"], Int[np.ndarray, " M"]]:
+    """Pairs of tracks that are the nearest to each other, in the mean over the moments that show both."""
+    x = x[:, evenly(x.shape[1], MOMENTS)]
+    seen = np.isfinite(x).all(2)
+    middle = x[seen].mean(0) if seen.any() else 0.0
+    x = np.where(seen[..., None], x - middle, 0.0)
+    ok = seen.astype(float)
+    flat = x.reshape(len(x), -1)
+    own = (x**2).sum(2) @ ok.T
+    squares = own + own.T - 2 * flat @ flat.T
+    count = ok @ ok.T
+    apart = np.where(count >= 4, np.maximum(squares, 0) / np.maximum(count, 1), np.inf)
+    np.fill_diagonal(apart, np.inf)
+    near = np.argsort(apart, 1, kind="stable")[:, :NEIGHBOURS]
+    first = np.repeat(np.arange(len(x)), near.shape[1])
+    second = near.ravel()
+    good = np.isfinite(apart[first, second])
+    pairs = np.unique(np.sort(np.stack([first, second], 1)[good], axis=1), axis=0)
+    return pairs[:, 0], pairs[:, 1]
+
+
+def _by(second: Int[np.ndarray, " T"], values: Float[np.ndarray, "M T"]) -> Float[np.ndarray, "M S"]:
+    starts = np.flatnonzero(np.diff(second, prepend=-1))
+    return np.add.reduceat(values, starts, axis=1)
+
+
+def with_lags(answers: Sequence[Answer], lags: Sequence[Lag], limit: float) -> list[Answer] | None:
+    """The answers, with those of videos doubted whose tracks lag by more than ``limit`` s; None where none do."""
+    lagging = {v for v, lag in enumerate(lags) if lag.told > limit}
+    if not lagging:
+        return None
+
+    def doubted(answer: Answer) -> Answer:
+        found = answer.refined
+        return replace(answer, refined=replace(found, flags=in_order((*found.flags, Status.LAGGING))))
+
+    return [doubted(a) if lagging & set(a.pair) else a for a in answers]
