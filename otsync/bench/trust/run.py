@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 
 from ...align.warping import DTW
-from ...progress import counted
+from ...progress import counted, tell
 from ...sync.method import PAPER, Method
 from ...sync.verb import synchronize
+from ..kept import Kept
 from ..record import Row, table, write_rows
 from ..sync_acceptance import WRONG, Check, at_least, at_most
 from ..sync_worlds import FPS
@@ -67,8 +68,8 @@ def run(
     jobs = [(name, "default", first_seed + k) for name in chosen for k in range(seeds)]
     if not only:
         jobs += [(n, m, first_seed + k) for n in SHORT for m in METHODS if m != "default" for k in range(seeds)]
-    rows = list(measured(jobs, one, "trust"))
     about = {"seeds": seeds, "first_seed": first_seed}
+    rows = list(measured(jobs, one, "trust", Kept(out / "trust_answers.jsonl", about)))
     write_rows(out, "trust", [written(r) for r in rows], about)
     summary = summarise(rows)
     write_rows(out, "trust_classes", [written(r) for r in summary], about)
@@ -83,14 +84,33 @@ def run(
     return 0 if all(c.met for c in checks) or not promises else 1
 
 
-def measured(jobs: Sequence[Any], answer: Callable[[Any], list[dict[str, Any]]], what: str) -> Iterator[dict[str, Any]]:
-    """A row a video; the jobs are done by a process a core. what: is counted, in the progress bar."""
+def measured(
+    jobs: Sequence[Any], answer: Callable[[Any], list[dict[str, Any]]], what: str, kept: Kept | None = None
+) -> Iterator[dict[str, Any]]:
+    """A row a video; the jobs are done by a process a core.
+
+    Args:
+        what: is counted, in the progress bar. kept: what was measured before, and is not measured again.
+    """
     import multiprocessing
 
+    todo = [job for job in jobs if kept is None or kept.rows(job) is None]
+    if kept is not None and len(todo) < len(jobs):
+        tell(f"{what}: {len(jobs) - len(todo)} of {len(jobs)} worlds were answered before: {kept.path}")
     workers = len(os.sched_getaffinity(0))
     with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
-        for rows in counted(pool.map(answer, jobs, chunksize=2), what, "world", total=len(jobs)):
-            yield from rows
+        fresh = iter(counted(pool.map(answer, todo, chunksize=2), what, "world", total=len(todo)))
+        try:
+            for job in jobs:
+                rows = None if kept is None else kept.rows(job)
+                if rows is None:
+                    rows = next(fresh)
+                    if kept is not None:
+                        kept.keep(job, rows)
+                yield from rows
+        except BaseException:  # what is on its way would be waited for
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
 
 
 def one(job: tuple[str, str, int], changed: Method | None = None) -> list[dict[str, Any]]:

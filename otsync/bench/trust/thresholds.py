@@ -27,6 +27,7 @@ from ...refine.splines import READS as FITTED
 from ...refine.splines import SplineRefine
 from ...sync.method import Method
 from ...types.trust import Trust
+from ..kept import Kept
 from ..record import Row, table, write_rows
 from .run import FIRST_SEED, interval, measured, one, written, wrong
 from .worlds import CLASSES
@@ -68,7 +69,8 @@ def run(out: Path, *, seeds: int = 3, first_seed: int = TUNED_ON, only: tuple[st
     worlds = [(world, first_seed + k) for world in CLASSES for k in range(seeds)]
     # the limits as they are answer once, for all
     jobs = [(*limit, *world) for limit in [(None, 0.0), *others] for world in worlds]
-    answers = list(measured(jobs, answered, "thresholds"))
+    about = {"seeds": seeds, "first_seed": first_seed}
+    answers = list(measured(jobs, answered, "thresholds", Kept(out / "thresholds_answers.jsonl", about)))
     of: dict[tuple[str | None, float], list[Row]] = {}
     for row in answers:
         of.setdefault((row["limit"], row["value"]), []).append(row)
@@ -77,7 +79,6 @@ def run(out: Path, *, seeds: int = 3, first_seed: int = TUNED_ON, only: tuple[st
         for name, each in tried.items()
         for value in each
     ]
-    about = {"seeds": seeds, "first_seed": first_seed}
     write_rows(out, "thresholds_answers", [written(r) for r in answers], about)
     write_rows(out, "thresholds", rows, about)
     told = [chosen([r for r in rows if r["limit"] == name]) for name in now]
