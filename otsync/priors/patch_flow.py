@@ -13,6 +13,10 @@ from ..types.checks import check_whole, positive
 LEAST = 16
 """Pixels of the shorter side of the coarsest level: two patches."""
 
+SMALL = 96
+"""Pixels of the shorter side of an image below which half the resolution shows too little: what moves in it is a few
+pixels wide."""
+
 AROUND = 2
 """Pixels of a level around what moves that patches reach: slopes of the images are taken there."""
 
@@ -24,7 +28,7 @@ RELAXED = 2
 class PatchFlow:
     """Dense inverse search and variational refinement, as :class:`DISFlow` does them, where something moves.
 
-    Levels from half the resolution down; on each, patches of 8 x 8 pixels that hold what moves are searched from where
+    Levels from half the resolution down (of small images from all of it); on each, patches of 8 x 8 pixels that hold what moves are searched from where
     the coarser level leads, spread over their pixels, and refined within what moves. What is still beside it has no
     say. On three cameras of basketball the flow of what moves differs from that of :class:`DISFlow` by .09 px (median;
     .35 at most in the worst tenth), in a fourth to a fifth of the time. Where parts of real images were moved over a
@@ -123,7 +127,7 @@ class Level:
 
 
 def levels(image: UInt8[np.ndarray, "H W"], moves: Bool[np.ndarray, "H W"], stride: int) -> tuple[Level, ...]:
-    """Levels of an image from half its resolution down."""
+    """Levels of an image, from half its resolution down; of a small one, from all of it."""
     import cv2
 
     from .kernels_flow import PAD, SIDE, length, stretches
@@ -133,7 +137,8 @@ def levels(image: UInt8[np.ndarray, "H W"], moves: Bool[np.ndarray, "H W"], stri
     part: Any = moves.astype(np.uint8)
     reach = np.ones((SIDE + 2 * AROUND,) * 2, np.uint8)  # of a patch from its first pixel on
     while not out or min(now.shape) // 2 >= LEAST:
-        h, w = (max(SIDE, n // 2) for n in now.shape)
+        whole = not out and min(now.shape) < SMALL
+        h, w = (max(SIDE, n if whole else n // 2) for n in now.shape)
         now = cv2.resize(now, (w, h), interpolation=cv2.INTER_AREA)
         part = (cv2.resize(255 * part, (w, h), interpolation=cv2.INTER_AREA) > 0).astype(np.uint8)
         part = cv2.dilate(part, np.ones((3, 3), np.uint8))  # points lie between pixels

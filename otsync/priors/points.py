@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from .flow import DISFlow
+from .patch_flow import PatchFlow
 from .slots import Flow, OfWhatMoves, cache_key
 from .working import WorkingFrames, bilinear
 
@@ -42,7 +42,7 @@ class ChainedFlow:
     most: int = 4000
     max_gap: int = 0
     join: float = 4.0
-    flow: Flow = field(default_factory=DISFlow)
+    flow: Flow = field(default_factory=PatchFlow)
 
     @property
     def cache_key(self) -> Any:

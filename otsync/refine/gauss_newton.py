@@ -109,6 +109,7 @@ class Fit:
         blur: rms residual over rms speed, s: how far off a single sample of a typical match tells the time.
         wander: rms over blocks of a second, by their information, of what each says the offset is off by, s.
         information: Σ w v·v of the weighted samples: how much moves there.
+        witnesses: neighbourhoods of matches that hold the information, of equal shares of it.
     """
 
     clock: Clock
@@ -119,6 +120,7 @@ class Fit:
     wander: float = 0.0
     settled: bool = True
     information: float = 0.0
+    witnesses: float = 1.0
 
     @property
     def effective_matches(self) -> float:
@@ -176,7 +178,8 @@ def fit_clock(
         move = np.array([[1.0, -centre], [0.0, 1.0]])
         covariance = move @ covariance @ move.T
     moving = float(system.H[0, 0])
-    return Fit(clock, covariance, system.match_weights, n, system.blur, system.wander(), settled, moving)
+    wander, witnesses = system.wander(), system.witnesses()
+    return Fit(clock, covariance, system.match_weights, n, system.blur, wander, settled, moving, witnesses)
 
 
 def _centre(a: TrackSplines, b: TrackSplines, clock: Clock) -> float:
@@ -220,6 +223,11 @@ class System:
         H, g = self.by_time[0][:, 0, 0], self.by_time[1][:, 0]
         told = 1e-9 * max(float(H.sum()), 1e-300) < H
         return float(np.sqrt((g[told] ** 2 / H[told]).sum() / max(float(H[told].sum()), 1e-300)))
+
+    def witnesses(self) -> float:
+        """See :class:`Fit`."""
+        H = self.by_match[0][:, 0, 0]
+        return float(H.sum() ** 2 / max(float((H**2).sum()), 1e-300))
 
 
 def jackknife(H: Float[np.ndarray, "C P P"], g: Float[np.ndarray, "C P"]) -> Float[np.ndarray, "P P"]:
