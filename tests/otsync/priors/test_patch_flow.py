@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from otsync.priors.flow import DISFlow
-from otsync.priors.patch_flow import PatchFlow
+from otsync.priors.patch_flow import SMALL, PatchFlow
 from otsync.priors.points import ChainedFlow
 from otsync.priors.slots import OfWhatMoves
 from otsync.priors.working import WorkingFrames

@@ -92,6 +92,21 @@ def test_a_clock_that_wanders_is_unsteady_and_one_that_runs_evenly_is_not():
     assert told["wanders"].stats["unsteady"] > limit and Status.BROKEN_CLOCK in told["wanders"].flags
 
 
+@pytest.mark.parametrize("alone", [True, False])
+def test_one_track_by_itself_tells_no_second(alone):
+    """It agrees with itself, exactly: a wrong match would be sure. Beside others its weight falls."""
+    a, b = wandering(lambda t: 0.3 + 0 * t)
+    x, y = a.positions().copy(), b.positions().copy()
+    y[0] = np.roll(y[0], 8, axis=0)  # the first match is wrong by 8 frames
+    if alone:
+        x[1:, :39], y[1:, :30] = np.nan, np.nan
+    told = seconds_of(
+        TrackSet(x, np.isfinite(x[..., 0]), fps=30), TrackSet(y, np.isfinite(y[..., 0]), fps=30), Clock(0.3)
+    )
+    assert np.isnan(told.late[0]) == alone
+    assert told.unsteady(0.001) < SplineRefine().trust.unsteady
+
+
 def test_an_end_that_moves_and_fits_nothing_is_not_vouched_for():
     """In its last second the second video shows something else: no offset suits that."""
     rng = np.random.default_rng(5)
