@@ -28,12 +28,12 @@ RELAXED = 2
 class PatchFlow:
     """Dense inverse search and variational refinement, as :class:`DISFlow` does them, where something moves.
 
-    Levels from half the resolution down (of small images from all of it); on each, patches of 8 x 8 pixels that hold what moves are searched from where
-    the coarser level leads, spread over their pixels, and refined within what moves. What is still beside it has no
-    say. On three cameras of basketball the flow of what moves differs from that of :class:`DISFlow` by .09 px (median;
-    .35 at most in the worst tenth), in a fourth to a fifth of the time. Where parts of real images were moved over a
-    still ground by known flows, the median error was .25, .48 and 1.2 px for motions of 1, 3 and 8 px; that of
-    :class:`DISFlow` .26, .48 and 1.2.
+    Levels from half the resolution down (of small images from all of it); on each, patches of 8 x 8 pixels that hold
+    what moves are searched from where the coarser level leads, spread over their pixels, and refined within what moves.
+    What is still beside it has no say. On three cameras of basketball the flow of what moves differs from that of
+    :class:`DISFlow` by .09 px (median; .35 at most in the worst tenth), in a fourth to a fifth of the time. Where parts
+    of real images were moved over a still ground by known flows, the median error was .25, .48 and 1.2 px for motions
+    of 1, 3 and 8 px; that of :class:`DISFlow` .26, .48 and 1.2.
 
     Args:
         stride: pixels of a level between patches. steps: of Gauss-Newton in each of two passes.

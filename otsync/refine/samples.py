@@ -37,9 +37,14 @@ class Pieces:
 
     @classmethod
     def of(cls, own: TrackSplines, window: float) -> Pieces:
-        near = max(1, round(window / own.frame))
-        length = max(round(PIECE / own.frame), 4 * near)
-        count = max(1, math.ceil(len(own.times) / length))
+        return cls.at(own.frame, len(own.times), window)
+
+    @classmethod
+    def at(cls, frame: float, frames: int, window: float) -> Pieces:
+        """Of a clip of so many frames, each ``frame`` s after the one before."""
+        near = max(1, round(window / frame))
+        length = max(round(PIECE / frame), 4 * near)
+        count = max(1, math.ceil(frames / length))
         return cls(length, near, evenly(count, MOST_PIECES), count)
 
     @property

@@ -49,9 +49,9 @@ FINE, DEPENDENT = 0.3 / 30, 0.3
 which errors of one pair depend on each other."""
 
 LOWER = 1.5
-"""Standard errors of the squared spread that are taken off it: what is left is hardly noise. Of 129 videos without delays
-(mid, hard, brutal; seeds 41000-41023) none has more than .42 frame left. Of 94 whose delays are exponential with a mean
-of 3 frames (mid, hard) one has less than .6, of 95 with a mean of 1.5 eleven percent."""
+"""Standard errors of the squared spread that are taken off it: what is left is hardly noise. Of 129 videos without
+delays (mid, hard, brutal; seeds 41000-41023) none has more than .42 frame left. Of 94 whose delays are exponential with
+a mean of 3 frames (mid, hard) one has less than .6, of 95 with a mean of 1.5 eleven percent."""
 
 USUAL = 0.5 / 30
 """Seconds that neighbours on a turning body differ by, which is no delay: sigma has only what is more."""
@@ -90,28 +90,32 @@ def lag_of(tracks: TrackSet) -> Lag:
     different seconds, of the product of what both say. Nothing is told where neighbours do not move together: things
     that each go their own way are late against each other all the time.
     """
-    scene = _positions(tracks)
-    curves = TrackSplines(tracks.times, scene)
-    i, j = _neighbours(scene)
+    times = tracks.times
+    frame = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
+    here_and_there = _positions(tracks, evenly(len(times), MOMENTS))
+    unit = binary_scale(here_and_there)
+    i, j = _neighbours(here_and_there / unit)
     if not len(i):
         return Lag(0.0, 0.0)
     sums, moved = [], np.zeros((3, len(i)))
-    parts = Pieces.of(curves, WINDOW)
+    parts = Pieces.at(frame, len(times), WINDOW)
     for frames, middle in parts:
-        times = curves.times[frames]
-        x, v, seen = curves.joined(times), curves.velocity(times), curves.support(times)
+        # curves of a piece alone: of an hour only a part is read
+        t = times[frames]
+        curves = TrackSplines(t, _positions(tracks, frames) / unit)
+        x, v, seen = curves.joined(t), curves.velocity(t), curves.support(t)
         both = seen[i] & seen[j]
         p, q, w = (detrended(d, both, parts.near)[:, middle] for d in (x[i], x[j], (v[i] + v[j]) / 2))
         r = p - q
         moved += [(p * q).sum((1, 2)), (p * p).sum((1, 2)), (q * q).sum((1, 2))]
-        second = np.floor(times[middle] - times[middle][0] + 1e-9).astype(int)
+        second = np.floor(t[middle] - t[middle][0] + 1e-9).astype(int)
         products = (r * w).sum(2), (w * w).sum(2), (r * r).sum(2), both[:, middle].astype(float)
         sums.append(np.stack([_by(second, p) for p in products]))
     move = moved[1] * moved[2] > 0
     alike = moved[0, move] / np.sqrt(moved[1, move] * moved[2, move])
     if not len(alike) or np.median(alike) < TOGETHER:
         return Lag(0.0, 0.0)
-    return _spread(np.concatenate(sums, 2), curves.frame)
+    return _spread(np.concatenate(sums, 2), frame)
 
 
 def _spread(sums: Float[np.ndarray, "4 M S"], frame: float) -> Lag:
@@ -135,21 +139,21 @@ def _spread(sums: Float[np.ndarray, "4 M S"], frame: float) -> Lag:
     return Lag(math.sqrt(max(total, 0.0) / of), total / error if error > 0 else 0.0)
 
 
-def _positions(tracks: TrackSet) -> Float[np.ndarray, "N T 3"]:
-    """Of at most :data:`MOST_TRACKS` tracks, in units of their size; nan where unseen."""
+def _positions(tracks: TrackSet, frames: slice | Int[np.ndarray, " F"]) -> Float[np.ndarray, "N F 3"]:
+    """Of at most :data:`MOST_TRACKS` tracks at some frames; nan where unseen."""
     some = evenly(len(tracks), MOST_TRACKS)
     if tracks.xyz is not None:
-        x = tracks.positions(some)
+        x = tracks.positions(some, frames)
     else:
         assert tracks.uv is not None
-        uv = np.where(tracks.seen[some, :, None], tracks.uv[some], np.nan)
-        x = np.concatenate([uv, np.where(np.isfinite(uv[..., :1]), 0.0, np.nan)], 2)
-    return np.asarray(x / binary_scale(x), float)
+        seen = tracks.seen[:, frames][some, :, None]
+        uv = np.where(seen, tracks.uv[:, frames][some], np.nan)
+        x = np.concatenate([uv, np.where(seen, 0.0, np.nan)], 2)
+    return np.asarray(x, float)
 
 
 def _neighbours(x: Float[np.ndarray, "N T 3"]) -> tuple[Int[np.ndarray, " M"], Int[np.ndarray, " M"]]:
     """Pairs of tracks that are the nearest to each other, in the mean over the moments that show both."""
-    x = x[:, evenly(x.shape[1], MOMENTS)]
     seen = np.isfinite(x).all(2)
     middle = x[seen].mean(0) if seen.any() else 0.0
     x = np.where(seen[..., None], x - middle, 0.0)
