@@ -156,8 +156,10 @@ def audit_offsets(
     if agreed.any():
         sigma = sigma * max(1.0, MAD * float(np.median(apart)) * _small(int(agreed.sum())))
     frames, sigma_frames, jitter_frames = (late - centre) * fps, sigma * fps, jitter * fps
-    near = agreed & (np.abs(frames) <= np.maximum(tolerance, SIGMAS * sigma_frames))
-    majority = V >= LEAST and 2 * int(near.sum()) > V
+    beside = linked & (np.abs(frames) <= np.maximum(tolerance, SIGMAS * sigma_frames))
+    near = agreed & beside
+    # a camera that is doubted, and all the same where the sure ones are, is one voice more for their clock
+    majority = V >= LEAST and 2 * int(beside.sum()) > V
     cameras = []
     for v, name in enumerate(offsets.names):
         left = doubts[v]

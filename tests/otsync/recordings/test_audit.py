@@ -127,6 +127,14 @@ def test_a_clock_in_doubt_is_its_own_cameras_affair():
     assert findings(rig([0.0] * 5, of_pairs={0: (Status.BROKEN_CLOCK,)})) == ["unsure"] + ["in_sync"] * 4
 
 
+@pytest.mark.parametrize("beside", [0.0, 7.0])
+def test_cameras_in_doubt_that_agree_with_the_sure_ones_make_a_majority(beside):
+    """Three sure ones of six are none by themselves; two that are elsewhere add nothing."""
+    broken = {4: (Status.BROKEN_CLOCK,), 5: (Status.BROKEN_CLOCK,)}
+    told = findings(rig([0.0, 2.0, 0, 0, beside, -beside], flags=broken, of_pairs=broken))
+    assert told[1] == ("unsure" if beside else "off")
+
+
 def test_a_doubt_about_peaks_is_settled_by_the_sum_of_curves_or_stays():
     flags = {1: (Status.AMBIGUOUS,)}
     settled = rig([0.0, 5.0, 0, 0, 0], flags=flags, of_pairs=flags)
