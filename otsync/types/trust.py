@@ -48,8 +48,8 @@ class Trust:
             right answers three of 210 have more; brutal tracks that froze behind their first second, 15 frames off
             there at sigma .22, have 9.8, ten frames that were lost .7 s before the end 1.4 and 2.6.
         lag: LAGGING when the tracks of one video differ by more than this many seconds, rms, in how late they are:
-            see :mod:`otsync.sync.lags`. Videos without delays have .42 frame at most (mid, hard and brutal, seeds
-            41000-41023); of those with delays of 3 frames in the mean one of 94 has less (mid and hard).
+            see :mod:`otsync.sync.lags`. Videos without delays have .47 frame at most (mid, hard and brutal, seeds
+            41000-41015); of those with delays of 3 frames in the mean one of 64 has less (mid and hard).
         rate_gain: RATE_MISMATCH when another common ratio of frame rates raises the score's peak by this factor.
         rate_sigmas: a fitted rate counts when it differs from the declared one by more than this many sigmas.
     """

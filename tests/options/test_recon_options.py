@@ -574,7 +574,7 @@ def test_the_other_options_of_a_run(arriving, world, outside, home):
     for name, value in named.items():  # both stages are told; what they do is tested with otsync sync and recon fit
         told = asked(f"--recording.{name}", value)
         assert told["fit"]["priors"] == {name: int(value) if name == "width" else value}
-        assert (told["stages"] != base["stages"]) == (name != "flow")  # that flow is the default
+        assert told["stages"] != base["stages"]
         refused(otsync.cli.main, running(world, home / "r", f"--recording.{name}", "a"), name)
     assert "dense" not in base
     maps, width, method = asked("--features", "lab:bins=3", "--method", "paper")["dense"]

@@ -18,11 +18,11 @@ from ...align.warping import DTW
 from ...progress import counted, tell
 from ...sync.method import PAPER, Method
 from ...sync.verb import synchronize
-from ..kept import Kept
 from ..record import Row, table, write_rows
 from ..sync_acceptance import WRONG, Check, at_least, at_most
 from ..sync_worlds import FPS
 from .diagram import draw, reliability
+from .kept import Kept
 from .worlds import CLASSES
 
 FIRST_SEED = 20_000

@@ -27,8 +27,8 @@ from ...refine.splines import READS as FITTED
 from ...refine.splines import SplineRefine
 from ...sync.method import Method
 from ...types.trust import Trust
-from ..kept import Kept
 from ..record import Row, table, write_rows
+from .kept import Kept
 from .run import FIRST_SEED, interval, measured, one, written, wrong
 from .worlds import CLASSES
 

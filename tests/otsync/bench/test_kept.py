@@ -6,8 +6,8 @@ import math
 
 import pytest
 
-from otsync.bench import kept
-from otsync.bench.kept import Kept
+from otsync.bench.trust import kept
+from otsync.bench.trust.kept import Kept
 from otsync.bench.trust.run import measured
 
 
