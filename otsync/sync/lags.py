@@ -49,9 +49,9 @@ FINE, DEPENDENT = 0.3 / 30, 0.3
 which errors of one pair depend on each other."""
 
 LOWER = 1.5
-"""Standard errors of the squared spread that are taken off it: what is left is hardly noise. Of 88 videos without delays
-(mid, hard, brutal; seeds 41000-41015) none has more than .47 frame left. Of 64 whose delays are exponential with a mean
-of 3 frames (mid, hard) one has less than .6, of 64 with a mean of 1.5 four."""
+"""Standard errors of the squared spread that are taken off it: what is left is hardly noise. Of 88 videos without
+delays (mid, hard, brutal; seeds 41000-41015) none has more than .47 frame left. Of 64 whose delays are exponential with
+a mean of 3 frames (mid, hard) one has less than .6, of 64 with a mean of 1.5 four."""
 
 USUAL = 0.5 / 30
 """Seconds that neighbours on a turning body differ by, which is no delay: sigma has only what is more."""
