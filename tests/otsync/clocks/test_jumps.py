@@ -35,9 +35,23 @@ def test_motion_and_noise_are_no_jumps_and_few_gaps_are(seed: int) -> None:
     rng = np.random.default_rng(seed)
     x = swaying(rng, noise=rng.choice([0.0, 0.002, 0.01, 0.05]))
     assert len(find_jumps(x)) == 0
-    lost = gaps(rng, x)
-    seen = np.isfinite(lost[..., 0])
-    assert len(find_jumps(lost)) <= 0.1 * (seen[:, :-1] & ~seen[:, 1:]).sum()
+    jumps, lost = jumps_and_gaps(gaps(rng, x))
+    assert jumps <= 0.2 * lost  # of 3000 worlds the worst has .12
+
+
+def jumps_and_gaps(x: np.ndarray) -> tuple[int, int]:
+    seen = np.isfinite(x[..., 0])
+    return len(find_jumps(x)), int((seen[:, :-1] & ~seen[:, 1:]).sum())
+
+
+def test_of_all_gaps_hardly_any_is_a_jump() -> None:
+    """Of 3000 worlds 1.9 % of the gaps are."""
+    told = []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        told.append(jumps_and_gaps(gaps(rng, swaying(rng, noise=rng.choice([0.0, 0.002, 0.01, 0.05])))))
+    jumps, lost = np.sum(told, 0)
+    assert jumps <= 0.03 * lost
 
 
 @settings(max_examples=25, deadline=None)
