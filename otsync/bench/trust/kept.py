@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +16,15 @@ PACKAGE = Path(__file__).parents[2]
 class Kept:
     """The rows of every job that is done, in a file of JSON lines.
 
-    Rows of the same code and the same settings are not measured again; what is of others is written anew.
+    Rows of the same code are not measured again, whatever else was asked with them; those of another are dropped.
 
     Args:
-        path: of the file. about: the settings; anything that JSON holds.
+        path: of the file. A job is anything that JSON holds, and says all that its rows depend on.
     """
 
-    def __init__(self, path: Path, about: Mapping[str, Any]):
+    def __init__(self, path: Path):
         self.path = path
-        self._head = json.dumps({"about": about, "code": code_digest()}, sort_keys=True)
+        self._head = json.dumps({"code": code_digest()})
         self._rows = dict(self._read())
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(path, "w") as stream:  # a torn line would spoil the next one

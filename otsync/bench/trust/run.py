@@ -69,7 +69,7 @@ def run(
     if not only:
         jobs += [(n, m, first_seed + k) for n in SHORT for m in METHODS if m != "default" for k in range(seeds)]
     about = {"seeds": seeds, "first_seed": first_seed}
-    rows = list(measured(jobs, one, "trust", Kept(out / "trust_answers.jsonl", about)))
+    rows = list(measured(jobs, one, "trust", Kept(out / "trust_answers.jsonl")))
     write_rows(out, "trust", [written(r) for r in rows], about)
     summary = summarise(rows)
     write_rows(out, "trust_classes", [written(r) for r in summary], about)

@@ -70,7 +70,7 @@ def run(out: Path, *, seeds: int = 3, first_seed: int = TUNED_ON, only: tuple[st
     # the limits as they are answer once, for all
     jobs = [(*limit, *world) for limit in [(None, 0.0), *others] for world in worlds]
     about = {"seeds": seeds, "first_seed": first_seed}
-    answers = list(measured(jobs, answered, "thresholds", Kept(out / "thresholds_answers.jsonl", about)))
+    answers = list(measured(jobs, answered, "thresholds", Kept(out / "thresholds_answers.jsonl")))
     of: dict[tuple[str | None, float], list[Row]] = {}
     for row in answers:
         of.setdefault((row["limit"], row["value"]), []).append(row)
