@@ -71,11 +71,12 @@ READS = (
     "wander",
     "unsteady",
     "untold",
+    "parted",
     "overlap",
     "matches",
     "rate_sigmas",
 )
-"""The limits of :class:`otsync.Trust` that the fit's flags are raised by."""
+"""The limits of :class:`otsync.Trust` that flags of the fit, and of its neighbourhoods, are raised by."""
 
 
 @dataclass(frozen=True)

@@ -184,12 +184,11 @@ def _by(second: Int[np.ndarray, " T"], values: Float[np.ndarray, "M T"]) -> Floa
 
 def with_lags(answers: Sequence[Answer], lags: Sequence[Lag], limit: float) -> list[Answer] | None:
     """The answers, with those of videos doubted whose tracks lag by more than ``limit`` s; None where none do."""
-    lagging = {v for v, lag in enumerate(lags) if lag.told > limit}
-    if not lagging:
-        return None
+    late = {v for v, lag in enumerate(lags) if lag.told > limit}
+    return [lagging(a) if late & set(a.pair) else a for a in answers] if late else None
 
-    def doubted(answer: Answer) -> Answer:
-        found = answer.refined
-        return replace(answer, refined=replace(found, flags=in_order((*found.flags, Status.LAGGING))))
 
-    return [doubted(a) if lagging & set(a.pair) else a for a in answers]
+def lagging(answer: Answer) -> Answer:
+    """The answer, doubted."""
+    found = answer.refined
+    return replace(answer, refined=replace(found, flags=in_order((*found.flags, Status.LAGGING))))

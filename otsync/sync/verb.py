@@ -29,13 +29,14 @@ from ..types import Alignment, Break, Clock, Matches, Offsets, Status, TrackSet,
 from ..types.checks import check_whole
 from .breaks import MOST, Seen, Suspect, culprit, mended, remeasured, runs_on, suspects
 from .graph import Graph, Pair
-from .lags import Lag, lag_of, with_lags
+from .lags import Lag, lag_of, lagging, with_lags
 from .method import Method, with_costs
 from .own_frames import Frames, refuse_common, solver_from, synchronize_own
 from .pairs import Job, Refit, run, run_refit, with_rate
 from .parts import broken_part, unvouched
 from .places import parts_by_place
 from .verdict import NOTHING_COMMON, Answer, Verdict, judge
+from .witnesses import parted
 
 MEASURED, SETTLED = 3, 0.02 / 30
 """How often a jump is measured anew, at most, and seconds by which it may still change."""
@@ -136,6 +137,7 @@ def synchronize(
             verdict = judged([_doubted(a) if breaking & set(a.pair) else a for a in verdict.answers])
     else:
         verdict = with_parts_checked(verdict, tracks, judged)
+        verdict = with_witnesses_heard(verdict, tracks, refining.trust.parted, judged)
     lags = list(map(lag_of, tracks))
     doubted = with_lags(verdict.answers, lags, refining.trust.lag)
     if doubted is not None:
@@ -157,6 +159,22 @@ def with_parts_checked(
         return verdict
     unsure = unvouched(broken, verdict.answers, tracks)
     return judged([_doubted(a) if a.pair in unsure else a for a in verdict.answers])
+
+
+def with_witnesses_heard(
+    verdict: Verdict, tracks: Sequence[TrackSet], limit: float, judged: Callable[[Sequence[Answer]], Verdict]
+) -> Verdict:
+    """The verdict, with pairs doubted of which a part of the scene tells another time."""
+
+    def contradicted(a: Answer) -> bool:
+        first, second = (tracks[v] for v in a.pair)
+        known = a.refined.status.ok and a.finite and first.xyz is not None and second.xyz is not None
+        return known and parted(a, first, second) > limit
+
+    doubted = {a.pair for a in verdict.answers if contradicted(a)}
+    if not doubted:
+        return verdict
+    return judged([lagging(a) if a.pair in doubted else a for a in verdict.answers])
 
 
 def _still_broken(fresh: Answer, first: Answer) -> Answer:

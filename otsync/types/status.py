@@ -32,9 +32,9 @@ class Status(StrEnum):
         "parts; give the true timestamps, or cut the recording there."
     )
     LAGGING = (
-        "The tracks of this video, or of the reference, come late by delays of their own, as a tracker's do that "
-        "filters as it goes; by how much all of them are late nobody can tell. Track without such a filter, or take "
-        "other tracks."
+        "Tracks of this video, or of the reference, come late by delays of their own: those of a tracker that filters "
+        "as it goes, or a part of the scene that is shown late (a screen, another tracker). By how much all of them are "
+        "late nobody can tell. Track without such a filter, or leave that part out."
     )
     POOR_FIT = (
         "The matched motions hardly correlate at the answer. Check that both videos show the same scene, and the "

@@ -50,6 +50,10 @@ class Trust:
         lag: LAGGING when the tracks of one video differ by more than this many seconds, rms, in how late they are:
             see :mod:`otsync.sync.lags`. Videos without delays have .47 frame at most (mid, hard and brutal, seeds
             41000-41015); of those with delays of 3 frames in the mean one of 64 has less (mid and hard).
+        parted: LAGGING when a neighbourhood of matches, fitted by itself, is off by more than this many units of how
+            well it is known (:mod:`otsync.sync.witnesses`). Of 262 right answers (mid to brutal, like people, drifts;
+            seeds 41000-41019) none has more than 6.0; where one of two performers, or every second limb, is 8 frames
+            late, wrong answers that were trusted have 9 and more.
         rate_gain: RATE_MISMATCH when another common ratio of frame rates raises the score's peak by this factor.
         rate_sigmas: a fitted rate counts when it differs from the declared one by more than this many sigmas.
     """
@@ -70,6 +74,7 @@ class Trust:
     unsteady: float = 2.0
     untold: float = 1 / 30
     lag: float = 0.6 / 30
+    parted: float = 7.0
     rate_sigmas: float = 4.0
     rate_gain: float = 1.3
 

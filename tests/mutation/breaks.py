@@ -105,10 +105,18 @@ BREAKS = (
     Break(
         "lags-of-others",
         "otsync/sync/lags.py",
-        "lagging & set(a.pair)",
-        "lagging & {a.pair[1]}",
+        "late & set(a.pair)",
+        "late & {a.pair[1]}",
         LAGS,
         "a reference whose tracks lag is no matter",
+    ),
+    Break(
+        "witnesses-of-one-place",
+        "otsync/sync/witnesses.py",
+        "fit = fit_clock(first.take(some), second.take(some), clock",
+        "fit = fit_clock(first, second, clock",
+        ("tests/otsync/sync/test_witnesses.py",),
+        "what a neighbourhood says is asked of all matches together",
     ),
     Break(
         "seconds-end-unseen",

@@ -117,6 +117,7 @@ REFINER_OPTIONS = slot("refiner", "SplineRefine", windows="0.3 0.2", smoothing=3
         "unsteady": "-1",
         "untold": "-1",
         "lag": "-1",
+        "parted": "-1",
         "overlap": "1e9",
         "matches": "1e9",
     }.items()
@@ -152,6 +153,7 @@ NOT_READ = {
             "wander",
             "unsteady",
             "untold",
+            "parted",
             "overlap",
             "matches",
             "disagreement",
@@ -165,6 +167,7 @@ NOT_READ = {
         for name in (
             *("moved", "spread", "correlation", "blur", "common", "wander", "unsteady", "untold", "rate_sigmas"),
             "lag",
+            "parted",
         )
     },
     **{f"{FIT}.trust.{name}": "refiner" for name in ("disagreement", "alias", "motion", "rate_gain")},

@@ -20,6 +20,7 @@ from ...simulate.effects import (
     Lag,
     LimbDrift,
     Loop,
+    PartLate,
     Repeats,
     Reverse,
     SharedDrift,
@@ -221,6 +222,10 @@ CLASSES: dict[str, Callable[[int], World]] = {
     "rate 1 %, 5 s": partial(rated, rate=0.01, frames=150),
     "tracks that lag": partial(plain, first=(In(1, Lag(3 / 30)),)),
     "tracks that lag, hard": partial(plain, preset="hard", first=(In(1, Lag(3 / 30)),)),
+    "one of two late": partial(plain, classes=("basketball", "football"), first=(In(1, PartLate()),)),
+    "one of two late, hard": partial(
+        plain, preset="hard", classes=("basketball", "football"), first=(In(1, PartLate()),)
+    ),
     "exact loop": partial(plain, motion="loop"),
     "carousel": partial(plain, motion="carousel", alike=True),
     "belt": partial(plain, motion="belt", alike=True),

@@ -27,7 +27,7 @@ from .noise import (
     Transient,
 )
 from .timing import Cut, Drop, Freeze, In, Loop, Repeats, Reverse, SlowMotion
-from .tracker import Gaps, Hallucination, IdentitySwitch, Lag, Occlusion, Outliers, RayCompression, Smoothing
+from .tracker import Gaps, Hallucination, IdentitySwitch, Lag, Occlusion, Outliers, PartLate, RayCompression, Smoothing
 
 __all__ = [
     "CameraDepthDrift",
@@ -52,6 +52,7 @@ __all__ = [
     "Occlusion",
     "Outliers",
     "OwnFrame",
+    "PartLate",
     "PositionNoise",
     "RayCompression",
     "Repeats",

@@ -101,6 +101,18 @@ class Lag:
         return replace(obs, xyz=xyz)
 
 
+@dataclass(frozen=True)
+class PartLate:
+    """Every second thing, the first one among them, is shown ``seconds`` late: on a screen, or by another tracker."""
+
+    seconds: float = 8 / 30
+
+    def __call__(self, obs: Observation, rng: np.random.Generator) -> Observation:
+        things = np.unique(obs.surface.object[obs.surface.object >= 0])
+        late = np.isin(obs.surface.object, things[::2])
+        return replace(obs, xyz=obs.xyz + np.where(late[:, None, None], obs.moved(-self.seconds), 0))
+
+
 def lost_spans(
     times: Float[np.ndarray, " T"], n: int, share: float, lengths: tuple[float, float], rng: np.random.Generator
 ) -> Bool[np.ndarray, "n T"]:
