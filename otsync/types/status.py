@@ -33,8 +33,8 @@ class Status(StrEnum):
     )
     LAGGING = (
         "Tracks of this video, or of the reference, come late by delays of their own: those of a tracker that filters "
-        "as it goes, or a part of the scene that is shown late (a screen, another tracker). By how much all of them are "
-        "late nobody can tell. Track without such a filter, or leave that part out."
+        "as it goes, or a part of the scene that is shown late (a screen, another tracker). By how much all of them "
+        "are late nobody can tell. Track without such a filter, or leave that part out."
     )
     POOR_FIT = (
         "The matched motions hardly correlate at the answer. Check that both videos show the same scene, and the "
