@@ -31,8 +31,10 @@ COMMON_ERRORS = 4.0
 the square of the noise, and neither residuals nor other windows show them."""
 
 LONG = 180 / 30
-"""Seconds of overlap from which a rate is looked for: over less, one of 1 % moves the ends by less than a frame, and
-what whole videos have in common (drifting depth, limbs) looks like one: real cameras, 3.3 s, "1.010 ± .0015"."""
+"""Seconds of overlap from which a fitted rate may be kept: over less, one of 1 % moves the ends by less than a frame,
+and what whole videos have in common (drifting depth, limbs) looks like one: real cameras, 3.3 s, "1.010 ± .0015". Over
+less, too, sigma covers a rate that is surely real: of 2 % over 3 to 5 s, ends were off by 1.1 to 1.6 frames at sigma
+.2, where the free rate was up to 8 of its sigmas off (96 worlds, seeds 41000-41015)."""
 
 AT_ENDS = 0.1
 """Share of ``blur`` by which errors that a whole video shares move the offset of a moment by itself."""
@@ -48,9 +50,11 @@ most; two takes of one choreography that were trusted 1.06 to 1.14."""
 LEAST_DRIFT = 0.1 / 30
 """Seconds by which a rate must move the ends of the overlap to be worth telling."""
 
-UNSETTLED = 1.0, 2.0
-"""Sigmas of a rate that is not kept, from which on it may be real, and from which on sigma covers it: rates of .1 %
-over 20 s, 2.4 to 3.2 sigma, were left out and the ends were off by .3 frame at sigma .07."""
+UNSETTLED, UNSETTLED_SHORT = (1.0, 2.0), (2.5, 4.0)
+"""Sigmas of a rate that is not kept, from which on it may be real, and from which on sigma covers it; and those of
+overlaps shorter than :data:`LONG`, over which few rates are real, and right answers have up to 3.1 (180 hard ones,
+seeds 500-599 and 41000-41079; one has 3.9). Rates of .1 % over 20 s, 2.4 to 3.2 sigma, were left out and the ends were
+off by .3 frame at sigma .07."""
 
 MOST_RATE = 0.03
 """Relative difference of rates beyond which a fit from one offset is not to be believed."""
@@ -126,7 +130,8 @@ class SplineRefine(Refiner):
         together = neighbours(curves[0].mean + curves[1].mean, GROUPS)
         common = common_error(*curves, fit.clock, fit.weights, together, self.windows[0])
         shared += max(0.0, common**2 - float(fit.covariance[0, 0]))
-        unsettled = unsettled_rate(rate_stats, fit.clock.rate)
+        long = overlap_seconds(*curves, fit.clock) >= LONG - 1e-9
+        unsettled = unsettled_rate(rate_stats, fit.clock.rate, UNSETTLED if long else UNSETTLED_SHORT)
         seconds = Seconds.of(*curves, fit.clock, self.windows[0], weight)
         ends = self._ends(curves, fit, free, shared, unsettled, rate_stats.get("rate_sigma"))
         stats = (
@@ -197,16 +202,16 @@ class SplineRefine(Refiner):
     ) -> tuple[Fit, Fit | None, tuple[Status, ...], dict[str, float]]:
         """The fit to keep, the one with a free rate, a warning where that one is right and not kept, and statistics."""
         overlap = overlap_seconds(*curves, fit.clock)
-        if overlap < LONG - 1e-9:
-            return fit, None, (), {}
         free = fit_clock(*curves, fit.clock, self.windows[0], weight=weight, fit_rate=True)
         if free is None:
             return fit, None, (), {}
         common = (AT_ENDS * free.blur) ** 2 + LEAST_SIGMA**2
         # the slope of a line through errors of that size, which are forgotten within FORGOTTEN seconds
-        sigma = math.sqrt(float(free.covariance[1, 1]) + 12 * common * FORGOTTEN / overlap**3)
+        sigma = math.sqrt(float(free.covariance[1, 1]) + 12 * common * FORGOTTEN / max(overlap, curves[0].frame) ** 3)
         stats = {"fitted_rate": free.clock.rate, "rate_sigma": sigma}
         off = abs(free.clock.rate - fit.clock.rate)
+        if overlap < LONG - 1e-9:
+            return fit, None, (), stats
         if off <= self.trust.rate_sigmas * sigma or off * overlap / 2 <= LEAST_DRIFT:
             return fit, free, (), stats
         if self.rate == "fixed" or abs(free.clock.rate - 1) > MOST_RATE:
@@ -262,10 +267,14 @@ class SplineRefine(Refiner):
         return tuple(flag for flag, raised in found.items() if raised)
 
 
-def unsettled_rate(stats: dict[str, float], kept: float) -> float:
-    """By how much the rate that is kept may be off, where a free one differs from it by more than its noise."""
+def unsettled_rate(stats: dict[str, float], kept: float, sigmas: tuple[float, float] = UNSETTLED) -> float:
+    """By how much the rate that is kept may be off, where a free one differs from it by more than its noise.
+
+    Args:
+        sigmas: from which on it may, and from which on all of the difference counts.
+    """
     if "rate_sigma" not in stats:
         return 0.0
     off = abs(stats["fitted_rate"] - kept)
-    low, high = UNSETTLED
+    low, high = sigmas
     return off * float(np.clip((off / stats["rate_sigma"] - low) / (high - low), 0.0, 1.0))

@@ -14,15 +14,10 @@ from ..align.slot import Aligner, AlignerLike
 from ..clocks.common import nominal_fps
 from ..clocks.shutter import at_frame_times
 from ..compute.threads import MapLike
-from ..costs.epipolar import EpipolarDistance
-from ..costs.linear import Cosine
-from ..costs.positions import SynchronousDistance
 from ..epipolar.scan import EpipolarScan
 from ..epipolar.steady import unsteady
 from ..frames import OwnFrames
 from ..match.slot import Matcher, MatcherLike
-from ..match.synchronous import SynchronousMatching
-from ..match.unbalanced import UnbalancedOT
 from ..refine.slot import Rate, Refiner, RefinerLike
 from ..refine.splines import SplineRefine
 from ..types import Alignment, Break, Clock, Matches, Offsets, Status, TrackSet, in_order
@@ -30,11 +25,12 @@ from ..types.checks import check_whole
 from .breaks import MOST, Seen, Suspect, culprit, mended, remeasured, runs_on, suspects
 from .graph import Graph, Pair
 from .lags import Lag, lag_of, lagging, with_lags
-from .method import Method, with_costs
+from .method import Method
 from .own_frames import Frames, refuse_common, solver_from, synchronize_own
 from .pairs import Job, Refit, run, run_refit, with_rate
 from .parts import broken_part, unvouched
 from .places import parts_by_place
+from .rematching import contested, rematching
 from .verdict import NOTHING_COMMON, Answer, Verdict, judge
 from .witnesses import parted
 
@@ -124,6 +120,11 @@ def synchronize(
 
     verdict = judged(list(map(run, jobs)))
     jobs, verdict, broken = mend_clocks(jobs, verdict, tracks, judged, map)
+    before = {a.pair: a.matches for a in verdict.answers}
+    if times and matches is None:
+        settled = contested(jobs, verdict, map)
+        if settled:
+            verdict = judged([settled.get(a.pair, a) for a in verdict.answers])
     for _ in range(times if matches is None else 0):
         again = rematching(jobs, verdict)
         if not again:
@@ -137,7 +138,7 @@ def synchronize(
             verdict = judged([_doubted(a) if breaking & set(a.pair) else a for a in verdict.answers])
     else:
         verdict = with_parts_checked(verdict, tracks, judged)
-        verdict = with_witnesses_heard(verdict, tracks, refining.trust.parted, judged)
+        verdict = with_witnesses_heard(verdict, tracks, before, refining.trust.parted, judged)
     lags = list(map(lag_of, tracks))
     doubted = with_lags(verdict.answers, lags, refining.trust.lag)
     if doubted is not None:
@@ -162,14 +163,22 @@ def with_parts_checked(
 
 
 def with_witnesses_heard(
-    verdict: Verdict, tracks: Sequence[TrackSet], limit: float, judged: Callable[[Sequence[Answer]], Verdict]
+    verdict: Verdict,
+    tracks: Sequence[TrackSet],
+    before: Mapping[Pair, Matches],
+    limit: float,
+    judged: Callable[[Sequence[Answer]], Verdict],
 ) -> Verdict:
-    """The verdict, with pairs doubted of which a part of the scene tells another time."""
+    """The verdict, with pairs doubted of which a part of the scene tells another time.
+
+    Args:
+        before: matches of the pairs before any were made anew.
+    """
 
     def contradicted(a: Answer) -> bool:
         first, second = (tracks[v] for v in a.pair)
         known = a.refined.status.ok and a.finite and first.xyz is not None and second.xyz is not None
-        return known and parted(a, first, second) > limit
+        return known and parted(a, first, second, before.get(a.pair)) > limit
 
     doubted = {a.pair for a in verdict.answers if contradicted(a)}
     if not doubted:
@@ -371,40 +380,6 @@ def _without_common_frame(
     verdict, transforms = synchronize_own(tracks, chosen, centre, solver=solver, graph=method.graph, lags=lags, map=map)
     found = to_offsets(tracks, verdict, time.perf_counter() - started, lags=lags)
     return dataclasses.replace(found, transforms=transforms)
-
-
-def rematching(jobs: list[Job], verdict: Verdict) -> list[Job]:
-    """The pairs between trusted videos of one component, to be matched at their synchronised times."""
-    again = []
-    for job in jobs:
-        i, j = job.pair
-        if verdict.flags[i] or verdict.flags[j] or verdict.component[i] != verdict.component[j]:
-            continue
-        # t_a = (r_b t_b + x_b - x_a) / r_a
-        clock = Clock(
-            float((verdict.x[j] - verdict.x[i]) / verdict.rates[i]), float(verdict.rates[j] / verdict.rates[i])
-        )
-        flat = job.a.xyz is None or job.b.xyz is None
-        again.append(dataclasses.replace(job, matcher=at_known_times(job.matcher, clock, flat)))
-    return again
-
-
-def at_known_times(matcher: Matcher | None, clock: Clock, flat: bool = False) -> Matcher:
-    """What matches a pair once more: as the matcher says, else mutual nearest neighbours at equal times.
-
-    ``flat``: the tracks are pixels only, which epipolar distances compare.
-    """
-    told = None if matcher is None else matcher.at(clock)
-    if told is not None and flat and told.needs_xyz:
-        pixels = EpipolarDistance(clock=clock)
-        costs = tuple(pixels if isinstance(c, SynchronousDistance) else c for c in told.costs)
-        told = Matcher.of(with_costs(told, costs))
-    if told is not None:
-        return told
-    costs = (Cosine(),) if matcher is None else matcher.costs
-    if flat:
-        return UnbalancedOT(costs=(*costs, EpipolarDistance(clock=clock)))
-    return SynchronousMatching(clock.offset, clock.rate, costs)
 
 
 COUNTED = 0.25

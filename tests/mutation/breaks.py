@@ -113,10 +113,26 @@ BREAKS = (
     Break(
         "witnesses-of-one-place",
         "otsync/sync/witnesses.py",
-        "fit = fit_clock(first.take(some), second.take(some), clock",
+        "fit = fit_clock(*curves, clock",
         "fit = fit_clock(first, second, clock",
         ("tests/otsync/sync/test_witnesses.py",),
         "what a neighbourhood says is asked of all matches together",
+    ),
+    Break(
+        "witnesses-without-first",
+        "otsync/sync/witnesses.py",
+        "if fits or not sure:",
+        "if not sure:",
+        ("tests/otsync/sync/test_witnesses.py",),
+        "the first matches are never heard",
+    ),
+    Break(
+        "witnesses-wrong-matches",
+        "otsync/sync/witnesses.py",
+        "if fits or not sure:",
+        "if True:",
+        ("tests/otsync/sync/test_witnesses.py",),
+        "neighbourhoods of wrong matches are heard",
     ),
     Break(
         "seconds-end-unseen",

@@ -211,7 +211,7 @@ def test_a_rate_that_is_not_kept_counts_where_it_may_be_real():
     assert unsettled_rate(told, 1.001) == 0.0  # it is kept
     assert unsettled_rate(told | {"rate_sigma": 0.001}, 1.0) == 0.0  # as much as noise makes
     assert 0 < unsettled_rate(told | {"rate_sigma": 0.0007}, 1.0) < 0.001
-    assert unsettled_rate({}, 1.0) == 0.0  # too short to tell
+    assert unsettled_rate({}, 1.0) == 0.0  # nothing tells it
 
 
 def test_flags_of_the_alignment_stay():

@@ -1,0 +1,118 @@
+"""Matching once more: at the times of clocks that are known, and at each of those that compete for a pair."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+
+from ..align.likelihood import APART
+from ..compute.threads import MapLike
+from ..costs.epipolar import EpipolarDistance
+from ..costs.linear import Cosine
+from ..costs.positions import SynchronousDistance
+from ..match.slot import Matcher
+from ..match.synchronous import SynchronousMatching
+from ..match.unbalanced import UnbalancedOT
+from ..types import Clock, Status
+from .graph import Pair
+from .method import with_costs
+from .pairs import Job, run
+from .verdict import Answer, Verdict
+
+NOISY = frozenset(
+    {
+        Status.AMBIGUOUS,
+        Status.WEAK,
+        Status.DISAGREE,
+        Status.ALIAS,
+        Status.MOVED,
+        Status.NO_MATCH,
+        Status.SPREAD,
+        Status.POOR_FIT,
+    }
+)
+"""Doubts that wrong matches make: of those that were made without any time half are wrong where tracks are noisy.
+
+A clock that breaks, a rate, things at rest are not among them: matches that were made at one time agree with it.
+"""
+
+CLEARLY = 0.3
+"""Share of its evidence by which the time that wins must be ahead of every other."""
+
+
+def contested(jobs: list[Job], verdict: Verdict, map: MapLike) -> dict[Pair, Answer]:
+    """The pairs of doubtful videos whose doubts are :data:`NOISY`, decided by matches made at each time that competes.
+
+    Every peak of a pair's scan gets matches of its own, an answer from these, and their evidence (nats a match times
+    matches). At the right time partners are at one place and move alike, and their evidence grows; wrong times keep
+    what chance gives, or lead to the right one. Where the same things happen twice, both times have as much, and the
+    doubt stays. So do all doubts that the winner's own matches raise.
+    """
+    answers = {a.pair: a for a in verdict.answers}
+    asked = [job for job in jobs if _asks(job, answers[job.pair], verdict)]
+    tasks = [
+        dataclasses.replace(job, matcher=at_known_times(job.matcher, Clock(float(at), 1.0)))
+        for job in asked
+        for at in answers[job.pair].scanned.hypotheses[:, 0]
+    ]
+    found: dict[Pair, list[Answer]] = {}
+    for answer in map(run, tasks) if tasks else ():
+        if answer.finite:
+            found.setdefault(answer.pair, []).append(answer)
+    winners = {pair: winner(several) for pair, several in found.items()}
+    return {pair: best for pair, best in winners.items() if best is not None}
+
+
+def _asks(job: Job, answer: Answer, verdict: Verdict) -> bool:
+    """Whether one of its videos is doubtful, and nothing speaks against the pair that better matches might not mend."""
+    flags = set(answer.refined.flags)
+    placed = job.a.xyz is not None and job.b.xyz is not None and job.a.frame is not None and job.a.frame == job.b.frame
+    doubtful = any(verdict.flags[v] for v in job.pair)
+    several = "evidence" in answer.scanned.stats and len(answer.scanned.hypotheses) > 0
+    return bool(placed and doubtful and several and flags <= NOISY)
+
+
+def winner(several: list[Answer]) -> Answer | None:
+    """The answer with the most evidence, where it is clearly ahead of all that are at other times; otherwise None."""
+    evidence = [a.scanned.stats.get("evidence", 0.0) * len(a.matches) for a in several]
+    best = int(np.argmax(evidence))
+    at = several[best].refined.offset
+    others = [e for a, e in zip(several, evidence, strict=True) if abs(a.refined.offset - at) > APART]
+    clear = evidence[best] * (1 - CLEARLY) >= max(others, default=0.0)
+    return several[best] if clear and evidence[best] > 0 and math.isfinite(at) else None
+
+
+def rematching(jobs: list[Job], verdict: Verdict) -> list[Job]:
+    """The pairs between trusted videos of one component, to be matched at their synchronised times."""
+    again = []
+    for job in jobs:
+        i, j = job.pair
+        if verdict.flags[i] or verdict.flags[j] or verdict.component[i] != verdict.component[j]:
+            continue
+        # t_a = (r_b t_b + x_b - x_a) / r_a
+        clock = Clock(
+            float((verdict.x[j] - verdict.x[i]) / verdict.rates[i]), float(verdict.rates[j] / verdict.rates[i])
+        )
+        flat = job.a.xyz is None or job.b.xyz is None
+        again.append(dataclasses.replace(job, matcher=at_known_times(job.matcher, clock, flat)))
+    return again
+
+
+def at_known_times(matcher: Matcher | None, clock: Clock, flat: bool = False) -> Matcher:
+    """What matches a pair once more: as the matcher says, else mutual nearest neighbours at equal times.
+
+    ``flat``: the tracks are pixels only, which epipolar distances compare.
+    """
+    told = None if matcher is None else matcher.at(clock)
+    if told is not None and flat and told.needs_xyz:
+        pixels = EpipolarDistance(clock=clock)
+        costs = tuple(pixels if isinstance(c, SynchronousDistance) else c for c in told.costs)
+        told = Matcher.of(with_costs(told, costs))
+    if told is not None:
+        return told
+    costs = (Cosine(),) if matcher is None else matcher.costs
+    if flat:
+        return UnbalancedOT(costs=(*costs, EpipolarDistance(clock=clock)))
+    return SynchronousMatching(clock.offset, clock.rate, costs)

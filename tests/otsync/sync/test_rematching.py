@@ -1,0 +1,64 @@
+"""Times that compete for a pair are decided by matches that are made at each of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from otsync import Matches, synchronize
+from otsync.bench.trust.worlds import CLASSES
+from otsync.sync.rematching import CLEARLY, NOISY, winner
+from otsync.sync.verdict import Answer
+from otsync.types import Alignment, Status
+
+FPS = 30.0
+
+
+def answer(offset: float, evidence: float, matches: int = 10) -> Answer:
+    found = Alignment(offset, sigma=0.01, fps=FPS, stats={"evidence": evidence})
+    return Answer((0, 1), Matches(np.stack([np.arange(matches)] * 2, 1)), found, found)
+
+
+def test_the_time_with_most_evidence_wins_where_it_is_clearly_ahead():
+    best, other = answer(0.5, 40.0), answer(-1.0, 20.0)
+    assert winner([other, best]) is best
+    assert winner([best]) is best
+    assert winner([other, best, replace(best)]) is best  # who comes to the same time is no rival
+
+
+def test_times_with_about_as_much_evidence_stay_in_doubt():
+    best, other = answer(0.5, 40.0), answer(-1.0, 1.05 * (1 - CLEARLY) * 40.0)
+    assert winner([best, other]) is None
+    assert winner([answer(0.5, 0.0)]) is None
+
+
+def test_evidence_is_that_of_all_matches():
+    few, many = answer(0.5, 40.0, matches=5), answer(-1.0, 30.0, matches=20)
+    assert winner([few, many]) is many
+
+
+@pytest.mark.parametrize("seed", [504, 509, 41026])
+def test_noisy_worlds_in_which_several_times_compete_are_decided(seed):
+    """Each was refused for a doubt about which time is right; 41026 was .75 frame off then."""
+    world = CLASSES["hard"](seed)
+    without = synchronize(world.tracks, rematch=0)
+    assert NOISY & set(without.flags[1])
+    offsets = synchronize(world.tracks)
+    assert offsets.status[1].ok
+    assert world.errors(offsets)[0][0] < min(0.4, 3 * offsets.sigma[1] * FPS)
+
+
+@pytest.mark.parametrize(("name", "seed"), [("carousel", 41001), ("exact loop", 41000), ("played backwards", 41011)])
+def test_what_happens_twice_stays_in_doubt(name, seed):
+    """Their best time is wrong or one of several, and its own matches have no flag but that of a rival, or none."""
+    offsets = synchronize(CLASSES[name](seed).tracks)
+    assert not offsets.status[1].ok
+
+
+def test_a_clock_that_breaks_is_no_question_of_which_time():
+    """Two parts of one video compete for it, each with an offset of its own."""
+    world = CLASSES["freeze of 30"](41000)
+    offsets = synchronize(world.tracks)
+    assert offsets.breaks[1] or Status.BROKEN_CLOCK in offsets.flags[1]
