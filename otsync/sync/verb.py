@@ -32,7 +32,7 @@ from .parts import broken_part, unvouched
 from .places import parts_by_place
 from .rematching import contested, rematching
 from .verdict import NOTHING_COMMON, Answer, Verdict, judge
-from .witnesses import parted
+from .witnesses import answered, elsewhere, left_over, parted
 
 MEASURED, SETTLED = 3, 0.02 / 30
 """How often a jump is measured anew, at most, and seconds by which it may still change."""
@@ -120,7 +120,6 @@ def synchronize(
 
     verdict = judged(list(map(run, jobs)))
     jobs, verdict, broken = mend_clocks(jobs, verdict, tracks, judged, map)
-    before = {a.pair: a.matches for a in verdict.answers}
     if times and matches is None:
         settled = contested(jobs, verdict, map)
         if settled:
@@ -138,7 +137,7 @@ def synchronize(
             verdict = judged([_doubted(a) if breaking & set(a.pair) else a for a in verdict.answers])
     else:
         verdict = with_parts_checked(verdict, tracks, judged)
-        verdict = with_witnesses_heard(verdict, tracks, before, refining.trust.parted, judged)
+        verdict = with_witnesses_heard(verdict, jobs, matches is None, refining.trust.parted, judged, map)
     lags = list(map(lag_of, tracks))
     doubted = with_lags(verdict.answers, lags, refining.trust.lag)
     if doubted is not None:
@@ -164,23 +163,23 @@ def with_parts_checked(
 
 def with_witnesses_heard(
     verdict: Verdict,
-    tracks: Sequence[TrackSet],
-    before: Mapping[Pair, Matches],
+    jobs: Sequence[Job],
+    rest: bool,
     limit: float,
     judged: Callable[[Sequence[Answer]], Verdict],
+    map: MapLike,
 ) -> Verdict:
     """The verdict, with pairs doubted of which a part of the scene tells another time.
 
     Args:
-        before: matches of the pairs before any were made anew.
+        rest: whether the tracks that no answer explains are matched and asked, too.
     """
-
-    def contradicted(a: Answer) -> bool:
-        first, second = (tracks[v] for v in a.pair)
-        known = a.refined.status.ok and a.finite and first.xyz is not None and second.xyz is not None
-        return known and parted(a, first, second, before.get(a.pair)) > limit
-
-    doubted = {a.pair for a in verdict.answers if contradicted(a)}
+    answers = {a.pair: a for a in verdict.answers if a.refined.status.ok and a.finite}
+    asked = [job for job in jobs if job.pair in answers and job.a.xyz is not None and job.b.xyz is not None]
+    doubted = {job.pair for job in asked if parted(answers[job.pair], job.a, job.b) > limit}
+    others = [left_over(answers[job.pair], job) for job in asked if rest and job.pair not in doubted]
+    for found in map(answered, [job for job in others if job is not None]):
+        doubted |= {rest.pair for rest in found if elsewhere(rest, answers[rest.pair])}
     if not doubted:
         return verdict
     return judged([lagging(a) if a.pair in doubted else a for a in verdict.answers])

@@ -8,9 +8,14 @@ import numpy as np
 import pytest
 
 from otsync import Matches, synchronize
+from otsync.align.likelihood import LikelihoodScan
 from otsync.bench.trust.worlds import CLASSES
-from otsync.sync.rematching import CLEARLY, NOISY, winner
-from otsync.sync.verdict import Answer
+from otsync.refine.splines import SplineRefine
+from otsync.simulate import simulate
+from otsync.sync.graph import Graph
+from otsync.sync.pairs import Job, run
+from otsync.sync.rematching import CLEARLY, NOISY, contested, winner
+from otsync.sync.verdict import Answer, Verdict, judge
 from otsync.types import Alignment, Status
 
 FPS = 30.0
@@ -57,8 +62,34 @@ def test_what_happens_twice_stays_in_doubt(name, seed):
     assert not offsets.status[1].ok
 
 
-def test_a_clock_that_breaks_is_no_question_of_which_time():
-    """Two parts of one video compete for it, each with an offset of its own."""
-    world = CLASSES["freeze of 30"](41000)
-    offsets = synchronize(world.tracks)
-    assert offsets.breaks[1] or Status.BROKEN_CLOCK in offsets.flags[1]
+def first_answers(tracks) -> tuple[list[Job], Verdict]:
+    """What is known of two videos before anything is matched once more."""
+    refiner = SplineRefine()
+    jobs = [Job((0, 1), tracks[0], tracks[1], None, LikelihoodScan(), refiner, None)]
+    return jobs, judge(2, list(map(run, jobs)), 0, 0, Graph(), refiner.trust, lambda tasks: [])
+
+
+def flagged(verdict: Verdict, *flags: Status) -> Verdict:
+    """The verdict with a pair, and a video, that are flagged so and not otherwise."""
+    (a,) = verdict.answers
+    answers = (replace(a, refined=replace(a.refined, flags=flags)),)
+    return replace(verdict, answers=answers, flags=((), flags))
+
+
+def test_only_doubts_that_wrong_matches_make_are_contested():
+    """A clock that breaks, things at rest: matches that were made at one time agree with it."""
+    tracks, _ = simulate("tennis", preset="mid", videos=2, frames=90, tracks=60, offsets=[0, 0.2], seed=3)
+    jobs, verdict = first_answers(tracks)
+    for doubt in NOISY:
+        (found,) = contested(jobs, flagged(verdict, doubt), map).values()
+        assert found.refined.offset == pytest.approx(0.2, abs=0.2 / FPS)
+    for other in (Status.BROKEN_CLOCK, Status.STATIC, Status.RATE_MISMATCH, Status.SHORT_OVERLAP):
+        assert not contested(jobs, flagged(verdict, Status.AMBIGUOUS, other), map)
+    assert not contested(jobs, flagged(verdict), map)  # nobody doubts them
+
+
+def test_without_a_common_frame_nothing_is_contested():
+    """Places are what tells the times apart."""
+    tracks, _ = simulate("tennis", preset="mid", videos=2, frames=90, tracks=60, offsets=[0, 0.2], seed=3)
+    jobs, verdict = first_answers([replace(t, frame=None) for t in tracks])
+    assert not contested(jobs, flagged(verdict, Status.AMBIGUOUS), map)

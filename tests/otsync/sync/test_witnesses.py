@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 
 from otsync import Matches, TrackSet, synchronize
+from otsync.align.likelihood import LikelihoodScan
 from otsync.bench.trust.worlds import plain
+from otsync.refine.splines import SplineRefine
 from otsync.simulate.effects import In, PartLate
+from otsync.sync.pairs import Job
 from otsync.sync.verdict import Answer
-from otsync.sync.witnesses import FEWEST, parted
+from otsync.sync.witnesses import FEWEST, REST, answered, competing, elsewhere, left_over, parted
 from otsync.types import Alignment, Status
 
 FPS = 30.0
@@ -44,7 +47,11 @@ def two_groups(late: float, share: int, n: int = 24) -> tuple[Answer, TrackSet, 
         return place + 0.3 * np.sin(speed * at + phase) + rng.normal(0, 0.002, (n, 120, 3))
 
     delay = np.where((np.arange(n) >= n // 2) & (np.arange(n) < n // 2 + share), late, 0.0)[:, None, None]
-    a, b = TrackSet(shown(t[:, None]), fps=FPS), TrackSet(shown(t[:, None] - delay), fps=FPS)
+    own = rng.normal(size=(n, 16))
+    a, b = (
+        TrackSet(shown(t[:, None] - d), fps=FPS, features=own + rng.normal(0, 0.1, own.shape), frame="world")
+        for d in (0.0, delay)
+    )
     matches = Matches(np.stack([np.arange(n)] * 2, 1), np.ones(n))
     answer = Alignment(0.0, sigma=0.001, fps=FPS, stats={"blur": 0.004})
     return Answer((0, 1), matches, answer, answer), a, b
@@ -67,20 +74,36 @@ def test_too_few_matches_are_no_witnesses():
     assert parted(fewer, a, b) < 1
 
 
-def test_first_matches_are_heard_where_the_last_ones_all_agree():
-    answer, a, b = two_groups(5 / FPS, 12)
-    first, agreeing = answer.matches, Matches(answer.matches.pairs[:12], np.ones(12))
-    told = replace(answer, matches=agreeing)
-    assert parted(told, a, b) < 1
-    assert parted(told, a, b, first) > 7
+def test_the_rest_is_what_the_answer_does_not_explain():
+    """The second place's tracks come late: the answer of the first place leaves them over, all and no others."""
+    answer, a, b = two_groups(5 / FPS, 40, n=80)
+    rest = left_over(answer, Job((0, 1), a, b, None, LikelihoodScan(), SplineRefine(), None))
+    assert rest is not None
+    places = [np.nanmean(t.xyz[..., 0], 1) > 4 for t in (rest.a, rest.b)]
+    assert all(p.all() and len(p) == 40 for p in places)
+    (found,) = answered(rest)
+    assert found.refined.status.ok and found.refined.offset == pytest.approx(-5 / FPS, abs=0.1 / FPS)
+    assert elsewhere(found, answer) and not elsewhere(answer, answer)
 
 
-def test_first_matches_that_are_wrong_are_not_heard():
-    """Tracks of the second place matched at random: what they tell, they do not fit."""
-    answer, a, b = two_groups(0.0, 12)
-    pairs = answer.matches.pairs.copy()
-    pairs[12:, 1] = np.roll(pairs[12:, 1], 5)
-    wrong = Matches(pairs, np.ones(24))
-    told = replace(answer, matches=Matches(pairs[:12], np.ones(12)))
-    assert parted(replace(answer, matches=wrong), a, b) > 1
-    assert parted(told, a, b, wrong) < 1
+def test_few_tracks_that_are_left_over_are_not_asked():
+    answer, a, b = two_groups(5 / FPS, REST - 1)
+    job = Job((0, 1), a, b, None, LikelihoodScan(), SplineRefine(), None)
+    assert left_over(answer, job) is None
+    assert left_over(two_groups(0.0, 12)[0], job) is None
+
+
+def test_an_answer_of_the_rest_counts_where_it_is_sound_and_another_one():
+    answer, _, _ = two_groups(0.0, 12)
+    late = replace(answer, refined=replace(answer.refined, offset=2 / FPS))
+    assert elsewhere(late, answer)
+    assert not elsewhere(replace(late, refined=replace(late.refined, sigma=1 / FPS)), answer)
+    assert not elsewhere(replace(late, refined=replace(late.refined, flags=(Status.AMBIGUOUS,))), answer)
+
+
+def test_times_of_the_rest_that_come_near_the_best_compete():
+    score = np.array([1.0, 1.0, 9.0, 1.0, 6.0, 1.0, 4.0, 1.0, -np.inf])
+    curve = np.stack([np.arange(9) / 10, score], 1)
+    scan = Alignment(0.2, fps=FPS, curve=curve, hypotheses=curve[[2, 4, 6]])
+    assert competing(scan) == [0.2, 0.4]
+    assert competing(Alignment(0.3, fps=FPS)) == [0.3]
