@@ -32,7 +32,7 @@ from .parts import broken_part, unvouched
 from .places import parts_by_place
 from .rematching import contested, rematching
 from .verdict import NOTHING_COMMON, Answer, Verdict, judge
-from .witnesses import answered, elsewhere, left_over, parted
+from .witnesses import elsewhere, left_over, once_more, parted
 
 MEASURED, SETTLED = 3, 0.02 / 30
 """How often a jump is measured anew, at most, and seconds by which it may still change."""
@@ -177,9 +177,11 @@ def with_witnesses_heard(
     answers = {a.pair: a for a in verdict.answers if a.refined.status.ok and a.finite}
     asked = [job for job in jobs if job.pair in answers and job.a.xyz is not None and job.b.xyz is not None]
     doubted = {job.pair for job in asked if parted(answers[job.pair], job.a, job.b) > limit}
-    others = [left_over(answers[job.pair], job) for job in asked if rest and job.pair not in doubted]
-    for found in map(answered, [job for job in others if job is not None]):
-        doubted |= {rest.pair for rest in found if elsewhere(rest, answers[rest.pair])}
+    unexplained = [left_over(answers[job.pair], job) for job in asked if rest and job.pair not in doubted]
+    others = [job for job in unexplained if job is not None]
+    first = list(map(run, others))
+    again = [job for other, answer in zip(others, first, strict=True) for job in once_more(other, answer)]
+    doubted |= {found.pair for found in map(run, again) if elsewhere(found, answers[found.pair])}
     if not doubted:
         return verdict
     return judged([lagging(a) if a.pair in doubted else a for a in verdict.answers])

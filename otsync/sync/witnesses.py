@@ -18,7 +18,7 @@ from ..refine.common_motion import common_motion
 from ..refine.gauss_newton import fit_clock, neighbours
 from ..refine.splines import SplineRefine
 from ..types import Alignment, Clock, TrackSet
-from .pairs import Job, run
+from .pairs import Job
 from .rematching import at_known_times
 from .verdict import Answer
 
@@ -103,11 +103,10 @@ def left_over(answer: Answer, job: Job) -> Job | None:
     return dataclasses.replace(job, a=a.take(rest[0]), b=b.take(rest[1]))
 
 
-def answered(job: Job) -> list[Answer]:
-    """The answers of a pair from matches that are made once more, at each of the times that compete for it."""
-    first = run(job)
+def once_more(job: Job, first: Answer) -> list[Job]:
+    """The work on a pair whose first answer is known: matched once more, at each of the times that compete for it."""
     times = competing(first.scanned) if first.finite else []
-    return [run(dataclasses.replace(job, matcher=at_known_times(job.matcher, Clock(t, 1.0)))) for t in times]
+    return [dataclasses.replace(job, matcher=at_known_times(job.matcher, Clock(t, 1.0))) for t in times]
 
 
 def competing(scan: Alignment) -> list[float]:
