@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import math
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -52,11 +52,7 @@ def contested(jobs: list[Job], verdict: Verdict, map: MapLike) -> dict[Pair, Ans
     """
     answers = {a.pair: a for a in verdict.answers}
     asked = [job for job in jobs if _asks(job, answers[job.pair], verdict)]
-    tasks = [
-        dataclasses.replace(job, matcher=at_known_times(job.matcher, Clock(float(at), 1.0)))
-        for job in asked
-        for at in answers[job.pair].scanned.hypotheses[:, 0]
-    ]
+    tasks = [again for job in asked for again in at_each(job, answers[job.pair].scanned.hypotheses[:, 0])]
     found: dict[Pair, list[Answer]] = {}
     for answer in map(run, tasks) if tasks else ():
         if answer.finite:
@@ -74,14 +70,19 @@ def _asks(job: Job, answer: Answer, verdict: Verdict) -> bool:
     return bool(placed and doubtful and several and flags <= NOISY)
 
 
-def winner(several: list[Answer]) -> Answer | None:
-    """The answer with the most evidence, where it is clearly ahead of all that are at other times; otherwise None."""
+def winner(several: Sequence[Answer]) -> Answer | None:
+    """The answer with the most evidence, where it is clearly ahead of all at other times; all have an offset."""
     evidence = [a.scanned.stats.get("evidence", 0.0) * len(a.matches) for a in several]
     best = int(np.argmax(evidence))
     at = several[best].refined.offset
     others = [e for a, e in zip(several, evidence, strict=True) if abs(a.refined.offset - at) > APART]
     clear = evidence[best] * (1 - CLEARLY) >= max(others, default=0.0)
-    return several[best] if clear and evidence[best] > 0 and math.isfinite(at) else None
+    return several[best] if clear and evidence[best] > 0 else None
+
+
+def at_each(job: Job, times: Iterable[float]) -> list[Job]:
+    """The work on a pair, to be matched once more at each of some offsets, s."""
+    return [dataclasses.replace(job, matcher=at_known_times(job.matcher, Clock(float(t), 1.0))) for t in times]
 
 
 def rematching(jobs: list[Job], verdict: Verdict) -> list[Job]:

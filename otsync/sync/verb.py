@@ -137,7 +137,9 @@ def synchronize(
             verdict = judged([_doubted(a) if breaking & set(a.pair) else a for a in verdict.answers])
     else:
         verdict = with_parts_checked(verdict, tracks, judged)
-        verdict = with_witnesses_heard(verdict, jobs, matches is None, refining.trust.parted, judged, map)
+        verdict = with_witnesses_heard(
+            verdict, jobs, bool(times) and matches is None, refining.trust.parted, judged, map
+        )
     lags = list(map(lag_of, tracks))
     doubted = with_lags(verdict.answers, lags, refining.trust.lag)
     if doubted is not None:
@@ -172,7 +174,7 @@ def with_witnesses_heard(
     """The verdict, with pairs doubted of which a part of the scene tells another time.
 
     Args:
-        rest: whether the tracks that no answer explains are matched and asked, too.
+        rest: whether the tracks that an answer does not explain are matched once more, and asked, too.
     """
     answers = {a.pair: a for a in verdict.answers if a.refined.status.ok and a.finite}
     asked = [job for job in jobs if job.pair in answers and job.a.xyz is not None and job.b.xyz is not None]
@@ -181,7 +183,8 @@ def with_witnesses_heard(
     others = [job for job in unexplained if job is not None]
     first = list(map(run, others))
     again = [job for other, answer in zip(others, first, strict=True) for job in once_more(other, answer)]
-    doubted |= {found.pair for found in map(run, again) if elsewhere(found, answers[found.pair])}
+    middle = {job.pair: float(job.b.times[[0, -1]].mean()) for job in asked}
+    doubted |= {a.pair for a in map(run, again) if elsewhere(a, answers[a.pair], middle[a.pair])}
     if not doubted:
         return verdict
     return judged([lagging(a) if a.pair in doubted else a for a in verdict.answers])

@@ -161,10 +161,18 @@ BREAKS = (
     Break(
         "rest-unsound",
         "otsync/sync/witnesses.py",
-        "rest.finite and rest.refined.status.ok and off",
-        "rest.finite and off",
+        "rest.finite and rest.refined.status.ok and abs",
+        "rest.finite and abs",
         ("tests/otsync/sync/test_witnesses.py",),
         "a doubtful answer of the rest speaks against a sound one",
+    ),
+    Break(
+        "rest-at-time-zero",
+        "otsync/sync/witnesses.py",
+        "a.refined.rate).world(middle) for",
+        "a.refined.rate).world(0.0) for",
+        ("tests/otsync/sync/test_witnesses.py",),
+        "answers of other rates are compared at time zero",
     ),
     Break(
         "rest-best-alone",

@@ -83,7 +83,7 @@ def test_the_rest_is_what_the_answer_does_not_explain():
     assert all(p.all() and len(p) == 40 for p in places)
     (found,) = map(run, once_more(rest, run(rest)))
     assert found.refined.status.ok and found.refined.offset == pytest.approx(-5 / FPS, abs=0.1 / FPS)
-    assert elsewhere(found, answer) and not elsewhere(answer, answer)
+    assert elsewhere(found, answer, 2.0) and not elsewhere(answer, answer, 2.0)
 
 
 def test_few_tracks_that_are_left_over_are_not_asked():
@@ -96,9 +96,16 @@ def test_few_tracks_that_are_left_over_are_not_asked():
 def test_an_answer_of_the_rest_counts_where_it_is_sound_and_another_one():
     answer, _, _ = two_groups(0.0, 12)
     late = replace(answer, refined=replace(answer.refined, offset=2 / FPS))
-    assert elsewhere(late, answer)
-    assert not elsewhere(replace(late, refined=replace(late.refined, sigma=1 / FPS)), answer)
-    assert not elsewhere(replace(late, refined=replace(late.refined, flags=(Status.AMBIGUOUS,))), answer)
+    assert elsewhere(late, answer, 0.0)
+    assert not elsewhere(replace(late, refined=replace(late.refined, sigma=1 / FPS)), answer, 0.0)
+    assert not elsewhere(replace(late, refined=replace(late.refined, flags=(Status.AMBIGUOUS,))), answer, 0.0)
+
+
+def test_answers_of_other_rates_are_compared_where_the_videos_meet():
+    """Offsets are those at time zero; of clocks that differ by a percent they are three frames apart after 10 s."""
+    answer, _, _ = two_groups(0.0, 12)
+    other = replace(answer, refined=replace(answer.refined, offset=-0.1, rate=1.01))
+    assert not elsewhere(other, answer, 10.0) and elsewhere(other, answer, 0.0)
 
 
 def test_times_of_the_rest_that_come_near_the_best_compete():
