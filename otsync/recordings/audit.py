@@ -20,11 +20,13 @@ The question is narrower than that of a search, and so is the answer's sigma:
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from scipy.stats import chi2
 
 from ..compute.threads import MapLike
 from ..files.cache import Cache
@@ -53,8 +55,11 @@ OF_PEAKS = frozenset(
 )
 """Flags that doubt which peak of a pair is the right one."""
 
-SMALL = 0.8
-"""A median absolute deviation of n is too small by n / (n - SMALL) (Croux and Rousseeuw, 1992)."""
+FAR = 1.5
+"""Standard deviations beyond which a camera counts as if it were there."""
+
+OF_NORMAL = float(chi2.cdf(FAR**2, 3) + FAR**2 * chi2.sf(FAR**2, 1))
+"""Mean square of normal noise of variance 1 that is cut there."""
 
 REMEDIES = {
     "in_sync": "",
@@ -151,10 +156,7 @@ def audit_offsets(
     quiet = linked & np.array([not flags for flags in doubts])
     agreed = quiet if quiet.sum() >= LEAST else linked
     centre = float(np.median(late[agreed])) if agreed.any() else np.nan
-    # what most cameras are apart is an error of measuring; what they may be off by is not
-    apart = np.abs(late - centre)[agreed] / sigma[agreed]
-    if agreed.any():
-        sigma = sigma * max(1.0, MAD * float(np.median(apart)) * _small(int(agreed.sum())))
+    sigma = sigma * _discord(np.abs(late - centre) / sigma, agreed)
     frames, sigma_frames, jitter_frames = (late - centre) * fps, sigma * fps, jitter * fps
     beside = linked & (np.abs(frames) <= np.maximum(tolerance, SIGMAS * sigma_frames))
     near = agreed & beside
@@ -283,5 +285,31 @@ def _settled(v: int, links: list[_Link], near: np.ndarray, seconds: Float[np.nda
     return here > 0 and here - rival >= STANDING_MARGIN * here
 
 
-def _small(n: int) -> float:
-    return n / (n - SMALL)
+def _discord(apart: Float[np.ndarray, " V"], agreed: Bool[np.ndarray, " V"]) -> Float[np.ndarray, " V"]:
+    """What each camera's sigma is to be multiplied by: 1, or what most of the others are apart, in their sigmas.
+
+    That is an error of measuring. What the camera itself is off by is the question, and no part of the answer's error.
+    """
+    out = np.ones(len(apart))
+    for v in range(len(apart)):
+        others = apart[agreed & (np.arange(len(apart)) != v)]
+        if len(others) > 1:
+            out[v] = max(1.0, _scale(others))
+    return out
+
+
+def _scale(apart: Float[np.ndarray, " n"]) -> float:
+    """Standard deviation of n values from distances to their middle, which hardly heeds the few that are far away.
+
+    Their root mean square, where those beyond :data:`FAR` of it count as if they were there (Huber, 1964, proposal 2);
+    infinite where more than a third are. Of few values it is known far better than by their median.
+    """
+    n, squares = len(apart), np.sort(apart**2)
+    for near in range(n, 0, -1):
+        left = OF_NORMAL * n - FAR**2 * (n - near)
+        if left <= 0:
+            break
+        variance = float(squares[:near].sum()) / left
+        if squares[near - 1] <= FAR**2 * variance:
+            return math.sqrt(variance * n / (n - 1)) * (4 * n - 3) / (4 * n - 4)  # unbiased for few
+    return math.inf

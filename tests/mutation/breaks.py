@@ -65,7 +65,7 @@ BREAKS = (
     Break(
         "audit-by-the-pairs-alone",
         "otsync/recordings/audit.py",
-        "sigma = sigma * max(1.0, MAD * float(np.median(apart)) * _small(int(agreed.sum())))",
+        "sigma = sigma * _discord(np.abs(late - centre) / sigma, agreed)",
         "pass",
         AUDIT,
         "cameras that are far apart do not say that the pairs are less sure than they tell",

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from otsync import Status, TrackSet, synchronize
+from otsync import Matches, Status, TrackSet, synchronize
 from otsync.epipolar.refine import EpipolarRefine
 from otsync.epipolar.scan import EpipolarScan
+from otsync.epipolar.steady import unsteady
 from otsync.match.candidates import Candidates
 from tests.recording_world import paths, ring
 
@@ -67,3 +69,26 @@ def test_cameras_of_other_rates_are_compared_on_one_clock():
     offsets = solved([*tracks[:2], replace(slow, fps=25.0)])
     assert np.abs(offsets.seconds * FPS - LATE[:3]).max() < 0.5
     assert not any(Status.BROKEN_CLOCK in flags for flags in offsets.flags)
+
+
+class Told:
+    """A scan whose pairs say of one offset, 12 frames away, in the first two windows what a table says."""
+
+    def __init__(self, nats: dict[int, float]):
+        self.nats, self.asked = nats, Counter[int]()  # by the number of matches of a pair
+
+    def evidence(self, part, xb, F, pairs, lags, fps, unit, weight):
+        self.asked[len(pairs)] += 1
+        there = lags == lags[len(lags) // 2] + 12
+        return np.where(there, self.nats[len(pairs)], 0.0) * (self.asked[len(pairs)] <= 2)
+
+
+@pytest.mark.parametrize(
+    "nats, breaks", [((150.0, 75, 10), True), ((150.0, 75, -20), True), ((110.0, -180, 155), False)]
+)
+def test_a_clock_breaks_where_its_pairs_agree_that_it_does(nats, breaks):
+    """As much evidence in the sum, from pairs of which some speak as strongly against it, is that of a few things."""
+    tracks = filmed([np.arange(120.0)] * 4)
+    matches = {(v, 3): Matches(np.stack([np.arange(10 + v)] * 2, 1)) for v in range(3)}
+    found = unsteady(Told({10 + v: x for v, x in enumerate(nats)}), tracks, matches, np.zeros(4))
+    assert (3 in found) == breaks
