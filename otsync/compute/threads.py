@@ -10,6 +10,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 MapLike = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
@@ -41,6 +42,23 @@ def _forget_pool() -> None:
     if _pool is not None:
         _pool.shutdown(wait=False)
     _pool = None
+
+
+SMALL = 1000
+"""Rows of matrices up to which threads of BLAS do not pay."""
+
+
+def blas_for(rows: int) -> AbstractContextManager[Any]:
+    """Matrix products on one thread within, where matrices have few rows; what was set before comes back behind.
+
+    For some hundred rows BLAS's threads wait for each other, spinning, for several times as long as they compute, and
+    take the processors from other pairs. Of threads that overlap the first one decides.
+    """
+    if rows > SMALL:
+        return nullcontext()
+    from threadpoolctl import threadpool_limits
+
+    return threadpool_limits(1, "blas")
 
 
 def _after_fork() -> None:

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 
 from ..clocks.common import CommonClock, common_clock, readable, strongest
 from ..compute.indices import blocks
+from ..compute.medians import known_median
 from ..types import Matches, TrackSet
 from .linear import velocity
 
@@ -33,11 +34,8 @@ def apart(a: TrackSet, b: TrackSet, matches: Matches, offset: float) -> float:
     if supporting.sum() < ENOUGH:
         return float("nan")
     x, y = x[supporting], y[supporting]
-    with np.errstate(invalid="ignore"):
-        parts = list(blocks(*x.shape[:2]))
-        distance = np.nanmedian(
-            np.concatenate([np.nanmedian(np.linalg.norm(x[p] - y[p], axis=2), axis=1) for p in parts])
-        )
+    parts = list(blocks(*x.shape[:2]))
+    distance = known_median(np.concatenate([known_median(np.linalg.norm(x[p] - y[p], axis=2), 1) for p in parts]), 0)
     sizes = [size(z) for z in (x, y)]
     scale = float(np.mean(sizes))
     return float(distance / scale) if scale > 0 else float("nan")
@@ -68,6 +66,6 @@ def size(x: Float[np.ndarray, "M T 3"]) -> float:
     """Median distance between the tracks' median positions."""
     from scipy.spatial.distance import pdist
 
-    medians = np.array([np.nanmedian(track, axis=0) for track in x]).reshape(-1, 3)
+    medians = np.concatenate([known_median(x[some], 1) for some in blocks(*x.shape[:2])] or [np.zeros((0, 3))])
     distance = pdist(medians[np.isfinite(medians[:, 0])])
     return float(np.median(distance)) if len(distance) else 0.0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -12,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 
 from ..clocks.common import in_space
 from ..clocks.splines import TrackSplines
+from ..compute.medians import known_median
 from ..geometry import seen_pixels
 from ..refine.common_error import FITTED, Sums
 from ..refine.gauss_newton import CLUSTER, GROUPS, jackknife, neighbours
@@ -179,9 +179,7 @@ class Residuals:
     @cached_property
     def group(self) -> Int[np.ndarray, " M"]:
         """Neighbourhoods of a's tracks: those of one limb err alike."""
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # of tracks that a's clock never sees
-            middle = np.nan_to_num(np.nanmedian(self.xa, 1))
+        middle = np.nan_to_num(known_median(self.xa, 1))  # some tracks a's clock never sees
         return neighbours(in_space(middle[:, None])[:, 0], GROUPS)
 
 

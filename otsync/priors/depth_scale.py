@@ -18,6 +18,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ..compute.medians import known_median
+
 Gives = Literal["relative", "inverse", "depth"]
 
 ROUGH = 0.05
@@ -177,7 +179,7 @@ def steadied(d: Float[np.ndarray, "T G"], *, shift: bool) -> Float[np.ndarray, "
     out = np.tile([1.0, 0.0], (len(d), 1))
     for _ in range(2):
         now = out[:, :1] * d + out[:, 1:]
-        middle = _nanmedian(now)
+        middle = known_median(now, 0)
         known = np.zeros(len(d), bool)
         for k in range(len(d)):
             both = np.isfinite(now[k]) & np.isfinite(middle)
@@ -233,7 +235,7 @@ def tie_static(
     """
     shift = gives == "relative"
     frames = steadied(as_inverse(background, gives), shift=shift)
-    d = _nanmedian(frames[:, :1] * as_inverse(points, gives) + frames[:, 1:])
+    d = known_median(frames[:, :1] * as_inverse(points, gives) + frames[:, 1:], 0)
     known = np.flatnonzero(np.isfinite(d))
     if len(known) == 0:
         raise Untied("no point of known depth is ever in sight")
@@ -289,12 +291,3 @@ def depth_of(
     q = scale * as_inverse(d, gives) + shift
     known = q > 1 / farthest  # nan is not
     return np.where(known, 1 / np.where(known, q, 1.0), 0).astype(np.float32)
-
-
-def _nanmedian(x: Float[np.ndarray, "T N"]) -> Float[np.ndarray, " N"]:
-    """Median of what is known in every column; nan where nothing is, without a warning."""
-    ordered = np.sort(x, 0)
-    count = np.isfinite(x).sum(0)
-    column = np.arange(x.shape[1])
-    low, high = ordered[np.maximum(count - 1, 0) // 2, column], ordered[np.minimum(count // 2, len(x) - 1), column]
-    return np.where(count > 0, 0.5 * (low + np.where(count > 0, high, low)), np.nan)

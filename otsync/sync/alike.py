@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
+from ..compute.medians import known_median
 from ..types import TrackSet
 
 LIMIT = 200
@@ -91,7 +92,7 @@ class Usual:
         known = seen.sum(1) >= LEAST_KNOWN
         if not known.any():
             return cls(known, np.zeros((0, 3)), 1.0)
-        middle = np.nanmedian(np.where(seen[known][..., None], apart[known], np.nan), 1)
+        middle = known_median(np.where(seen[known][..., None], apart[known], np.nan), 1)
         off = ((apart[known] - middle[:, None]) ** 2).sum(2)
         return cls(known, middle, float(np.median(off[seen[known]])) + 1e-300)
 

@@ -13,7 +13,7 @@ from ..align.likelihood import LikelihoodScan
 from ..align.slot import Aligner, AlignerLike
 from ..clocks.common import nominal_fps
 from ..clocks.shutter import at_frame_times
-from ..compute.threads import MapLike
+from ..compute.threads import MapLike, blas_for
 from ..epipolar.scan import EpipolarScan
 from ..epipolar.steady import unsteady
 from ..frames import OwnFrames
@@ -118,33 +118,34 @@ def synchronize(
     def judged(answers: Sequence[Answer]) -> Verdict:
         return judge(len(tracks), answers, chosen, centre, graph, refining.trust, refit)
 
-    verdict = judged(list(map(run, jobs)))
-    jobs, verdict, broken = mend_clocks(jobs, verdict, tracks, judged, map)
-    if times and matches is None:
-        settled = contested(jobs, verdict, map)
-        if settled:
-            verdict = judged([settled.get(a.pair, a) for a in verdict.answers])
-    for _ in range(times if matches is None else 0):
-        again = rematching(jobs, verdict)
-        if not again:
-            break
-        fresh = {answer.pair: answer for answer in map(run, again)}
-        verdict = judged([_still_broken(fresh.get(a.pair, a), a) for a in verdict.answers])
-    if isinstance(aligning, EpipolarScan):
-        sound = {a.pair: a.matches for a in verdict.answers if a.sound}
-        breaking = set(unsteady(aligning, tracks, sound, verdict.x))
-        if breaking:
-            verdict = judged([_doubted(a) if breaking & set(a.pair) else a for a in verdict.answers])
-    else:
-        verdict = with_parts_checked(verdict, tracks, judged)
-        verdict = with_witnesses_heard(
-            verdict, jobs, bool(times) and matches is None, refining.trust.parted, judged, map
-        )
-    lags = list(map(lag_of, tracks))
-    doubted = with_lags(verdict.answers, lags, refining.trust.lag)
-    if doubted is not None:
-        verdict = judged(doubted)
-    return to_offsets(original, verdict, time.perf_counter() - started, broken, lags)
+    with blas_for(max(len(t) for t in tracks)):
+        verdict = judged(list(map(run, jobs)))
+        jobs, verdict, broken = mend_clocks(jobs, verdict, tracks, judged, map)
+        if times and matches is None:
+            settled = contested(jobs, verdict, map)
+            if settled:
+                verdict = judged([settled.get(a.pair, a) for a in verdict.answers])
+        for _ in range(times if matches is None else 0):
+            again = rematching(jobs, verdict)
+            if not again:
+                break
+            fresh = {answer.pair: answer for answer in map(run, again)}
+            verdict = judged([_still_broken(fresh.get(a.pair, a), a) for a in verdict.answers])
+        if isinstance(aligning, EpipolarScan):
+            sound = {a.pair: a.matches for a in verdict.answers if a.sound}
+            breaking = set(unsteady(aligning, tracks, sound, verdict.x))
+            if breaking:
+                verdict = judged([_doubted(a) if breaking & set(a.pair) else a for a in verdict.answers])
+        else:
+            verdict = with_parts_checked(verdict, tracks, judged)
+            verdict = with_witnesses_heard(
+                verdict, jobs, bool(times) and matches is None, refining.trust.parted, judged, map
+            )
+        lags = list(map(lag_of, tracks))
+        doubted = with_lags(verdict.answers, lags, refining.trust.lag)
+        if doubted is not None:
+            verdict = judged(doubted)
+        return to_offsets(original, verdict, time.perf_counter() - started, broken, lags)
 
 
 def with_parts_checked(

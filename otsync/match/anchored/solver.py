@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 
+from ...compute.threads import blas_for
 from ...costs.linear import Cosine, Cost, memberships, total_cost
 from ...types import Matches, Status, TrackSet
 from ..slot import StructuralMatcher
@@ -82,10 +83,11 @@ class AnchoredFGW(StructuralMatcher):
         b.check("b")
         for cost in self.costs:  # refuse what they cannot use while a is a and b is b
             cost.pairs(a, b, np.zeros(1, int), np.zeros(1, int))
-        cloud_a, cloud_b = clouds(*common_labels(a, b))
-        if not comes_first(cloud_a, cloud_b):
-            return self._match(cloud_b, cloud_a, len(b), len(a)).swapped()
-        return self._match(cloud_a, cloud_b, len(a), len(b))
+        with blas_for(self.anchors):
+            cloud_a, cloud_b = clouds(*common_labels(a, b))
+            if not comes_first(cloud_a, cloud_b):
+                return self._match(cloud_b, cloud_a, len(b), len(a)).swapped()
+            return self._match(cloud_a, cloud_b, len(a), len(b))
 
     def _match(self, a: Cloud, b: Cloud, n_a: int, n_b: int) -> Matches:
         if not len(a) or not len(b):

@@ -1,0 +1,61 @@
+"""BLAS on one thread within, where matrices are small, and as before behind."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
+
+from otsync.compute.threads import blas_for
+
+
+def blas_threads() -> set[int]:
+    return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
+
+
+@pytest.fixture
+def two():
+    with threadpool_limits(2, "blas"):
+        if blas_threads() != {2}:
+            pytest.skip("BLAS without threads")
+        yield
+
+
+def test_what_was_set_comes_back_with_the_last_one_inside(two):
+    with blas_for(200):
+        with blas_for(200):
+            assert blas_threads() == {1}
+        assert blas_threads() == {1}
+    assert blas_threads() == {2}
+
+
+def test_an_error_brings_it_back_too(two):
+    with pytest.raises(KeyError), blas_for(200):
+        raise KeyError
+    assert blas_threads() == {2}
+
+
+def test_large_matrices_keep_their_threads(two):
+    with blas_for(5000):
+        assert blas_threads() == {2}
+
+
+def test_threads_that_overlap_leave_nothing_behind(two):
+    inside, leave = threading.Barrier(2), threading.Event()
+
+    def other():
+        with blas_for(200):
+            inside.wait(10)
+            leave.wait(10)
+
+    helper = threading.Thread(target=other)
+    helper.start()
+    with blas_for(200):
+        inside.wait(10)
+        assert blas_threads() == {1}
+    leave.set()
+    helper.join()
+    with blas_for(200):
+        assert blas_threads() == {1}
+    assert blas_threads() == {2}
