@@ -5,6 +5,7 @@ Numba's own `parallel=True` is not used: its default layer aborts the process wh
 
 from __future__ import annotations
 
+import functools
 import os
 import threading
 from collections import deque
@@ -54,11 +55,16 @@ def blas_for(rows: int) -> AbstractContextManager[Any]:
     For some hundred rows BLAS's threads wait for each other, spinning, for several times as long as they compute, and
     take the processors from other pairs. Of threads that overlap the first one decides.
     """
-    if rows > SMALL:
-        return nullcontext()
-    from threadpoolctl import threadpool_limits
+    return nullcontext() if rows > SMALL else _blas().limit(limits=1, user_api="blas")
 
-    return threadpool_limits(1, "blas")
+
+@functools.cache
+def _blas() -> Any:
+    """What tells BLAS its threads. To look for it among all that a process has loaded takes some ten milliseconds."""
+    import scipy.linalg  # noqa: F401  # it brings a BLAS of its own
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController()
 
 
 def _after_fork() -> None:

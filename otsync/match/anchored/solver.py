@@ -1,4 +1,4 @@
-"""Anchored fused Gromov-Wasserstein: from some 200 anchors to all tracks, coarse to fine."""
+"""Anchored fused Gromov-Wasserstein: from some 175 anchors to all tracks, coarse to fine."""
 
 from __future__ import annotations
 
@@ -54,13 +54,13 @@ class AnchoredFGW(StructuralMatcher):
     threads. About 1 s for 20,000 tracks a video, and 0.3 GB.
     """
 
-    anchors: int = 200
+    anchors: int = 175
     cells: int = 2000
     mass: float = 0.8
     alpha: float = 0.222
     tau: float = 0.05
     beta: float = 1.0
-    landmarks: int = 96
+    landmarks: int = 64
     rounds: int = 3
     partners: int = 16
     restarts: int = 4
