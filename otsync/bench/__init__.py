@@ -3,7 +3,7 @@
 core.py    the paper's ablation and its DTW, import time, the cost of no effect
 match.py   every matcher at every size; match_limits.py: what matching promises
 sync.py    aligners, refiners and graphs; sync_acceptance.py: what synchronisation promises
-chain.py   matchers x aligners x rematching, to frames of the offset; chain_worlds.py: where; chain_plot.py
+chain/     matchers x aligners x rematching, to frames of the offset; gate.py: the default chain alone
 hard_cases/  the catalogue of hard cases, and running it
 panoptic.py  the paper's protocol on a truly synchronised recording
 own_frames.py  clock and pose without a common frame, on worlds and on a truly synchronised recording
@@ -29,7 +29,7 @@ OWN = {
     "sync": "sync",
     "hard-cases": "hard_cases.run",
     "panoptic": "panoptic",
-    "chain": "chain",
+    "chain": "chain.run",
     "own-frames": "own_frames",
     "trust": "trust.run",
     "thresholds": "trust.thresholds",

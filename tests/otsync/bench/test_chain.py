@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from otsync import PAPER, synchronize
-from otsync.bench import chain, own_frames
-from otsync.bench.chain_worlds import SITUATIONS, world
+from otsync.bench import own_frames
+from otsync.bench.chain import run as chain
+from otsync.bench.chain.worlds import SITUATIONS, world
 
 
 @pytest.mark.slow

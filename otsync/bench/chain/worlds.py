@@ -1,4 +1,4 @@
-"""Situations for :mod:`otsync.bench.chain`: pairs of videos with a known offset."""
+"""Situations for :mod:`otsync.bench.chain.run`: pairs of videos with a known offset."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from typing import Any
 
 import numpy as np
 
-from ..files.cache import Cache
-from ..geometry import common_target, view_angle
-from ..io import open_scene
-from ..progress import say
-from ..recordings.stages import Stages
-from ..simulate import Rig, simulate
-from ..types import TrackSet
-from .panoptic import BANDS, Material
-from .sync_worlds import FPS, MOVING
+from ...files.cache import Cache
+from ...geometry import common_target, view_angle
+from ...io import open_scene
+from ...progress import say
+from ...recordings.stages import Stages
+from ...simulate import Rig, simulate
+from ...types import TrackSet
+from ..panoptic import BANDS, Material
+from ..sync_worlds import FPS, MOVING
 
 FARTHEST = 50.0
 """Frames of offset, at most."""

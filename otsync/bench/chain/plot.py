@@ -1,4 +1,4 @@
-"""The plot of :mod:`otsync.bench.chain`: frames against seconds, a panel for each situation, the front drawn."""
+"""The plot of :mod:`otsync.bench.chain.run`: frames against seconds, a panel for each situation, the front drawn."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ..files.arrays import atomic_write
+from ...files.arrays import atomic_write
 
 MARKS = {"DTW": "s", "scan": "o", "scan + spline": "D", "scan + fit": "D"}
 LEAST = 0.01

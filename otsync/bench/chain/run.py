@@ -21,14 +21,14 @@ from typing import Any
 
 import numpy as np
 
-from ..align.likelihood import LikelihoodScan
-from ..align.warping import DTW
-from ..costs.epipolar import EpipolarDistance
-from ..costs.linear import Cosine, Cost
-from ..costs.positions import CurveDistance
-from ..epipolar import EpipolarRefine, EpipolarScan
-from ..files.arrays import read_json
-from ..match import (
+from ...align.likelihood import LikelihoodScan
+from ...align.warping import DTW
+from ...costs.epipolar import EpipolarDistance
+from ...costs.linear import Cosine, Cost
+from ...costs.positions import CurveDistance
+from ...epipolar import EpipolarRefine, EpipolarScan
+from ...files.arrays import read_json
+from ...match import (
     AnchoredFGW,
     Candidates,
     FusedGromovWasserstein,
@@ -40,17 +40,18 @@ from ..match import (
     UnbalancedFGW,
     UnbalancedOT,
 )
-from ..match.slot import Matcher
-from ..progress import counted, say
-from ..recordings.stages import COLOUR
-from ..refine.splines import SplineRefine
-from ..refine.unrefined import Unrefined
-from ..sync.method import PAPER, Method
-from ..sync.verb import synchronize
-from ..types import Clock
-from .chain_plot import plot
-from .chain_worlds import SITUATIONS, Case, real_cases
-from .record import table, write_rows
+from ...match.slot import Matcher
+from ...progress import counted, say
+from ...recordings.stages import COLOUR
+from ...refine.splines import SplineRefine
+from ...refine.unrefined import Unrefined
+from ...sync.method import PAPER, Method
+from ...sync.verb import synchronize
+from ...types import Clock
+from ..record import table, write_rows
+from .gate import judged
+from .plot import plot
+from .worlds import SITUATIONS, Case, real_cases
 
 FRESH = 9400
 """First seed: nothing was tuned on seeds from here on."""
@@ -118,6 +119,8 @@ def run(
     seeds: int = 10,
     first_seed: int = FRESH,
     only: tuple[str, ...] = (),
+    gate: bool = False,
+    rebase: bool = False,
 ) -> int:
     """Measure, print a table for each situation, write CSV, JSON and the plot.
 
@@ -126,7 +129,13 @@ def run(
         seeds: worlds of each situation; half as many pairs of cameras of the recording, each with an offset in three
             bands.
         only: names of the matchers; default: all.
+        gate: measure the default chain alone, on worlds of its own, and compare it with the committed baseline; exit
+            code 1 where something got worse. rebase: make this run the baseline.
     """
+    if gate or rebase:
+        if scene is not None:
+            raise ValueError(f"scene: expected none with --gate or --rebase, which measure worlds; found {scene}.")
+        return judged(out, gate=gate, rebase=rebase)
     known = {*IN_SPACE, *IN_PIXELS}
     if strange := [name for name in only if name not in known]:
         raise ValueError(f"--only: expected some of {', '.join(sorted(known))}; found {', '.join(strange)}.")
