@@ -291,7 +291,9 @@ def test_every_row_can_be_measured_and_a_seed_is_the_fits_too(world, monkeypatch
 
 def test_the_gate_compares_with_the_baseline_and_takes_no_other_options(tmp_path, monkeypatch, capsys):
     rows = [row(name) for name in gate.ROWS]
+    whole = {"offset error of the motion, frames": 0.2, "offset error, frames": 0.1, "PSNR": 25.0, "speed": 0.01}
     monkeypatch.setattr(gate, "measured", lambda: rows)
+    monkeypatch.setattr(gate, "whole_run", lambda: whole)
     monkeypatch.setattr("otsync.bench.record.baseline_path", lambda name: tmp_path / f"{name}.json")
     out = ["--out", str(tmp_path / "out")]
     assert recon.cli.main(["bench", "--rebase", *out]) == 0 == recon.cli.main(["bench", "--gate", *out])
@@ -302,6 +304,12 @@ def test_the_gate_compares_with_the_baseline_and_takes_no_other_options(tmp_path
         assert "ours" in capsys.readouterr().err
     rows[0] = row("ours", psnr=24.8, mean=0.13, neighbour_change=0.2)
     assert recon.cli.main(["bench", "--gate", *out]) == 0
+    for key, change in (*((name, 0.1) for name in list(whole)[:2]), ("PSNR", -0.4), ("speed", -0.005)):
+        kept = whole[key]
+        whole[key] += change
+        assert recon.cli.main(["bench", "--gate", *out]) == 1
+        assert f"whole run: {key}" in capsys.readouterr().err
+        whole[key] = kept
     for more, named in ((["world"], "scene"), (["--steps", "3"], "protocol"), (["--json"], "json")):
         assert recon.cli.main(["bench", "--gate", *out, *more]) == 2
         assert f"found {named}" in capsys.readouterr().err
