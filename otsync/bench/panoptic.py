@@ -161,6 +161,8 @@ WATCHED = (
     "short_overlap_mean",
     "graph_mean",
     "graph_max",
+    "graph_apart",
+    "graph_apart_max",
     "all_cameras_mean",
     "all_cameras_apart",
 )
@@ -485,6 +487,8 @@ def _row(
         "half_frame_mean": mean(errors(details, "half")),
         "graph_mean": mean(errors(graph)),
         "graph_max": at(errors(graph), 1.0),
+        "graph_apart": mean(apart(graph)),
+        "graph_apart_max": at(apart(graph), 1.0),
         "all_cameras_mean": mean(errors(whole)),
         "all_cameras_max": at(errors(whole), 1.0),
         "all_cameras_apart": mean(apart(whole)),

@@ -281,12 +281,17 @@ def _strips(ready: Prepared, progress: Progress) -> tuple[Strip, ...]:
 
 
 def offset_figures(offsets: Offsets, true: np.ndarray) -> dict[str, Any]:
-    """Mean and largest absolute error in frames, relative to the reference; None where there is no other video."""
-    error = offset_error(offsets.seconds, true, float(offsets.fps[offsets.reference]), reference=offsets.reference)
+    """Mean and largest absolute error in frames, relative to the reference; None where there is no other video.
+
+    The reference's own error is in all of these; ``mean_apart_frames`` is without what all videos have in common.
+    """
+    fps = float(offsets.fps[offsets.reference])
+    error = offset_error(offsets.seconds, true, fps, reference=offsets.reference)
     alone = len(error.errors) < 2
     return {
         "mean_frames": None if alone else error.mean,
         "max_frames": None if alone else error.max,
+        "mean_apart_frames": None if alone else offset_error(offsets.seconds, true, fps, "median").mean,
         "frames": [float(e) for e in error.errors],
     }
 

@@ -380,7 +380,7 @@ def test_one_camera_with_depth_is_a_scene(world, start, tmp_path):
     assert outcome.fitted.offsets.names == ("cam0",) and len(outcome.fitted.scene) > 100
     # no other video, no error of a clock: said so, in a file that any reader of JSON takes
     error = json.loads((tmp_path / "metrics.json").read_text())["offset_error"]
-    assert error == {"mean_frames": None, "max_frames": None, "frames": [0.0]}
+    assert error == {"mean_frames": None, "max_frames": None, "mean_apart_frames": None, "frames": [0.0]}
     assert (tmp_path / "report.html").exists() and "nan" not in offset_table(outcome)
     assert main(["eval", str(tmp_path), str(world), "--held-out", "held0", "--truth", str(world / "truth.json")]) == 0
     assert isinstance(Gaussians4D.load(tmp_path / "scene.npz"), Gaussians4D)
