@@ -178,8 +178,8 @@ class Eval:
                 lines.append("offset error: none, for there is one video only")
             else:
                 lines.append(
-                    f"offset error: mean {error['mean_frames']:.3f}, max {error['max_frames']:.3f} frames; without what "
-                    f"all videos have in common: mean {error['mean_apart_frames']:.3f}"
+                    f"offset error: mean {error['mean_frames']:.3f}, max {error['max_frames']:.3f} frames; without "
+                    f"what all videos have in common: mean {error['mean_apart_frames']:.3f}"
                 )
             document["offset_error"] = error
         write_json(out, document)
