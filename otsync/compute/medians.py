@@ -8,7 +8,7 @@ import numpy as np
 
 
 def known_median(x: Any, axis: int) -> np.ndarray:
-    """Median along an axis of what is finite; nan where nothing is, without a warning.
+    """Median along an axis of what is finite, (..., N, ...) to (...); nan where nothing is, without a warning.
 
     Example:
         >>> known_median([[1.0, np.nan, 4.0], [np.inf, np.nan, 3.0]], 0)

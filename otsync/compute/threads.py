@@ -9,9 +9,9 @@ import functools
 import os
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import contextmanager
 from typing import Any
 
 MapLike = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
@@ -48,29 +48,71 @@ def _forget_pool() -> None:
 SMALL = 1000
 """Rows of matrices up to which threads of BLAS do not pay."""
 
+_inside, _inside_lock = 0, threading.Lock()
+_own = threading.local()
+_before: list[int] = []
 
-def blas_for(rows: int) -> AbstractContextManager[Any]:
-    """Matrix products on one thread within, where matrices have few rows; what was set before comes back behind.
+
+@contextmanager
+def blas_for(rows: int) -> Iterator[None]:
+    """Matrix products on one thread within, where matrices have few rows; behind the last one, as before the first.
 
     For some hundred rows BLAS's threads wait for each other, spinning, for several times as long as they compute, and
-    take the processors from other pairs. Of threads that overlap the first one decides.
+    take the processors from other pairs. Where several of the caller's threads are inside, and the first one leaves,
+    those that are left may get BLAS's threads back.
     """
-    return nullcontext() if rows > SMALL else _blas().limit(limits=1, user_api="blas")
+    if rows > SMALL or getattr(_own, "inside", False):
+        yield
+        return
+    _enter()
+    try:
+        yield
+    finally:
+        _leave()
+
+
+def _enter() -> None:
+    global _inside, _before
+    libraries = _blas()
+    with _inside_lock:
+        if _inside == 0:
+            _before = [library.get_num_threads() for library in libraries]
+        _inside += 1
+        for library in libraries:
+            library.set_num_threads(1)
+    _own.inside = True
+
+
+def _leave() -> None:
+    from threadpoolctl import OpenBLASController
+
+    global _inside
+    _own.inside = False
+    with _inside_lock:
+        _inside -= 1
+        if _inside == 0:  # whoever began: threadpoolctl listens to the first thread alone while that lives
+            OpenBLASController.clear_controlling_thread(force=True)
+        for library, threads in zip(_blas(), _before, strict=True):
+            library.set_num_threads(threads)
+        if _inside == 0:
+            OpenBLASController.clear_controlling_thread(force=True)
 
 
 @functools.cache
-def _blas() -> Any:
-    """What tells BLAS its threads. To look for it among all that a process has loaded takes some ten milliseconds."""
-    import scipy.linalg  # noqa: F401  # it brings a BLAS of its own
+def _blas() -> list[Any]:
+    """The BLAS libraries of this process. To look for them among all that it has loaded takes some ten milliseconds."""
+    import scipy.linalg  # noqa: F401  # it brings one of its own
     from threadpoolctl import ThreadpoolController
 
-    return ThreadpoolController()
+    return ThreadpoolController().select(user_api="blas").lib_controllers
 
 
 def _after_fork() -> None:
-    # the child has the pool but none of its threads
-    global _pool, _pool_lock
+    # the child has the pool but none of its threads, and nobody else in it is inside anything
+    global _pool, _pool_lock, _inside, _inside_lock
     _pool, _pool_lock = None, threading.Lock()
+    _inside, _inside_lock = 0, threading.Lock()
+    _own.inside = False
 
 
 if hasattr(os, "register_at_fork"):

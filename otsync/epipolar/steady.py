@@ -34,9 +34,9 @@ Basketball: without a break at most 49 nats (12 pairs) and none (9 sets of four 
 fifteen frozen 60 and more in 19 of 24 pairs, and 230 and more in sets of four."""
 
 AGREED = 0.9
-"""Standard errors, from the scatter of its pairs, that the sum of their gains must reach: matches of a few wrong things
-say much for some offset in some pairs, and as much against it in others. Basketball, sets of six: with ten frames
-dropped or fifteen frozen 1.5 and more in 16 of 16, of sound cameras .7 at most (seeds 5300-5329, 5600-5611)."""
+"""Root sums of squares of its pairs' gains that their sum must reach; that of one pair alone is 1. Matches of a few
+wrong things say much for some offset in some pairs, and as much against it in others. Basketball, sets of six: with ten
+frames dropped or fifteen frozen 1.5 and more in 16 of 16, of sound cameras .7 at most (seeds 5300-5329, 5600-5611)."""
 
 MATCHES = 1500
 """Matches of a pair that are read, the best ones."""

@@ -364,7 +364,7 @@ class Paths:
             if not self.resolve(path).is_relative_to(home):
                 raise ValueError(
                     f"path {text!r}: expected a file inside {self.root}; it points outside. Move the file there, or "
-                    "allow it (allow_outside=True; --allow-outside, of otsync sync --recording.allow-outside)."
+                    "allow it (allow_outside=True; --allow-outside, or otsync sync --recording.allow-outside)."
                 )
         return path
 
@@ -377,7 +377,7 @@ class Paths:
         if isinstance(pattern, str) and ".." in Path(pattern).parts:
             raise ValueError(
                 f"frames: expected files inside {self.root}; {shown(pattern)} points outside. Move them there, or list "
-                "the files one by one and allow it (allow_outside=True; --allow-outside, of otsync sync "
+                "the files one by one and allow it (allow_outside=True; --allow-outside, or otsync sync "
                 "--recording.allow-outside)."
             )
         if not isinstance(pattern, str) or "*" not in pattern or "**" in pattern:

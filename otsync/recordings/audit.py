@@ -11,9 +11,9 @@ The question is narrower than that of a search, and so is the answer's sigma:
 * The pairs' errors go the way that the answer goes: a pair that is known to a frame hardly moves it, and hardly adds
   to its sigma. What tracks of a video have in common errs alike in all its pairs, and no number of pairs averages that
   out (:data:`SHARED`).
-* The cameras are declared to be of one moment. So how far most of them are apart is an error that was made, whatever
-  the pairs say: sigma is at least what that takes. Pairs that contradict each other, all or those of one camera, say
-  the same.
+* The cameras are declared to be of one moment. So how far most of the others are apart is an error that was made,
+  whatever the pairs say: sigma is at least what that takes. Pairs that contradict each other, all or those of one
+  camera, say the same.
 * A flag that asks which of many peaks is the right one (:data:`OF_PEAKS`) is settled by the sum of the curves of the
   camera's pairs with those that agree, where that has no rival.
 """
@@ -54,6 +54,12 @@ OF_PEAKS = frozenset(
     {Status.AMBIGUOUS, Status.WEAK, Status.FEW_MATCHES, Status.SHORT_OVERLAP, Status.BORDER, Status.MOVED}
 )
 """Flags that doubt which peak of a pair is the right one."""
+
+OTHERS = 4
+"""Cameras beside one that tell by themselves how far apart they are: one of four may be off, of three hardly."""
+
+SMALL = 0.8
+"""A median absolute deviation of n is too small by n / (n - SMALL) (Croux and Rousseeuw, 1992)."""
 
 FAR = 1.5
 """Standard deviations beyond which a camera counts as if it were there."""
@@ -289,27 +295,28 @@ def _discord(apart: Float[np.ndarray, " V"], agreed: Bool[np.ndarray, " V"]) -> 
     """What each camera's sigma is to be multiplied by: 1, or what most of the others are apart, in their sigmas.
 
     That is an error of measuring. What the camera itself is off by is the question, and no part of the answer's error.
+    Of fewer than :data:`OTHERS` one that is off would be too large a part, so there all answer, by their median.
     """
+    count = int(agreed.sum())
+    if count <= OTHERS:
+        told = MAD * float(np.median(apart[agreed])) * count / (count - SMALL) if count else 1.0
+        return np.full(len(apart), max(1.0, told))
     out = np.ones(len(apart))
     for v in range(len(apart)):
-        others = apart[agreed & (np.arange(len(apart)) != v)]
-        if len(others) > 1:
-            out[v] = max(1.0, _scale(others))
+        out[v] = max(1.0, scale_of(apart[agreed & (np.arange(len(apart)) != v)]))
     return out
 
 
-def _scale(apart: Float[np.ndarray, " n"]) -> float:
-    """Standard deviation of n values from distances to their middle, which hardly heeds the few that are far away.
+def scale_of(apart: Float[np.ndarray, " n"]) -> float:
+    """Standard deviation of n >= 2 values from distances to their middle, which hardly heeds a few that are far away.
 
-    Their root mean square, where those beyond :data:`FAR` of it count as if they were there (Huber, 1964, proposal 2);
-    infinite where more than a third are. Of few values it is known far better than by their median.
+    The largest solution s of mean(min((d / s)², FAR²)) = OF_NORMAL: those beyond :data:`FAR` of it count as if they
+    were there (Huber, 1964, proposal 2). Of few values it is known far better than by their median. Corrected as the
+    standard deviation of n normal values about their mean is.
     """
     n, squares = len(apart), np.sort(apart**2)
     for near in range(n, 0, -1):
-        left = OF_NORMAL * n - FAR**2 * (n - near)
-        if left <= 0:
-            break
-        variance = float(squares[:near].sum()) / left
+        variance = float(squares[:near].sum()) / (OF_NORMAL * n - FAR**2 * (n - near))
         if squares[near - 1] <= FAR**2 * variance:
-            return math.sqrt(variance * n / (n - 1)) * (4 * n - 3) / (4 * n - 4)  # unbiased for few
-    return math.inf
+            break
+    return math.sqrt(variance * n / (n - 1)) * (4 * n - 3) / (4 * n - 4)

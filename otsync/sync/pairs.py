@@ -26,7 +26,6 @@ log = logging.getLogger("otsync")
 DOUBTS = frozenset({Status.NO_MATCH, Status.AMBIGUOUS})
 """Doubts about matches: the pair's answer carries them, so that nobody trusts it, and is there to be looked at."""
 
-
 CLEAR = 40.0
 """Nats a match that answer a doubt about features."""
 
@@ -46,29 +45,30 @@ class Job:
 
 def run(job: Job) -> Answer:
     """Match, align and refine one pair. An exception becomes the status FAILED, told in the log."""
-    try:
-        with blas_for(max(len(job.a), len(job.b))):
-            return _answer(job)
-    except Exception as error:
-        log.warning("pair %s: %s: %s", job.pair, type(error).__name__, error)
-        failed = Alignment(float("nan"), flags=(Status.FAILED,))
-        return Answer(job.pair, Matches(np.zeros((0, 2), int), flags=(Status.FAILED,)), failed, failed)
+    with blas_for(max(len(job.a), len(job.b))):
+        return _answer(job)
 
 
 def _answer(job: Job) -> Answer:
-    given = job.matches if job.matches is not None else match(job.a, job.b, job.matcher, throw=False)
-    matches = given.without_plan()
-    told = set(matches.flags) - {Status.FORCED}  # aligners bear wrong matches, and judge for themselves
-    if told and not (len(matches) and told <= DOUBTS):
-        failed = Alignment(float("nan"), flags=matches.flags, stats=matches.stats)
+    matches = Matches(np.zeros((0, 2), int), flags=(Status.FAILED,))
+    try:
+        given = job.matches if job.matches is not None else match(job.a, job.b, job.matcher, throw=False)
+        matches = given.without_plan()
+        told = set(matches.flags) - {Status.FORCED}  # aligners bear wrong matches, and judge for themselves
+        if told and not (len(matches) and told <= DOUBTS):
+            failed = Alignment(float("nan"), flags=matches.flags, stats=matches.stats)
+            return Answer(job.pair, matches, failed, failed)
+        scanned = align(job.a, job.b, matches, job.aligner, throw=False)
+        scanned = dataclasses.replace(scanned, flags=(*(f for f in matches.flags if f in DOUBTS), *scanned.flags))
+        refined = scanned
+        if np.isfinite(scanned.offset):
+            refined = refine(job.a, job.b, matches, scanned, job.refiner, throw=False)
+            refined = without_answered_doubt(refined)
+        return Answer(job.pair, matches, scanned, refined)
+    except Exception as error:
+        log.warning("pair %s: %s: %s", job.pair, type(error).__name__, error)
+        failed = Alignment(float("nan"), flags=(Status.FAILED,))
         return Answer(job.pair, matches, failed, failed)
-    scanned = align(job.a, job.b, matches, job.aligner, throw=False)
-    scanned = dataclasses.replace(scanned, flags=(*(f for f in matches.flags if f in DOUBTS), *scanned.flags))
-    refined = scanned
-    if np.isfinite(scanned.offset):
-        refined = refine(job.a, job.b, matches, scanned, job.refiner, throw=False)
-        refined = without_answered_doubt(refined)
-    return Answer(job.pair, matches, scanned, refined)
 
 
 def without_answered_doubt(refined: Alignment) -> Alignment:

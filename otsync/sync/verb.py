@@ -184,7 +184,8 @@ def with_witnesses_heard(
     others = [job for job in unexplained if job is not None]
     first = list(map(run, others))
     again = [job for other, answer in zip(others, first, strict=True) for job in once_more(other, answer)]
-    middle = {job.pair: float(job.b.times[[0, -1]].mean()) for job in asked}
+    shared = {job.pair: Seen.by(answers[job.pair], job.a, job.b)[1] for job in asked}
+    middle = {pair: (seen.begin + seen.end) / 2 for pair, seen in shared.items()}
     doubted |= {a.pair for a in map(run, again) if elsewhere(a, answers[a.pair], middle[a.pair])}
     if not doubted:
         return verdict

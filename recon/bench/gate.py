@@ -63,7 +63,8 @@ SLOWER = 0.4
 
 
 def run(out: Path, *, gate: bool = False, rebase: bool = False) -> int:
-    """Film, measure, write ``recon_gate.csv`` and ``.json`` to ``out``; 1 where the gate finds something worse, else 0.
+    """Film, measure, write ``recon_gate`` and ``recon_gate_whole`` (``.csv``, ``.json``) to ``out``; 1 where the gate
+    finds something worse, else 0.
 
     gate: compare with the baseline. rebase: make this run the baseline, before it is compared.
     """
@@ -119,10 +120,10 @@ def whole_run() -> dict[str, float]:
         for found in (coarse, outcome.fitted.offsets)
     ]
     return {
-        "offset error of the motion, frames": errors[0],
-        "offset error, frames": errors[1],
-        "PSNR": shown["psnr"],
-        "speed": yard / seconds,
+        "offset error of the motion, frames": round(errors[0], 4),
+        "offset error, frames": round(errors[1], 4),
+        "PSNR": round(shown["psnr"], 4),
+        "speed": float(f"{yard / seconds:.3g}"),
     }
 
 

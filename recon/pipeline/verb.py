@@ -283,7 +283,8 @@ def _strips(ready: Prepared, progress: Progress) -> tuple[Strip, ...]:
 def offset_figures(offsets: Offsets, true: np.ndarray) -> dict[str, Any]:
     """Mean and largest absolute error in frames, relative to the reference; None where there is no other video.
 
-    The reference's own error is in all of these; ``mean_apart_frames`` is without what all videos have in common.
+    The reference's own error is in all of these. ``mean_apart_frames`` is without what all videos have in common, their
+    median error, and of all videos, the reference too: of two it is half of their difference.
     """
     fps = float(offsets.fps[offsets.reference])
     error = offset_error(offsets.seconds, true, fps, reference=offsets.reference)

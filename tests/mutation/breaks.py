@@ -71,6 +71,22 @@ BREAKS = (
         "cameras that are far apart do not say that the pairs are less sure than they tell",
     ),
     Break(
+        "audit-one-of-three",
+        "otsync/recordings/audit.py",
+        "if count <= OTHERS:",
+        "if count <= 0:",
+        AUDIT,
+        "of three cameras one that is off makes the others unsure",
+    ),
+    Break(
+        "steady-a-few-decide",
+        "otsync/epipolar/steady.py",
+        "inside & agreed & (gain",
+        "inside & (gain",
+        ("tests/otsync/epipolar/test_steady.py",),
+        "a clock breaks although its pairs contradict each other about that",
+    ),
+    Break(
         "audit-averages-everything",
         "otsync/recordings/audit.py",
         "own = np.maximum(common**2, SHARED * sigma**2)",

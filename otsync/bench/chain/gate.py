@@ -30,7 +30,8 @@ SHARE, FRAME = 0.2, 0.02
 """By which an error may grow: a share of the baseline's, and frames."""
 
 TRUSTED, SLOWER = 0.17, 0.4
-"""By how much less of a situation may be trusted: one answer of six; and the share by which the speed may fall."""
+"""By how much less of a situation may be trusted: one answer of six, not two; and the share by which the speed may
+fall."""
 
 
 def judged(out: Path, *, gate: bool, rebase: bool) -> int:
@@ -50,7 +51,8 @@ def judged(out: Path, *, gate: bool, rebase: bool) -> int:
 def measured(seeds: Sequence[int]) -> list[dict[str, Any]]:
     """A row for every situation."""
     cases = [(name, make, seed) for name, make in SITUATIONS.items() for seed in seeds]
-    answer(SITUATIONS["mid"](0)), answer(SITUATIONS["no depth"](0))  # imports and compiled loops are nobody's time
+    for name in ("mid", "no depth"):  # imports and compiled loops are nobody's time
+        answer(SITUATIONS[name](0))
     found: dict[str, list[dict[str, float]]] = {}
     for name, make, seed in counted(cases, "the default chain", "case", len(cases)):
         found.setdefault(name, []).append(answer(make(seed)))
@@ -73,7 +75,9 @@ def answer(case: Case) -> dict[str, float]:
 
 
 def summary(answers: Sequence[dict[str, float]]) -> dict[str, Any]:
-    error, trusted, seconds, yard = (np.array([a[k] for a in answers]) for k in answers[0])
+    error, trusted, seconds, yard = (
+        np.array([a[key] for a in answers]) for key in ("error", "trusted", "cpu_s", "yardstick")
+    )
     return {
         "mean": round(float(error.mean()), 4),
         "trusted": round(float(trusted.mean()), 3),

@@ -53,8 +53,8 @@ from .gate import judged
 from .plot import plot
 from .worlds import SITUATIONS, Case, real_cases
 
-FRESH = 9400
-"""First seed: nothing was tuned on seeds from here on."""
+FRESH, SEEDS = 9400, 10
+"""First seed, and how many: nothing was tuned on seeds from here on."""
 
 WRONG = 1.0
 """Frames of error from which a trusted answer counts as wrong."""
@@ -116,7 +116,7 @@ def run(
     *,
     scene: str | os.PathLike[str] | None = None,
     cache: Path | None = None,
-    seeds: int = 10,
+    seeds: int = SEEDS,
     first_seed: int = FRESH,
     only: tuple[str, ...] = (),
     gate: bool = False,
@@ -133,8 +133,13 @@ def run(
             code 1 where something got worse. rebase: make this run the baseline.
     """
     if gate or rebase:
-        if scene is not None:
-            raise ValueError(f"scene: expected none with --gate or --rebase, which measure worlds; found {scene}.")
+        given: dict[str, Any] = {"scene": scene, "cache": cache, "only": only or None}
+        given |= {"seeds": seeds if seeds != SEEDS else None, "first_seed": first_seed if first_seed != FRESH else None}
+        if extra := [name for name, value in given.items() if value is not None]:
+            raise ValueError(
+                f"{', '.join(extra)}: expected none with --gate or --rebase, which measure worlds of their own. Leave "
+                "it out."
+            )
         return judged(out, gate=gate, rebase=rebase)
     known = {*IN_SPACE, *IN_PIXELS}
     if strange := [name for name in only if name not in known]:

@@ -10,8 +10,10 @@ import pytest
 
 from otsync import PAPER, synchronize
 from otsync.bench import own_frames
+from otsync.bench.chain import gate
 from otsync.bench.chain import run as chain
 from otsync.bench.chain.worlds import SITUATIONS, world
+from otsync.recordings.stages import Stages
 
 
 @pytest.mark.slow
@@ -73,3 +75,39 @@ def test_an_unknown_matcher_is_refused(tmp_path):
     for suite in (chain, own_frames):
         with pytest.raises(ValueError, match="--cache: expected with a recording"):
             suite.run(tmp_path, cache=tmp_path)
+
+
+def test_the_gate_tells_what_got_worse(tmp_path, monkeypatch, capsys):
+    answers = [{"error": e, "trusted": 1.0, "cpu_s": 2.0, "yardstick": 0.02} for e in (0.1, 0.2, 0.3, 0.1, 0.2, 0.3)]
+    rows = [{"situation": "mid", **gate.summary(answers)}]
+    assert rows[0] | {"mean": 0.2, "trusted": 1.0, "trusted_wrong": 0, "cpu_s": 2.0, "speed": 0.01} == rows[0]
+    monkeypatch.setattr(gate, "measured", lambda seeds: rows)
+    monkeypatch.setattr("otsync.bench.record.baseline_path", lambda name: tmp_path / f"{name}.json")
+    assert chain.run(tmp_path, rebase=True) == 0 == chain.run(tmp_path, gate=True)
+    assert (tmp_path / "chain_gate.csv").exists() and "no worse" in capsys.readouterr().out
+    for key, allowed, too_much in (
+        ("mean", 0.25, 0.27),
+        ("trusted", 5 / 6, 4 / 6),
+        ("trusted_wrong", 0, 1),
+        ("speed", 0.007, 0.005),
+    ):
+        kept = rows[0][key]
+        rows[0][key] = allowed
+        assert chain.run(tmp_path, gate=True) == 0
+        rows[0][key] = too_much
+        assert chain.run(tmp_path, gate=True) == 1 and f"mid: {key}" in capsys.readouterr().err
+        rows[0][key] = kept
+
+
+@pytest.mark.parametrize("option", [{"scene": "here"}, {"cache": "here"}, {"only": ("EMD",)}, {"seeds": 3}])
+def test_a_gate_takes_nothing_else(option, tmp_path):
+    with pytest.raises(ValueError, match=f"{next(iter(option))}: expected none with --gate"):
+        chain.run(tmp_path, gate=True, **option)
+
+
+def test_an_answer_of_the_gate_is_the_default_chains():
+    case = SITUATIONS["mid"](12_400)
+    found = gate.answer(case)
+    offsets = synchronize(case.tracks, method=Stages().space)
+    assert found["error"] == case.errors(offsets.seconds)[0] < 0.1 and found["trusted"] == 1.0
+    assert 0 < found["yardstick"] < found["cpu_s"]

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
@@ -41,21 +43,41 @@ def test_large_matrices_keep_their_threads(two):
         assert blas_threads() == {2}
 
 
-def test_threads_that_overlap_leave_nothing_behind(two):
-    inside, leave = threading.Barrier(2), threading.Event()
+@pytest.mark.parametrize("order", ["begins and ends last", "begins first"])
+def test_threads_that_overlap_leave_nothing_behind(two, order):
+    entered, leave = threading.Event(), threading.Event()
 
     def other():
         with blas_for(200):
-            inside.wait(10)
+            entered.set()
             leave.wait(10)
 
     helper = threading.Thread(target=other)
-    helper.start()
+    if order == "begins first":
+        helper.start()
+        assert entered.wait(10)
+        with blas_for(200):
+            assert blas_threads() == {1}
+        leave.set()
+        helper.join()
+    else:
+        with blas_for(200):
+            helper.start()
+            assert entered.wait(10)
+            assert blas_threads() == {1}
+        leave.set()
+        helper.join()
+    assert blas_threads() == {2}
     with blas_for(200):
-        inside.wait(10)
         assert blas_threads() == {1}
-    leave.set()
-    helper.join()
-    with blas_for(200):
-        assert blas_threads() == {1}
+    assert blas_threads() == {2}
+
+
+def test_a_pool_leaves_nothing_behind(two):
+    def work(_: int) -> None:
+        with blas_for(200):
+            time.sleep(0.001)
+
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(work, range(40)))
     assert blas_threads() == {2}

@@ -6,8 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from otsync.recordings.audit import audit_offsets
+from otsync.recordings.audit import FAR, OF_NORMAL, audit_offsets, scale_of
 from otsync.sync.graph import Edge, solve
 from otsync.types import Alignment, Offsets, Status
 
@@ -118,6 +120,38 @@ def test_cameras_that_are_far_apart_say_that_the_pairs_are_less_sure_than_they_t
     """Errors of half a frame that every video has in all its pairs alike: no cycle shows them, and no pair tells."""
     alarms = sum(len(audit_offsets(rig([0.0] * 6, 0.05, seed=seed, own=0.5)).alarms) for seed in range(100, 150))
     assert alarms <= 3  # of 300 cameras; by the pairs' own sigmas it would be most of them
+
+
+@pytest.mark.parametrize("cameras", [3, 4, 5, 6, 8])
+@pytest.mark.parametrize("move", [1.0, 5.0])
+def test_one_camera_that_is_off_makes_few_others_unsure(cameras, move):
+    told = [audit_offsets(rig([move] + [0.0] * (cameras - 1), 0.1, seed=seed, own=0.05)) for seed in range(30)]
+    found = np.array([[c.finding for c in t.cameras] for t in told])
+    assert (found[:, 0] == "off").mean() > (0.7 if cameras == 3 else 0.85) and (found[:, 1:] != "off").all()
+    assert (found[:, 1:] == "in_sync").mean() > (0.75 if cameras == 3 else 0.9)
+
+
+@given(
+    st.lists(st.just(0.0) | st.floats(1e-3, 1e3), min_size=4, max_size=30).filter(
+        lambda d: np.mean(np.array(d) > 0) > 0.4
+    ),
+    st.floats(1e-3, 1e3),
+)
+def test_the_scale_of_distances_is_hubers(apart, unit):
+    """What it solves, before the correction for few; and its unit is that of the distances."""
+    d, n = np.array(apart), len(apart)
+    scale = scale_of(d)
+    raw = scale / (np.sqrt(n / (n - 1)) * (4 * n - 3) / (4 * n - 4))
+    assert np.minimum((d / raw) ** 2, FAR**2).mean() == pytest.approx(OF_NORMAL)
+    assert scale_of(unit * d) == pytest.approx(unit * scale)
+
+
+def test_one_of_eight_that_is_far_away_hardly_moves_the_scale():
+    rng = np.random.default_rng(0)
+    clean, with_one = np.array(
+        [(scale_of(d), scale_of(np.append(d, 1e6))) for d in np.abs(rng.normal(size=(200, 7)))]
+    ).T
+    assert np.median(with_one) < 1.4 * np.median(clean)
 
 
 def test_a_clock_in_doubt_is_its_own_cameras_affair():
