@@ -72,15 +72,17 @@ def test_cameras_of_other_rates_are_compared_on_one_clock():
 
 
 class Told:
-    """A scan whose pairs say of one offset, 12 frames away, in the first two windows what a table says."""
+    """A scan whose pairs say of offsets 12 frames later and earlier, in the first two windows, what a table says."""
 
-    def __init__(self, nats: dict[int, float]):
+    def __init__(self, nats: dict[int, tuple[float, float]]):
         self.nats, self.asked = nats, Counter[int]()  # by the number of matches of a pair
 
     def evidence(self, part, xb, F, pairs, lags, fps, unit, weight):
         self.asked[len(pairs)] += 1
-        there = lags == lags[len(lags) // 2] + 12
-        return np.where(there, self.nats[len(pairs)], 0.0) * (self.asked[len(pairs)] <= 2)
+        away = lags - lags[len(lags) // 2]
+        later, earlier = self.nats[len(pairs)]
+        told = np.where(away == 12, later, np.where(away == -12, earlier, 0.0))
+        return told * (self.asked[len(pairs)] <= 2)
 
 
 @pytest.mark.parametrize(
@@ -89,6 +91,9 @@ class Told:
 def test_a_clock_breaks_where_its_pairs_agree_that_it_does(nats, breaks):
     """As much evidence in the sum, from pairs of which some speak as strongly against it, is that of a few things."""
     tracks = filmed([np.arange(120.0)] * 4)
-    matches = {(v, 3): Matches(np.stack([np.arange(10 + v)] * 2, 1)) for v in range(3)}
-    found = unsteady(Told({10 + v: x for v, x in enumerate(nats)}), tracks, matches, np.zeros(4))
-    assert (3 in found) == breaks
+    pairs = [(0, 3), (1, 3), (2, 3), (0, 1), (0, 2), (1, 2)]
+    matches = {pair: Matches(np.stack([np.arange(10 + n)] * 2, 1)) for n, pair in enumerate(pairs)}
+    # the others are sure of each other
+    told = [(x, 0.0) for x in nats] + [(-200.0, -200.0)] * 3
+    found = unsteady(Told({10 + n: x for n, x in enumerate(told)}), tracks, matches, np.zeros(4))
+    assert found == [3] * breaks
