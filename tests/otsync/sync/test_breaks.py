@@ -12,7 +12,7 @@ from otsync.clocks.common import CommonClock
 from otsync.clocks.splines import TrackSplines
 from otsync.simulate import simulate
 from otsync.simulate.effects import Drop, Freeze, In, SlowMotion
-from otsync.sync.breaks import mended, stood_still
+from otsync.sync.breaks import mended, stood_still, whole
 from otsync.sync.verb import jump_sigma
 from otsync.types import Break, Offsets, Status, TrackSet, mended_frames, mended_times
 
@@ -223,3 +223,17 @@ def test_a_pause_lasts_whole_frames_where_it_is_measured():
     assert jump_sigma(Break(2.0, 0.5, 0.0, 0.1 * frame), frame) == pytest.approx(0.1 * frame)
     for still in (0.0, 0.5):
         assert jump_sigma(Break(2.0, -0.5, still, float("nan")), frame) > frame
+
+
+@pytest.mark.parametrize(
+    "length, sigma, frames",
+    [
+        (29.2, 0.05, 29),  # surely 29
+        (29.38, 0.09, 29),
+        (29.2, 0.25, 29.2),  # it may be 30
+        (29.45, 0.05, 29.45),  # no whole number
+        (29.2, np.nan, 29),  # nobody knows how well it is known
+    ],
+)
+def test_a_freeze_has_whole_frames_where_it_is_clear_how_many(length, sigma, frames):
+    assert whole(length / 30, sigma / 30, 1 / 30) * 30 == pytest.approx(frames)
