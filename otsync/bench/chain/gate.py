@@ -18,13 +18,10 @@ from ...recordings.stages import Stages
 from ...sync.verb import synchronize
 from .. import record
 from ..match import yardstick
-from .worlds import SITUATIONS, Case
+from .worlds import SITUATIONS, WRONG, Case
 
 SEEDS = range(12_400, 12_406)
 """Nothing was tuned on these."""
-
-WRONG = 1.0
-"""Frames of error from which a trusted answer counts as wrong."""
 
 SHARE, FRAME = 0.2, 0.02
 """By which an error may grow: a share of the baseline's, and frames."""

@@ -51,13 +51,10 @@ from ...types import Clock
 from ..record import table, write_rows
 from .gate import judged
 from .plot import plot
-from .worlds import SITUATIONS, Case, real_cases
+from .worlds import SITUATIONS, WRONG, Case, real_cases
 
 FRESH, SEEDS = 9400, 10
 """First seed, and how many: nothing was tuned on seeds from here on."""
-
-WRONG = 1.0
-"""Frames of error from which a trusted answer counts as wrong."""
 
 FEATURES: tuple[Cost, ...] = (Cosine(),)
 PLACES: tuple[Cost, ...] = (Cosine(weight=COLOUR, center=False), CurveDistance())

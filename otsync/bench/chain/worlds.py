@@ -26,6 +26,9 @@ from ..sync_worlds import FPS, MOVING
 FARTHEST = 50.0
 """Frames of offset, at most."""
 
+WRONG = 1.0
+"""Frames of error from which a trusted answer counts as wrong."""
+
 TOGETHER, GRAPH = 6, "recording, 6 cameras"
 
 STRANGERS = 0.6
