@@ -45,7 +45,7 @@ def _forget_pool() -> None:
     _pool = None
 
 
-SMALL = 1000
+FEW = 1000
 """Rows of matrices up to which threads of BLAS do not pay."""
 
 _inside, _inside_lock = 0, threading.Lock()
@@ -61,7 +61,7 @@ def blas_for(rows: int) -> Iterator[None]:
     take the processors from other pairs. Where several of the caller's threads are inside, and the first one leaves,
     those that are left may get BLAS's threads back.
     """
-    if rows > SMALL or getattr(_own, "inside", False):
+    if rows > FEW or getattr(_own, "inside", False):
         yield
         return
     _enter()
@@ -100,7 +100,10 @@ def _leave() -> None:
 
 @functools.cache
 def _blas() -> list[Any]:
-    """The BLAS libraries of this process. To look for them among all that it has loaded takes some ten milliseconds."""
+    """numpy's and scipy's BLAS, and what else was loaded by the first call; torch, loaded later, keeps its own.
+
+    To look for them among all that a process has loaded takes some ten milliseconds.
+    """
     import scipy.linalg  # noqa: F401  # it brings one of its own
     from threadpoolctl import ThreadpoolController
 
