@@ -62,13 +62,12 @@ class SynchronousMatching(Matcher):
         cost = self.cost(a.take(own_a), b.take(own_b))
         if not np.isfinite(cost).any():
             return Matches(np.zeros((0, 2), int), flags=(Status.NO_OVERLAP,))
-        best_b, best_a = cost.argmin(1), cost.argmin(0)
-        i = np.flatnonzero((best_a[best_b] == np.arange(len(own_a))) & np.isfinite(cost.min(1)))
-        value = cost[i, best_b[i]]
+        i, j = mutual(cost)
+        value = cost[i, j]
         order = np.argsort(value, kind="stable")
         flags = () if len(i) else (Status.NO_MATCH,)
         return Matches(
-            np.stack([own_a[i], own_b[best_b[i]]], 1)[order],
+            np.stack([own_a[i], own_b[j]], 1)[order],
             -value[order],
             flags=flags,
             stats={"objective": float(value.sum()), "mass": len(i) / max(min(len(a), len(b)), 1)},
@@ -76,23 +75,20 @@ class SynchronousMatching(Matcher):
 
     def cost(self, a: TrackSet, b: TrackSet) -> Float[np.ndarray, "Na Nb"]:
         """In units; infinite where two tracks are not seen together at enough moments."""
-        place, motion = self.distances(a, b)
-        features = total_cost(self.costs, a, b) / FEATURE if a.features is not None and b.features is not None else 0.0
-        both = a.frame is not None and a.frame == b.frame
-        cost = features + motion / MOTION + (place / PLACE if both else 0.0)
-        return np.where(np.isfinite(motion), cost, np.inf)
+        return joined(self.unlike(a, b), *self.distances(a, b), placed(a, b))
+
+    def unlike(self, a: TrackSet, b: TrackSet) -> Float[np.ndarray, "Na Nb"] | float:
+        """The part of features, in units; 0 without any."""
+        known = a.features is not None and b.features is not None
+        return total_cost(self.costs, a, b) / FEATURE if known else 0.0
 
     def distances(self, a: TrackSet, b: TrackSet) -> tuple[Float[np.ndarray, "Na Nb"], Float[np.ndarray, "Na Nb"]]:
         """Truncated mean distance and rms demeaned distance at common moments, in extents of the scene; nan: unseen."""
-        from ..compute.threads import for_each, ranges
-        from .kernels import synchronous_distances
-
         first = max(a.times[0], self.rate * b.times[0] + self.offset)
         last = min(a.times[-1], self.rate * b.times[-1] + self.offset)
-        shape = len(a), len(b)
-        place, motion = np.full(shape, np.nan), np.full(shape, np.nan)
+        unseen = np.full((len(a), len(b)), np.nan)
         if last <= first:
-            return place, motion
+            return unseen, unseen
         t = np.linspace(first, last, MOMENTS)
         assert a.xyz is not None and b.xyz is not None
         at_a = sampled(a.times, a.xyz, a.seen, t)
@@ -100,17 +96,53 @@ class SynchronousMatching(Matcher):
         scale = max(binary_scale(at_a), binary_scale(at_b))  # a power of two: what is divided by it stays exact
         at_a, at_b = at_a / scale, at_b / scale
         extent = 0.5 * (rms_extent(at_a) + rms_extent(at_b))
-        if not extent > 0:
-            return place, motion
-        wa, wb = np.isfinite(at_a[..., 0]), np.isfinite(at_b[..., 0])
-        fa = np.where(wa[..., None], at_a, 0.0) / extent
-        fb = np.where(wb[..., None], at_b, 0.0) / extent
+        return apart(at_a, at_b, extent) if extent > 0 else (unseen, unseen)
 
-        def work(*rows: int) -> None:
-            synchronous_distances(fa, wa, fb, wb, FARTHEST * PLACE, LEAST_MOMENTS, *rows, place, motion)
 
-        for_each(work, ranges(len(a), 64))
-        return place, motion
+def placed(a: TrackSet, b: TrackSet) -> bool:
+    """Whether both declare one world frame, so that places count."""
+    return a.frame is not None and a.frame == b.frame
+
+
+def apart(
+    a: Float[np.ndarray, "Na S 3"], b: Float[np.ndarray, "Nb S 3"], extent: float
+) -> tuple[Float[np.ndarray, "Na Nb"], Float[np.ndarray, "Na Nb"]]:
+    """Truncated mean distance and rms demeaned distance of tracks at S moments, in extents; nan: hardly seen together.
+
+    Args:
+        a, b: positions, nan where unseen. extent: of the scene, in the same unit.
+    """
+    from ..compute.threads import for_each, ranges
+    from .kernels import synchronous_distances
+
+    wa, wb = np.isfinite(a[..., 0]), np.isfinite(b[..., 0])
+    fa = np.where(wa[..., None], a, 0.0) / extent
+    fb = np.where(wb[..., None], b, 0.0) / extent
+    place, motion = (np.full((len(a), len(b)), np.nan) for _ in range(2))
+
+    def work(*rows: int) -> None:
+        synchronous_distances(fa, wa, fb, wb, FARTHEST * PLACE, LEAST_MOMENTS, *rows, place, motion)
+
+    for_each(work, ranges(len(a), 64))
+    return place, motion
+
+
+def joined(
+    features: Float[np.ndarray, "Na Nb"] | float,
+    place: Float[np.ndarray, "Na Nb"],
+    motion: Float[np.ndarray, "Na Nb"],
+    both: bool,
+) -> Float[np.ndarray, "Na Nb"]:
+    """The cost of every two tracks, in units; infinite where their motion is not known. ``both``: places count."""
+    cost = features + motion / MOTION + (place / PLACE if both else 0.0)
+    return np.where(np.isfinite(motion), cost, np.inf)
+
+
+def mutual(cost: Float[np.ndarray, "Na Nb"]) -> tuple[Int[np.ndarray, " M"], Int[np.ndarray, " M"]]:
+    """Rows and columns that are each other's cheapest, at a finite cost."""
+    best_b, best_a = cost.argmin(1), cost.argmin(0)
+    i = np.flatnonzero((best_a[best_b] == np.arange(len(cost))) & np.isfinite(cost.min(1)))
+    return i, best_b[i]
 
 
 def longest_seen(tracks: TrackSet, limit: int) -> Int[np.ndarray, " n"]:

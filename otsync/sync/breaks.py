@@ -53,6 +53,9 @@ SNAP, SURELY = 0.4, 5.0
 the next. A freeze near the end of a clip, known to a quarter of a frame, was made a frame too short, and trusted (seed
 53009); one known to .09 was left .38 frame off (41006)."""
 
+ROUNDING = 1e-6
+"""Frames."""
+
 BESIDE, OFF, OTHERS = 0.45, 1.5 / 30, 10 / 30
 """Seconds on either side of a mended break in which no offset that differs by more than :data:`OFF` s, of those within
 :data:`OTHERS`, may suit the positions better than the answer. Beside freezes, lost frames and cuts one within a frame
@@ -85,8 +88,12 @@ def mended(tracks: TrackSet, breaks: Sequence[Break]) -> TrackSet:
     return replace(tracks, **taken, timestamps=shown, fps=None, camera=camera)
 
 
-def suspects(answer: Answer, a: TrackSet, b: TrackSet, fps: Sequence[float]) -> list[Suspect]:
-    """Both readings of every jump of a pair's offset, located to a frame and measured below it."""
+def suspects(answer: Answer, a: TrackSet, b: TrackSet, fps: Sequence[float], within: float = AROUND) -> list[Suspect]:
+    """Both readings of every jump of a pair's offset, located to a frame and measured below it.
+
+    Args:
+        within: s by which the offsets of its parts may be off.
+    """
     matches = strongest(answer.matches, readable(LIMIT, a, b))
     curves = SplineRefine().splines(a, b, matches)
     raw = Raw.of(a, matches.pairs[:, 0]), Raw.of(b, matches.pairs[:, 1])
@@ -95,7 +102,7 @@ def suspects(answer: Answer, a: TrackSet, b: TrackSet, fps: Sequence[float]) -> 
     for k in range(len(parts) - 1):
         begin = parts[k][0] if k else -math.inf
         end = parts[k + 2][0] if k + 2 < len(parts) else math.inf
-        found += _readings(answer, curves, raw, parts[k][1], parts[k + 1], (begin, end), fps)
+        found += _readings(answer, curves, raw, parts[k][1], parts[k + 1], (begin, end), fps, within)
     return found
 
 
@@ -107,6 +114,7 @@ def _readings(
     after: np.ndarray,
     limits: tuple[float, float],
     fps: Sequence[float],
+    within: float,
 ) -> list[Suspect]:
     a, b = curves
     when, later = float(after[0]), float(after[1])
@@ -116,7 +124,7 @@ def _readings(
     sigmas = [math.nan, math.nan]
     for margin in (2 * AROUND / 3, MARGIN):
         sides = Part(low, when - margin, first), Part(when + gap + margin, high, second)
-        (first, second), sigmas = _offsets(a, b, sides)
+        (first, second), sigmas = _offsets(a, b, sides, within)
         when, gap = _moment(*raw, first, second, when, limits)
     jump, sigma = second - first, math.hypot(*sigmas)
     i, j = answer.pair
@@ -128,12 +136,25 @@ def _readings(
     else:
         froze, lost = (j, at_b, b), (i, when)
     video, start, own = froze
-    length = whole(abs(jump), sigma, 1 / fps[video])
     stands = stood_still(own, start, abs(jump))
-    back = Break(start + length, -length, length, sigma) if stands else Break(start, -abs(jump), 0.0, sigma)
+    lasts = lasting(start, abs(jump), sigma, 1 / fps[video])
+    back = lasts if stands else Break(start, -abs(jump), 0.0, sigma)
     gone = Break(lost[1], abs(jump), 0.0, sigma)
     votes = (1.0, 0.0) if stands else (RESTING, MOVING)
     return [Suspect(video, back, votes[0]), Suspect(lost[0], gone, votes[1])]
+
+
+def lasting(start: float, length: float, sigma: float, frame: float) -> Break:
+    """A pause from ``start`` on, its length a whole number of frames where it is clear which: all in s."""
+    length = whole(length, sigma, frame)
+    return Break(start + length, -length, length, sigma)
+
+
+def counted(found: Break, frame: float) -> bool:
+    """Whether it is clear how many frames a pause has: :func:`whole` made it so many."""
+    frames = found.still / frame
+    clear = SURELY * (found.sigma / frame) ** 2 <= 1 / 2  # never of nan
+    return bool(found.still > 0 and clear and abs(frames - round(frames)) < ROUNDING)
 
 
 def whole(length: float, sigma: float, frame: float) -> float:
@@ -147,13 +168,15 @@ def whole(length: float, sigma: float, frame: float) -> float:
     return length if off >= SNAP or unclear else frames * frame
 
 
-def _offsets(a: TrackSplines, b: TrackSplines, sides: tuple[Part, Part]) -> tuple[list[float], list[float]]:
+def _offsets(
+    a: TrackSplines, b: TrackSplines, sides: tuple[Part, Part], within: float = AROUND
+) -> tuple[list[float], list[float]]:
     """Offsets of two parts beside a break, and their sigmas, s; nan where a part cannot tell: its offset stays.
 
     Each by the motion within it; where that is too little, by the places of the matches in the other part.
     """
     fits = [fit_clock(a.within(p.begin, p.end), b, Clock(p.offset), WINDOW) for p in sides]
-    near = [f is not None and abs(f.clock.offset - p.offset) < AROUND for f, p in zip(fits, sides, strict=True)]
+    near = [f is not None and abs(f.clock.offset - p.offset) < within for f, p in zip(fits, sides, strict=True)]
     found = [f.clock.offset if f is not None and ok else p.offset for f, p, ok in zip(fits, sides, near, strict=True)]
     sigma = [math.sqrt(float(f.covariance[0, 0])) if f is not None else math.nan for f in fits]
     for k in (0, 1):

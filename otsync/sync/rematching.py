@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -51,33 +51,51 @@ def contested(jobs: list[Job], verdict: Verdict, map: MapLike) -> dict[Pair, Ans
     doubt stays. So do all doubts that the winner's own matches raise.
     """
     answers = {a.pair: a for a in verdict.answers}
-    asked = [job for job in jobs if _asks(job, answers[job.pair], verdict)]
-    tasks = [again for job in asked for again in at_each(job, answers[job.pair].scanned.hypotheses[:, 0])]
+    asked = [job for job in jobs if asks(job, answers[job.pair], verdict) and noisy(answers[job.pair])]
+    winners = {pair: winner(several) for pair, several in at_peaks(asked, answers, map).items()}
+    return {pair: best for pair, best in winners.items() if best is not None}
+
+
+def at_peaks(jobs: list[Job], answers: Mapping[Pair, Answer], map: MapLike) -> dict[Pair, list[Answer]]:
+    """The answers of pairs at each peak of their scans, by matches that are made there; without those that fail."""
+    tasks = [again for job in jobs for again in at_each(job, answers[job.pair].scanned.hypotheses[:, 0])]
     found: dict[Pair, list[Answer]] = {}
     for answer in map(run, tasks) if tasks else ():
         if answer.finite:
             found.setdefault(answer.pair, []).append(answer)
-    winners = {pair: winner(several) for pair, several in found.items()}
-    return {pair: best for pair, best in winners.items() if best is not None}
+    return found
 
 
-def _asks(job: Job, answer: Answer, verdict: Verdict) -> bool:
-    """Whether one of its videos is doubtful, and nothing speaks against the pair that better matches might not mend."""
-    flags = set(answer.refined.flags)
+def asks(job: Job, answer: Answer, verdict: Verdict) -> bool:
+    """Whether one of a pair's videos is doubtful, and several times can be tried in a common frame."""
     placed = job.a.xyz is not None and job.b.xyz is not None and job.a.frame is not None and job.a.frame == job.b.frame
     doubtful = any(verdict.flags[v] for v in job.pair)
     several = "evidence" in answer.scanned.stats and len(answer.scanned.hypotheses) > 0
-    return bool(placed and doubtful and several and flags <= NOISY)
+    return bool(placed and doubtful and several)
 
 
-def winner(several: Sequence[Answer]) -> Answer | None:
-    """The answer with the most evidence, where it is clearly ahead of all at other times; all have an offset."""
-    evidence = [a.scanned.stats.get("evidence", 0.0) * len(a.matches) for a in several]
-    best = int(np.argmax(evidence))
-    at = several[best].refined.offset
-    others = [e for a, e in zip(several, evidence, strict=True) if abs(a.refined.offset - at) > APART]
-    clear = evidence[best] * (1 - CLEARLY) >= max(others, default=0.0)
-    return several[best] if clear and evidence[best] > 0 else None
+def noisy(answer: Answer) -> bool:
+    """Whether nothing speaks against a pair that better matches might not mend."""
+    return set(answer.refined.flags) <= NOISY
+
+
+def winner(several: Sequence[Answer], explained: Sequence[float] = ()) -> Answer | None:
+    """The answer with the most evidence, where it is clearly ahead of all at other times; all have an offset.
+
+    Args:
+        explained: offsets, s, that are no rivals: parts of a clock that breaks have them.
+    """
+    total = [evidence_of(a) for a in several]
+    best = int(np.argmax(total))
+    known = (several[best].refined.offset, *explained)
+    others = [e for a, e in zip(several, total, strict=True) if all(abs(a.refined.offset - at) > APART for at in known)]
+    clear = total[best] * (1 - CLEARLY) >= max(others, default=0.0)
+    return several[best] if clear and total[best] > 0 else None
+
+
+def evidence_of(answer: Answer) -> float:
+    """Nats of all matches together."""
+    return answer.scanned.stats.get("evidence", 0.0) * len(answer.matches)
 
 
 def at_each(job: Job, times: Iterable[float]) -> list[Job]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Literal
 
 import numpy as np
@@ -20,22 +20,19 @@ from ..frames import OwnFrames
 from ..match.slot import Matcher, MatcherLike
 from ..refine.slot import Rate, Refiner, RefinerLike
 from ..refine.splines import SplineRefine
-from ..types import Alignment, Break, Clock, Matches, Offsets, Status, TrackSet, in_order
+from ..types import Alignment, Break, Matches, Offsets, Status, TrackSet
 from ..types.checks import check_whole
-from .breaks import MOST, Seen, Suspect, culprit, mended, remeasured, runs_on, suspects
+from .breaks import Seen, counted
 from .graph import Graph, Pair
 from .lags import Lag, lag_of, lagging, with_lags
+from .mending import ByMotion, doubted, mend_by_windows, mend_clocks
 from .method import Method
 from .own_frames import Frames, refuse_common, solver_from, synchronize_own
 from .pairs import Job, Refit, run, run_refit, with_rate
 from .parts import broken_part, unvouched
-from .places import parts_by_place
 from .rematching import contested, rematching
-from .verdict import NOTHING_COMMON, Answer, Verdict, judge
+from .verdict import Answer, Verdict, judge
 from .witnesses import elsewhere, left_over, once_more, parted
-
-MEASURED, SETTLED = 3, 0.02 / 30
-"""How often a jump is measured anew, at most, and seconds by which it may still change."""
 
 
 def synchronize(
@@ -120,13 +117,16 @@ def synchronize(
 
     with blas_for(max(len(t) for t in tracks)):
         verdict = judged(list(map(run, jobs)))
-        jobs, verdict, broken = mend_clocks(jobs, verdict, tracks, judged, map)
+        broken: dict[int, tuple[Break, ...]] = {}
+        jobs, verdict = mend_clocks(jobs, verdict, tracks, judged, map, ByMotion(), broken)
+        timed: set[Pair] = set()
         if times and matches is None:
+            jobs, verdict, timed = mend_by_windows(jobs, verdict, tracks, judged, map, broken)
             settled = contested(jobs, verdict, map)
             if settled:
                 verdict = judged([settled.get(a.pair, a) for a in verdict.answers])
         for _ in range(times if matches is None else 0):
-            again = rematching(jobs, verdict)
+            again = [job for job in rematching(jobs, verdict) if job.pair not in timed]
             if not again:
                 break
             fresh = {answer.pair: answer for answer in map(run, again)}
@@ -135,7 +135,7 @@ def synchronize(
             sound = {a.pair: a.matches for a in verdict.answers if a.sound}
             breaking = set(unsteady(aligning, tracks, sound, verdict.x))
             if breaking:
-                verdict = judged([_doubted(a) if breaking & set(a.pair) else a for a in verdict.answers])
+                verdict = judged([doubted(a) if breaking & set(a.pair) else a for a in verdict.answers])
         else:
             verdict = with_parts_checked(verdict, tracks, judged)
             verdict = with_witnesses_heard(
@@ -161,7 +161,7 @@ def with_parts_checked(
     if not broken:
         return verdict
     unsure = unvouched(broken, verdict.answers, tracks)
-    return judged([_doubted(a) if a.pair in unsure else a for a in verdict.answers])
+    return judged([doubted(a) if a.pair in unsure else a for a in verdict.answers])
 
 
 def with_witnesses_heard(
@@ -196,164 +196,7 @@ def _still_broken(fresh: Answer, first: Answer) -> Answer:
     """Matches that were made at one offset agree with it: they do not lift the doubt whether there is only one."""
     if Status.BROKEN_CLOCK not in first.refined.flags:
         return fresh
-    return _doubted(fresh)
-
-
-def mend_clocks(
-    jobs: list[Job],
-    verdict: Verdict,
-    tracks: list[TrackSet],
-    judged: Callable[[Sequence[Answer]], Verdict],
-    map: MapLike,
-) -> tuple[list[Job], Verdict, dict[int, tuple[Break, ...]]]:
-    """Videos whose clocks break are put on the clock that they had before, one break after the other.
-
-    ``tracks`` is changed in place. A mend is kept where it adds to the evidence of the video's pairs.
-    """
-    broken: dict[int, tuple[Break, ...]] = {}
-    doubtful_mends: set[int] = set()
-    fps = [nominal_fps(t) for t in tracks]
-    for _ in range(MOST):
-        verdict = dataclasses.replace(verdict, answers=tuple(_with_parts(a, tracks) for a in verdict.answers))
-        doubtful = [a for a in verdict.answers if len(a.scanned.parts) and not NOTHING_COMMON & set(a.scanned.flags)]
-        named = [s for a in doubtful for s in suspects(a, tracks[a.pair[0]], tracks[a.pair[1]], fps)]
-        one = culprit(named, _seen(verdict, tracks))
-        if one is None:
-            break
-        v = one.video
-        tried = with_break(jobs, tracks, v, one.found, verdict, map)
-        if tried is None:
-            break
-        jobs, tracks[v], fresh, exact = tried
-        earlier = broken.get(v, ())
-        broken[v] = (*earlier, _on_own_clock(exact, earlier))
-        verdict = judged([fresh.get(a.pair, a) for a in verdict.answers])
-        if not steady_beside(fresh, tracks, v, exact):
-            doubtful_mends.add(v)
-    # a clock that is whole again is so against every video: one pair that still breaks speaks against the mend
-    still = {v for a in verdict.answers if Status.BROKEN_CLOCK in a.refined.flags for v in a.pair}
-    doubtful_mends |= still & set(broken)
-    doubtful_mends |= {s.video for s in suspected(verdict, tracks, fps)}
-    if doubtful_mends:
-        verdict = judged([_doubted(a) if doubtful_mends & set(a.pair) else a for a in verdict.answers])
-    return jobs, verdict, broken
-
-
-def _with_parts(answer: Answer, tracks: Sequence[TrackSet]) -> Answer:
-    """The answer, with the parts that positions tell of where its clock is doubtful and motion tells of none."""
-    first, second = (tracks[v] for v in answer.pair)
-    if len(answer.scanned.parts) or Status.BROKEN_CLOCK not in answer.refined.flags or not answer.finite:
-        return answer
-    if first.xyz is None or second.xyz is None:
-        return answer
-    parts = parts_by_place(answer, first, second)
-    return dataclasses.replace(answer, scanned=dataclasses.replace(answer.scanned, parts=parts))
-
-
-def _seen(verdict: Verdict, tracks: Sequence[TrackSet]) -> list[Seen]:
-    """What the pairs without any doubt see of their videos."""
-    sound = [a for a in verdict.answers if a.refined.status.ok and a.finite]
-    return [seen for a in sound for seen in Seen.by(a, tracks[a.pair[0]], tracks[a.pair[1]])]
-
-
-def suspected(verdict: Verdict, tracks: Sequence[TrackSet], fps: Sequence[float]) -> list[Suspect]:
-    """Breaks that were not mended, and that no pair which sees both sides of them speaks against.
-
-    A pair that is ambiguous accuses nobody: what suits a part of it at another time may be motion that comes again.
-    """
-    doubtful = [
-        a
-        for a in verdict.answers
-        if len(a.scanned.parts)
-        and Status.BROKEN_CLOCK in a.refined.flags
-        and not {*NOTHING_COMMON, Status.AMBIGUOUS} & set(a.refined.flags)
-    ]
-    sound = _seen(verdict, tracks)
-    named = [s for a in doubtful for s in suspects(a, tracks[a.pair[0]], tracks[a.pair[1]], fps)]
-    return [s for s in named if not any(seen.across(s) for seen in sound)]
-
-
-def _doubted(answer: Answer) -> Answer:
-    """The answer with the flag of a clock that breaks otherwise than it was mended."""
-    refined = answer.refined
-    return dataclasses.replace(
-        answer, refined=dataclasses.replace(refined, flags=in_order((*refined.flags, Status.BROKEN_CLOCK)))
-    )
-
-
-def steady_beside(fresh: Mapping[Pair, Answer], tracks: Sequence[TrackSet], v: int, found: Break) -> bool:
-    """Whether most pairs of video v agree that its mended clock runs evenly up to the break and from it on."""
-    told = []
-    for (i, j), answer in fresh.items():
-        if not np.isfinite(answer.refined.offset) or not answer.sound:
-            continue
-        shown = found.at + found.jump
-        moments = (shown if found.still > 0 else found.at), shown
-        clock = Clock(answer.refined.offset, answer.refined.rate)
-        before, behind = moments if v == i else (clock.world(m) for m in moments)
-        told.append(runs_on(answer, tracks[i], tracks[j], before, behind))
-    return 2 * sum(told) >= len(told)
-
-
-def with_break(
-    jobs: list[Job], tracks: Sequence[TrackSet], v: int, found: Break, verdict: Verdict, map: MapLike
-) -> tuple[list[Job], TrackSet, dict[Pair, Answer], Break] | None:
-    """The pairs of video v done anew with its clock mended, and again while what is left of the jump is measured.
-
-    None where that adds nothing to the evidence, or where the clock still breaks in as many pairs. That is asked of
-    the last jump alone: the first one, measured by matches of two offsets, may be a frame off.
-    """
-    own = [a for a in verdict.answers if v in a.pair]
-    before, doubts = _evidence(own), _broken(own)
-    best = None
-    for _ in range(MEASURED):
-        better = mended(tracks[v], (found,))
-        sets = [better if k == v else t for k, t in enumerate(tracks)]
-        again = [dataclasses.replace(j, a=sets[j.pair[0]], b=sets[j.pair[1]]) for j in jobs]
-        fresh = {a.pair: a for a in map(run, [j for j in again if v in j.pair])}
-        if _evidence(fresh.values()) <= before:
-            break
-        if _broken(fresh.values()) < doubts:
-            best = again, better, fresh, found
-        left = remeasured_jump(fresh, sets, v, found)
-        if left is None or found.still > 0:  # a freeze lasts whole frames
-            break
-        if best is not None and abs(left.jump - found.jump) < SETTLED:
-            break
-        found = left
-    return best
-
-
-def remeasured_jump(fresh: Mapping[Pair, Answer], tracks: Sequence[TrackSet], v: int, found: Break) -> Break | None:
-    """The break with what all pairs say is left of its jump; None where none can."""
-    told, sigmas = [], []
-    for (i, j), answer in fresh.items():
-        if not np.isfinite(answer.refined.offset) or not answer.sound:
-            continue
-        clock = Clock(answer.refined.offset, answer.refined.rate)
-        shown = found.at + found.jump
-        left, sigma = remeasured(answer, tracks[i], tracks[j], shown if v == i else clock.world(shown))
-        if np.isfinite(sigma):
-            told.append(left if v == j else -left)
-            sigmas.append(sigma)
-    if not told:
-        return None
-    sigma = float(np.median(sigmas)) / np.sqrt(len(sigmas))
-    return dataclasses.replace(found, jump=found.jump + float(np.median(told)), sigma=sigma)
-
-
-def _evidence(answers: Iterable[Answer]) -> float:
-    return sum(a.scanned.stats.get("evidence", 0.0) for a in answers)
-
-
-def _broken(answers: Iterable[Answer]) -> int:
-    return sum(Status.BROKEN_CLOCK in a.refined.flags for a in answers)
-
-
-def _on_own_clock(found: Break, earlier: Sequence[Break]) -> Break:
-    """A break that was found on a mended clock, told in the video's own time."""
-    late = sum(b.jump for b in earlier if b.at + b.jump <= found.at)
-    return dataclasses.replace(found, at=found.at - late)
+    return doubted(fresh)
 
 
 def _without_common_frame(
@@ -388,20 +231,17 @@ def _without_common_frame(
     return dataclasses.replace(found, transforms=transforms)
 
 
-COUNTED = 0.25
-"""Frames, one sigma, below which the length of a pause tells how many frames it has."""
-
 UNMEASURED = 2.0
 """Frames, one sigma, of a jump whose parts leave too little to measure it by: seed 35015 was 1.8 frames off, and ok."""
 
 
 def jump_sigma(found: Break, frame: float) -> float:
-    """One sigma, s, of how far a clock jumps: a pause lasts whole frames, where it is measured well enough to tell how
-    many; a jump that could not be measured is known to a few frames at best.
+    """One sigma, s, of how far a clock jumps: none of a pause of which it is clear how many frames it has; a jump that
+    could not be measured is known to a few frames at best.
     """
-    if not np.isfinite(found.sigma):
-        return UNMEASURED * frame
-    return 0.0 if found.still > 0 and found.sigma < COUNTED * frame else found.sigma
+    if counted(found, frame):
+        return 0.0
+    return found.sigma if np.isfinite(found.sigma) else UNMEASURED * frame
 
 
 def to_offsets(

@@ -20,6 +20,7 @@ EPIPOLAR = ("tests/otsync/epipolar",)
 PARTS = ("tests/otsync/sync/test_parts.py",)
 COMMON = ("tests/otsync/refine/test_common_motion.py",)
 PLACES = ("tests/otsync/sync/test_places.py",)
+WINDOWS = ("tests/otsync/sync/test_windows.py",)
 LAGS = ("tests/otsync/sync/test_lags.py",)
 SECONDS = ("tests/otsync/refine/test_seconds.py",)
 TIMING = ("tests/otsync/simulate/test_timing.py",)
@@ -346,18 +347,58 @@ BREAKS = (
     Break(
         "parts-jump-exact",
         "otsync/sync/verb.py",
-        "return UNMEASURED * frame",
-        "return 0.0",
-        PARTS,
+        "np.isfinite(found.sigma) else UNMEASURED * frame",
+        "np.isfinite(found.sigma) else 0.0",
+        ("tests/otsync/sync/test_breaks.py",),
         "a jump that could not be measured counts as exact",
     ),
     Break(
         "breaks-pause-always-counted",
-        "otsync/sync/verb.py",
-        "found.still > 0 and found.sigma < COUNTED * frame",
-        "found.still > 0",
+        "otsync/sync/breaks.py",
+        "return bool(found.still > 0 and clear and",
+        "return bool(found.still > 0 and",
         ("tests/otsync/sync/test_breaks.py",),
         "the length of a pause is exact, however badly it is measured",
+    ),
+    Break(
+        "windows-gap-asked",
+        "otsync/sync/windows.py",
+        "(near - near[:, [middle]]) * self.whole[:, None]",
+        "near - near[:, [middle]]",
+        WINDOWS,
+        "what lies in the gap of a mended clock breaks it again",
+    ),
+    Break(
+        "windows-steady-without-support",
+        "otsync/sync/windows.py",
+        "supported = usual > 0 and self.whole.any() and here[self.whole].min() >= SUPPORTED * usual",
+        "supported = True",
+        WINDOWS,
+        "windows in which nothing moves say that a clock runs evenly",
+    ),
+    Break(
+        "windows-parts-exchanged",
+        "otsync/sync/windows.py",
+        "own if split.behind else own[::-1]",
+        "own[::-1] if split.behind else own",
+        WINDOWS,
+        "the offset of one part is given to the other",
+    ),
+    Break(
+        "mend-freed-though-fast",
+        "otsync/sync/mending.py",
+        "for pair, readings in told.items() if _even(readings[0], tracks, broken)",
+        "for pair, readings in told.items()",
+        WINDOWS,
+        "a change of speed that was taken for lost frames is trusted",
+    ),
+    Break(
+        "mend-first-reading-only",
+        "otsync/sync/mending.py",
+        "if len(self.told.get(pair, ())) > 1:",
+        "if False:",
+        WINDOWS,
+        "of several readings of a break only the first is tried",
     ),
     # --- costs ------------------------------------------------------------------------------------------------------
     Break(

@@ -100,10 +100,14 @@ def test_where_another_offset_cannot_be_seen_positions_that_do_not_agree_tell():
     ],
 )
 def test_an_answer_that_a_part_of_the_clip_does_not_share_is_not_trusted(name, seed):
-    """Trusted before, 10 and 150 frames wrong, and with no true answer: half a second and more agrees with nothing."""
+    """Trusted before, 10 and 150 frames wrong, and with no true answer: half a second and more agrees with nothing.
+
+    Where the break is found and mended instead, so is the answer.
+    """
     world = CLASSES[name](seed)
     found = synchronize(world.tracks)
-    assert not world.errors(found)[0].max() < 1 and Status.BROKEN_CLOCK in found.flags[1]
+    mended = bool(found.breaks[1]) and world.errors(found)[0].max() < 1
+    assert mended or Status.BROKEN_CLOCK in found.flags[1]
 
 
 def test_a_part_within_the_clip_that_does_not_agree_is_named():

@@ -1,0 +1,371 @@
+"""Clocks that break, put right: the readings of all pairs are voted on, and a mend is kept where it proves itself.
+
+Two ways, one after the other. By motion: what the first matches tell. By windows: pairs whose doubts wrong matches make
+are matched at the time that wins, and each window of what they share is matched by itself.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Protocol
+
+import numpy as np
+
+from ..clocks.common import nominal_fps
+from ..compute.threads import MapLike
+from ..refine.verb import refine
+from ..types import Break, Clock, Status, TrackSet, in_order
+from .breaks import AROUND, MOST, Seen, Suspect, counted, culprit, lasting, mended, remeasured, runs_on, suspects
+from .graph import Pair
+from .pairs import Job, run, without_answered_doubt
+from .places import NONE, parts_by_place
+from .rematching import NOISY, asks, at_each, at_peaks, evidence_of, winner
+from .verdict import NOTHING_COMMON, Answer, Verdict
+from .windows import EVERY, NEAR, Split, Windows, matches_of_parts
+
+MEASURED, SETTLED = 3, 0.02 / 30
+"""How often a jump is measured anew, at most, and seconds by which it may still change."""
+
+
+class Way(Protocol):
+    """How breaks are looked for, and how pairs are answered anew.
+
+    Args:
+        within: s by which the offsets of parts may be off.
+    """
+
+    within: float
+
+    def doubtful(self, answers: Sequence[Answer], tracks: Sequence[TrackSet]) -> list[Answer]:
+        """The pairs that a clock breaks in, with their parts."""
+
+    def anew(self, jobs: Sequence[Job], map: MapLike) -> dict[Pair, Answer]:
+        """The answers of pairs whose tracks changed."""
+
+    def kept(self, fresh: Iterable[Answer]) -> None:
+        """These answers, of all that were made anew, stand."""
+
+    def refused(self, pairs: Iterable[Pair]) -> bool:
+        """A reading of these pairs was wrong: whether there is another one."""
+
+
+class ByMotion:
+    """Parts that the first matches tell of, by their motion or by their places."""
+
+    within = AROUND
+
+    def doubtful(self, answers: Sequence[Answer], tracks: Sequence[TrackSet]) -> list[Answer]:
+        told = [_with_parts(a, tracks) for a in answers]
+        return [a for a in told if len(a.scanned.parts) and not NOTHING_COMMON & set(a.scanned.flags)]
+
+    def anew(self, jobs: Sequence[Job], map: MapLike) -> dict[Pair, Answer]:
+        return {a.pair: a for a in map(run, jobs)}
+
+    def kept(self, fresh: Iterable[Answer]) -> None:
+        pass
+
+    def refused(self, pairs: Iterable[Pair]) -> bool:
+        return False
+
+
+class ByWindows:
+    """Parts that windows tell of, matched by themselves.
+
+    Args:
+        told: of every pair that is looked at so, the readings of its windows that may be right, best first.
+    """
+
+    within = NEAR * EVERY
+
+    def __init__(self, told: Mapping[Pair, list[Answer]]) -> None:
+        self.told = dict(told)
+        self.tried: list[list[Answer]] = []
+
+    def doubtful(self, answers: Sequence[Answer], tracks: Sequence[TrackSet]) -> list[Answer]:
+        return [readings[0] for readings in self.told.values() if len(readings[0].scanned.parts)]
+
+    def refused(self, pairs: Iterable[Pair]) -> bool:
+        for pair in pairs:
+            if len(self.told.get(pair, ())) > 1:
+                del self.told[pair][0]
+                return True
+        return False
+
+    def anew(self, jobs: Sequence[Job], map: MapLike) -> dict[Pair, Answer]:
+        own = [job for job in jobs if job.pair in self.told]
+        others = [job for job in jobs if job.pair not in self.told]
+        read = list(map(_at_time, [(job, self._time(job)) for job in own]))
+        self.tried += read
+        return {readings[0].pair: readings[0] for readings in read} | {a.pair: a for a in map(run, others)}
+
+    def kept(self, fresh: Iterable[Answer]) -> None:
+        stands = {id(answer) for answer in fresh}
+        self.told |= {r[0].pair: r for r in self.tried if id(r[0]) in stands}
+        self.tried = []
+
+    def _time(self, job: Job) -> float:
+        """Where a pair is matched: what is mended is on the clock that it had before it broke."""
+        answer = self.told[job.pair][0]
+        parts = answer.scanned.parts
+        return float(parts[0, 1] if len(parts) else answer.refined.offset)
+
+
+def mend_clocks(
+    jobs: list[Job],
+    verdict: Verdict,
+    tracks: list[TrackSet],
+    judged: Callable[[Sequence[Answer]], Verdict],
+    map: MapLike,
+    way: Way,
+    broken: dict[int, tuple[Break, ...]],
+) -> tuple[list[Job], Verdict]:
+    """Videos whose clocks break are put on the clock that they had before, one break after the other.
+
+    ``tracks`` and ``broken`` are changed in place. A mend is kept where it adds to the evidence of the video's pairs.
+    """
+    doubtful_mends: set[int] = set()
+    fps = [nominal_fps(t) for t in tracks]
+    mends = 0
+    while mends < MOST:
+        doubtful = {a.pair: a for a in way.doubtful(verdict.answers, tracks)}
+        verdict = dataclasses.replace(verdict, answers=tuple(doubtful.get(a.pair, a) for a in verdict.answers))
+        named = [
+            s for a in doubtful.values() for s in suspects(a, tracks[a.pair[0]], tracks[a.pair[1]], fps, way.within)
+        ]
+        one = culprit(named, _seen(verdict, tracks))
+        if one is None:
+            break
+        v = one.video
+        tried = with_break(jobs, tracks, v, one.found, verdict, way, map)
+        if tried is None:
+            if way.refused(pair for pair in doubtful if v in pair):
+                continue
+            break
+        mends += 1
+        jobs, tracks[v], fresh, exact = tried
+        way.kept(fresh.values())
+        earlier = broken.get(v, ())
+        broken[v] = (*earlier, _on_own_clock(exact, earlier))
+        verdict = judged([fresh.get(a.pair, a) for a in verdict.answers])
+        if not steady_beside(fresh, tracks, v, exact):
+            doubtful_mends.add(v)
+    # a clock that is whole again is so against every video: one pair that still breaks speaks against the mend
+    still = {v for a in verdict.answers if Status.BROKEN_CLOCK in a.refined.flags for v in a.pair}
+    doubtful_mends |= still & set(broken)
+    doubtful_mends |= {s.video for s in suspected(verdict, tracks, fps)}
+    if doubtful_mends:
+        verdict = judged([doubted(a) if doubtful_mends & set(a.pair) else a for a in verdict.answers])
+    return jobs, verdict
+
+
+def mend_by_windows(
+    jobs: list[Job],
+    verdict: Verdict,
+    tracks: list[TrackSet],
+    judged: Callable[[Sequence[Answer]], Verdict],
+    map: MapLike,
+    broken: dict[int, tuple[Break, ...]],
+) -> tuple[list[Job], Verdict, set[Pair]]:
+    """:func:`mend_clocks` by windows, of pairs whose clocks are doubtful; and those pairs that are told of so.
+
+    Of videos that were mended before, only those that run evenly beside each break by the new matches, too: one that
+    changed its speed is steady in windows.
+    """
+    answers = {a.pair: a for a in verdict.answers}
+    asked = [job for job in jobs if asks(job, answers[job.pair], verdict) and _may_break(answers[job.pair])]
+    several = at_peaks(asked, answers, map)
+    tasks = [(job, several[job.pair]) for job in asked if job.pair in several]
+    told = {readings[0].pair: readings for readings in map(_told, tasks) if readings}
+    told = {pair: readings for pair, readings in told.items() if _even(readings[0], tracks, broken)}
+    if not told:
+        return jobs, verdict, set()
+    verdict = judged([told[a.pair][0] if a.pair in told else a for a in verdict.answers])
+    jobs, verdict = mend_clocks(jobs, verdict, tracks, judged, map, ByWindows(told), broken)
+    return jobs, verdict, set(told)
+
+
+def _even(answer: Answer, tracks: Sequence[TrackSet], broken: Mapping[int, tuple[Break, ...]]) -> bool:
+    """Whether the mended clocks of a pair run evenly beside all of their breaks."""
+    for v in set(answer.pair) & broken.keys():
+        late = 0.0
+        for found in broken[v]:
+            if not steady_beside({answer.pair: answer}, tracks, v, dataclasses.replace(found, at=found.at + late)):
+                return False
+            late += found.jump
+    return True
+
+
+def _may_break(answer: Answer) -> bool:
+    """Whether a pair's clock is doubtful, and the rest of its doubts are those that wrong matches, or a break, make."""
+    flags = set(answer.refined.flags)
+    return Status.BROKEN_CLOCK in flags and flags <= NOISY | {Status.BROKEN_CLOCK, Status.RATE_MISMATCH}
+
+
+def _told(task: tuple[Job, list[Answer]]) -> list[Answer]:
+    """What windows tell of a pair, around the best of its answers: readings, best first; none where it is not clear."""
+    job, several = task
+    best = max(several, key=evidence_of)
+    windows = Windows.of(job, Clock(best.refined.offset, best.refined.rate))
+    breaks = windows.breaks()
+    explained = [best.refined.offset + split.late for split in breaks]
+    if winner(several, explained) is None or not (breaks or windows.steady):
+        return []
+    return _by(windows, best, job)
+
+
+def _at_time(task: tuple[Job, float]) -> list[Answer]:
+    """A pair matched at a time, and what windows tell then: readings, best first."""
+    job, offset = task
+    (once,) = at_each(job, (offset,))
+    answer = run(once)
+    if not answer.finite:
+        return [doubted(answer)]
+    return _by(Windows.of(job, Clock(answer.refined.offset, answer.refined.rate)), answer, job)
+
+
+def _by(windows: Windows, answer: Answer, job: Job) -> list[Answer]:
+    """The answer, freed of the scan's doubt whether its clock breaks where no window has it; else with the doubt, and
+    with the parts that they tell of, as often as there are readings.
+    """
+    if windows.steady:
+        return [freed(answer, job)]
+    return [_with_split(windows, split, answer, job) for split in windows.breaks()] or [doubted(answer)]
+
+
+def _with_split(windows: Windows, split: Split, answer: Answer, job: Job) -> Answer:
+    parts = windows.parts(split)
+    scanned = dataclasses.replace(answer.scanned, parts=parts)
+    return doubted(
+        dataclasses.replace(answer, matches=matches_of_parts(job, parts, answer.refined.rate), scanned=scanned)
+    )
+
+
+def freed(answer: Answer, job: Job) -> Answer:
+    """The answer without the scan's doubt whether its clock breaks; the fit's own stays."""
+    flags = tuple(f for f in answer.scanned.flags if f is not Status.BROKEN_CLOCK)
+    scanned = dataclasses.replace(answer.scanned, flags=flags, parts=NONE)
+    refined = refine(job.a, job.b, answer.matches, scanned, job.refiner, throw=False)
+    return dataclasses.replace(answer, scanned=scanned, refined=without_answered_doubt(refined))
+
+
+def _with_parts(answer: Answer, tracks: Sequence[TrackSet]) -> Answer:
+    """The answer, with the parts that positions tell of where its clock is doubtful and motion tells of none."""
+    first, second = (tracks[v] for v in answer.pair)
+    if len(answer.scanned.parts) or Status.BROKEN_CLOCK not in answer.refined.flags or not answer.finite:
+        return answer
+    if first.xyz is None or second.xyz is None:
+        return answer
+    parts = parts_by_place(answer, first, second)
+    return dataclasses.replace(answer, scanned=dataclasses.replace(answer.scanned, parts=parts))
+
+
+def _seen(verdict: Verdict, tracks: Sequence[TrackSet]) -> list[Seen]:
+    """What the pairs without any doubt see of their videos."""
+    sound = [a for a in verdict.answers if a.refined.status.ok and a.finite]
+    return [seen for a in sound for seen in Seen.by(a, tracks[a.pair[0]], tracks[a.pair[1]])]
+
+
+def suspected(verdict: Verdict, tracks: Sequence[TrackSet], fps: Sequence[float]) -> list[Suspect]:
+    """Breaks that were not mended, and that no pair which sees both sides of them speaks against.
+
+    A pair that is ambiguous accuses nobody: what suits a part of it at another time may be motion that comes again.
+    """
+    doubtful = [
+        a
+        for a in verdict.answers
+        if len(a.scanned.parts)
+        and Status.BROKEN_CLOCK in a.refined.flags
+        and not {*NOTHING_COMMON, Status.AMBIGUOUS} & set(a.refined.flags)
+    ]
+    sound = _seen(verdict, tracks)
+    named = [s for a in doubtful for s in suspects(a, tracks[a.pair[0]], tracks[a.pair[1]], fps)]
+    return [s for s in named if not any(seen.across(s) for seen in sound)]
+
+
+def doubted(answer: Answer) -> Answer:
+    """The answer with the flag of a clock that breaks otherwise than it was mended."""
+    refined = answer.refined
+    return dataclasses.replace(
+        answer, refined=dataclasses.replace(refined, flags=in_order((*refined.flags, Status.BROKEN_CLOCK)))
+    )
+
+
+def steady_beside(fresh: Mapping[Pair, Answer], tracks: Sequence[TrackSet], v: int, found: Break) -> bool:
+    """Whether most pairs of video v agree that its mended clock runs evenly up to the break and from it on."""
+    told = []
+    for (i, j), answer in fresh.items():
+        if not np.isfinite(answer.refined.offset) or not answer.sound:
+            continue
+        shown = found.at + found.jump
+        moments = (shown if found.still > 0 else found.at), shown
+        clock = Clock(answer.refined.offset, answer.refined.rate)
+        before, behind = moments if v == i else (clock.world(m) for m in moments)
+        told.append(runs_on(answer, tracks[i], tracks[j], before, behind))
+    return 2 * sum(told) >= len(told)
+
+
+def with_break(
+    jobs: list[Job], tracks: Sequence[TrackSet], v: int, found: Break, verdict: Verdict, way: Way, map: MapLike
+) -> tuple[list[Job], TrackSet, dict[Pair, Answer], Break] | None:
+    """The pairs of video v done anew with its clock mended, and again while what is left of the jump is measured.
+
+    None where that adds nothing to the evidence, or where the clock still breaks in as many pairs. That is asked of
+    the last jump alone: the first one, measured by matches of two offsets, may be a frame off.
+    """
+    own = [a for a in verdict.answers if v in a.pair]
+    before, doubts = _evidence(own), _broken(own)
+    best = None
+    for _ in range(MEASURED):
+        better = mended(tracks[v], (found,))
+        sets = [better if k == v else t for k, t in enumerate(tracks)]
+        again = [dataclasses.replace(j, a=sets[j.pair[0]], b=sets[j.pair[1]]) for j in jobs]
+        fresh = way.anew([j for j in again if v in j.pair], map)
+        if _evidence(fresh.values()) <= before:
+            break
+        if _broken(fresh.values()) < doubts:
+            best = again, better, fresh, found
+        frame = 1 / nominal_fps(tracks[v])
+        if counted(found, frame):
+            break
+        left = remeasured_jump(fresh, sets, v, found)
+        if left is None:
+            break
+        if left.still > 0:
+            left = lasting(found.at - found.still, -left.jump, left.sigma, frame)
+        if best is not None and abs(left.jump - found.jump) < SETTLED:
+            break
+        found = left
+    return best
+
+
+def remeasured_jump(fresh: Mapping[Pair, Answer], tracks: Sequence[TrackSet], v: int, found: Break) -> Break | None:
+    """The break with what all pairs say is left of its jump; None where none can."""
+    told, sigmas = [], []
+    for (i, j), answer in fresh.items():
+        if not np.isfinite(answer.refined.offset) or not answer.sound:
+            continue
+        clock = Clock(answer.refined.offset, answer.refined.rate)
+        shown = found.at + found.jump
+        left, sigma = remeasured(answer, tracks[i], tracks[j], shown if v == i else clock.world(shown))
+        if np.isfinite(sigma):
+            told.append(left if v == j else -left)
+            sigmas.append(sigma)
+    if not told:
+        return None
+    sigma = float(np.median(sigmas)) / np.sqrt(len(sigmas))
+    return dataclasses.replace(found, jump=found.jump + float(np.median(told)), sigma=sigma)
+
+
+def _evidence(answers: Iterable[Answer]) -> float:
+    return sum(a.scanned.stats.get("evidence", 0.0) for a in answers)
+
+
+def _broken(answers: Iterable[Answer]) -> int:
+    return sum(Status.BROKEN_CLOCK in a.refined.flags for a in answers)
+
+
+def _on_own_clock(found: Break, earlier: Sequence[Break]) -> Break:
+    """A break that was found on a mended clock, told in the video's own time."""
+    late = sum(b.jump for b in earlier if b.at + b.jump <= found.at)
+    return dataclasses.replace(found, at=found.at - late)

@@ -1,0 +1,248 @@
+"""Every window of an overlap, matched by itself at every offset around an answer.
+
+Matches that are made without any time are half wrong where tracks are noisy, and the right ones are too few to tell of
+single windows. Matches that were made at one time agree with it, wherever they are read. Here nothing favours an
+offset: each window gets matches of its own at each of them, and the evidence of these. So a part of the overlap that
+has an offset of its own stands out under noise that hides it from everything else; and where every window says the
+answer's offset, its clock does not break there.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ..align.likelihood import evidence
+from ..clocks.common import CommonClock, nominal_fps
+from ..clocks.splines import sampled
+from ..costs.linear import Cosine
+from ..match.synchronous import SynchronousMatching, apart, joined, longest_seen, mutual, placed, rms_extent
+from ..match.verb import match
+from ..types import Clock, Matches, TrackSet
+from .pairs import Job
+from .rematching import at_known_times
+
+LENGTH, STEP = 24 / 30, 12 / 30
+"""Seconds of a window, and from one to the next."""
+
+MOST = 60
+"""Windows, at most: of longer overlaps they lie further apart."""
+
+EVERY, REACH = 3 / 30, 45 / 30
+"""Seconds between offsets, and from the answer's to the furthest."""
+
+MOMENTS = 12
+"""Of a window, that tracks are compared at."""
+
+TRACKS = 300
+"""Of each video, that take part: those that are seen longest."""
+
+FEWEST = 3
+"""Matches of a window, at least."""
+
+NEAR = 1
+"""Steps of :data:`EVERY` beside an offset that are the same one still."""
+
+BREAKS = 0.14
+"""What the windows on one side must gain by another offset, as a share of what a window usually has: a break. In worlds
+with one that was not mended (15 frames frozen, ten lost; mid to brutal; seeds 41000-41015, 53000-53019) it is .24 at
+least, .3 in 53 of 56. In 40 right answers of hard and brutal noise it is .12 at most, but for two that are known badly
+(.32, .55), and 0 in 60 of less noise."""
+
+RIVAL, TRIED = 0.5, 4
+"""Share of the best gain from which another offset is tried as well, and offsets that are tried, at most."""
+
+STEADY, SUPPORTED = 0.1, 0.3
+"""Up to which gain a clock does not break, where every window has at least this share of what one usually has."""
+
+WHOLE = 0.9
+"""Share of a window's moments that both videos must have frames of, for it to be asked so: a mended clock has gaps."""
+
+
+@dataclass(frozen=True)
+class Split:
+    """One part of an overlap, from its begin or up to its end, that another offset suits better.
+
+    Args:
+        at: s of a's clock. late: s by which the offset is larger there. behind: whether it is the later part.
+        gain: in units of what a window usually has.
+    """
+
+    at: float
+    late: float
+    behind: bool
+    gain: float
+
+
+@dataclass(frozen=True, eq=False)
+class Windows:
+    """What each window says.
+
+    Args:
+        clock: the answer that they are around. begin: (W,) s of a's clock. late: (O,) s beside the answer's offset.
+        evidence: (W,O) nats, of all matches that are made in a window at an offset together; none below 0.
+        whole: (W,) whether both videos have frames of all of it at the answer's offset.
+    """
+
+    clock: Clock
+    begin: Float[np.ndarray, " W"]
+    late: Float[np.ndarray, " O"]
+    evidence: Float[np.ndarray, "W O"]
+    whole: Bool[np.ndarray, " W"]
+
+    @classmethod
+    def of(cls, job: Job, clock: Clock) -> Windows:
+        """Of a pair whose tracks have positions."""
+        a, b = (t.take(longest_seen(t, TRACKS)) for t in (job.a, job.b))
+        assert a.xyz is not None and b.xyz is not None
+        fps = min(nominal_fps(a), nominal_fps(b))
+        length, every = round(LENGTH * fps), max(1, round(EVERY * fps))
+        around = round(REACH * fps / every)
+        late = np.arange(-around, around + 1) * every
+        ends = [clock.world(float(t)) for t in b.times[[0, -1]]]
+        start = max(float(a.times[0]), ends[0])
+        frames = int((min(float(a.times[-1]), ends[1]) - start) * fps + 1e-6) + 1
+        if frames < length:
+            return cls(clock, np.zeros(0), late / fps, np.zeros((0, len(late))), np.zeros(0, bool))
+        count = min(MOST, -(-(frames - length) // max(1, round(STEP * fps))) + 1)
+        first = np.round(np.linspace(0, frames - length, count)).astype(int)
+        beside = around * every
+        grid = start + np.arange(-beside, frames + beside) / fps
+        at_a, at_b = sampled(a.times, a.xyz, a.seen, grid), sampled(b.times, b.xyz, b.seen, clock.own(grid))
+        costs = (Cosine(),) if job.matcher is None else job.matcher.costs
+        unlike = SynchronousMatching(clock.offset, clock.rate, costs).unlike(a, b)
+        extent = 0.5 * (rms_extent(at_a) + rms_extent(at_b))
+        found = np.zeros((count, len(late)))
+        if extent > 0:
+            look = _Look(at_a, at_b, unlike, extent, placed(a, b), fps)
+            for w, k in enumerate(first + beside):
+                found[w] = [look.evidence(k, k - frames_late, length) for frames_late in late]
+        there = _has_frames(a.times, grid) & _has_frames(b.times, clock.own(grid))
+        whole = np.array([there[k : k + length].mean() >= WHOLE for k in first + beside])
+        return cls(clock, start + first / fps, late / fps, np.maximum(found, 0.0), whole)
+
+    @property
+    def usual(self) -> float:
+        """What a window has at the answer's offset, the median of all."""
+        here = self._near()[:, len(self.late) // 2]
+        return float(np.median(here)) if len(here) else 0.0
+
+    @property
+    def steady(self) -> bool:
+        """Whether every window says the answer's offset."""
+        here, usual = self._near()[:, len(self.late) // 2], self.usual
+        split = self.split()
+        supported = usual > 0 and self.whole.any() and here[self.whole].min() >= SUPPORTED * usual
+        return bool(supported and (split is None or split.gain <= STEADY))
+
+    def split(self) -> Split | None:
+        """The part that gains most by an offset of its own; None where none gains anything."""
+        return max(self._splits(), key=lambda split: split.gain, default=None)
+
+    def breaks(self) -> list[Split]:
+        """The parts that gain enough for a break, each by an offset that suits it better than those beside it, best
+        first. Motion that nearly repeats leaves several; the right one is that after which the clock is whole.
+        """
+        found = self._splits()
+        gain = np.array([0.0, *(split.gain for split in found), 0.0])
+        peaks = [s for k, s in enumerate(found, 1) if gain[k] >= max(gain[k - 1], gain[k + 1])]
+        least = max(BREAKS, RIVAL * float(gain.max()))
+        return sorted((s for s in peaks if s.gain > least), key=lambda split: -split.gain)[:TRIED]
+
+    def _splits(self) -> list[Split]:
+        """Of every other offset the part that gains most by it."""
+        near = self._near()
+        if len(near) < 2 or not self.usual > 0:
+            return []
+        middle = len(self.late) // 2
+        gains = (near - near[:, [middle]]) * self.whole[:, None]  # what lies in a gap is seen at other offsets only
+        centre = self.begin + LENGTH / 2
+        cuts = (centre[1:] + centre[:-1]) / 2
+        found = []
+        for k in np.flatnonzero(np.abs(np.arange(len(self.late)) - middle) > 2 * NEAR):
+            # a part is never all of the overlap: then the answer were another one
+            early = np.cumsum(gains[:, k])[:-1]
+            both = np.stack([early, gains[:, k].sum() - early])
+            behind, at = np.unravel_index(int(np.argmax(both)), both.shape)
+            part = slice(int(at) + 1, None) if behind else slice(0, int(at) + 1)
+            gain = float(both[behind, at]) / self.usual
+            if gain > 0:
+                found.append(Split(float(cuts[at]), self._peak(int(k), part), bool(behind), gain))
+        return found
+
+    def _peak(self, k: int, part: slice) -> float:
+        """The offset near the k-th that suits a part best, s beside the answer's."""
+        near = slice(max(0, k - NEAR), k + NEAR + 1)
+        return float(self.late[near][int(np.argmax(self.evidence[part, near].sum(0)))])
+
+    def _near(self) -> Float[np.ndarray, "W O"]:
+        """The most that a window has at an offset or within :data:`NEAR` of it."""
+        wide = np.pad(self.evidence, ((0, 0), (NEAR, NEAR)))
+        shifted = [wide[:, k : k + len(self.late)] for k in range(2 * NEAR + 1)]
+        return np.maximum.reduce(shifted)
+
+    def parts(self, split: Split) -> Float[np.ndarray, "2 2"]:
+        """Rows (seconds of a's clock from which on, offset in seconds) as :attr:`Alignment.parts` has them."""
+        own = self.clock.offset, self.clock.offset + split.late
+        first, second = own if split.behind else own[::-1]
+        return np.array([[self.begin[0], first], [split.at, second]])
+
+
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """Tracks of both videos on one grid of moments.
+
+    Args:
+        a, b: (N,G,3). unlike: of their features, in units of costs. extent: of the scene.
+        both: whether places count. fps: of the grid.
+    """
+
+    a: Float[np.ndarray, "Na G 3"]
+    b: Float[np.ndarray, "Nb G 3"]
+    unlike: Float[np.ndarray, "Na Nb"] | float
+    extent: float
+    both: bool
+    fps: float
+
+    def evidence(self, at_a: int, at_b: int, length: int) -> float:
+        """Nats of the matches that are made where a's frames from ``at_a`` on show what b's from ``at_b`` on do."""
+        if at_b < 0 or at_b + length > self.b.shape[1]:
+            return 0.0
+        a, b = self.a[:, at_a : at_a + length], self.b[:, at_b : at_b + length]
+        some = np.unique(np.linspace(0, length - 1, MOMENTS).round().astype(int))
+        cost = joined(self.unlike, *apart(a[:, some], b[:, some], self.extent), self.both)
+        i, j = mutual(cost)
+        if len(i) < FEWEST:
+            return 0.0
+        found = evidence(CommonClock(a[i], b[j], self.fps, 0.0), np.zeros(1, int)).total[0]
+        return float(found) * len(i) if np.isfinite(found) else 0.0
+
+
+def _has_frames(times: Float[np.ndarray, " T"], t: Float[np.ndarray, " G"]) -> Bool[np.ndarray, " G"]:
+    """Which moments a video has a frame of, within a usual frame's length."""
+    usual = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+    k = np.clip(np.searchsorted(times, t), 1, max(len(times) - 1, 1))
+    nearest = np.minimum(np.abs(times[np.minimum(k, len(times) - 1)] - t), np.abs(times[k - 1] - t))
+    return nearest <= usual
+
+
+def matches_of_parts(job: Job, parts: Float[np.ndarray, "P 2"], rate: float) -> Matches:
+    """Matches that are made in every part at its own offset: of both videos' frames there, put together."""
+    ends = [*parts[1:, 0], np.inf]
+    found = [
+        match(_within(job.a, begin, end), job.b, at_known_times(job.matcher, Clock(float(offset), rate)), throw=False)
+        for (begin, offset), end in zip(parts, ends, strict=True)
+    ]
+    together = np.concatenate([m.pairs for m in found])
+    score = np.concatenate([m.score for m in found if m.score is not None])
+    pairs, kept = np.unique(together, axis=0, return_index=True)
+    return Matches(pairs, score[kept])
+
+
+def _within(tracks: TrackSet, begin: float, end: float) -> TrackSet:
+    """The tracks, seen only from ``begin`` to ``end`` s of their clock."""
+    inside = (tracks.times >= begin) & (tracks.times < end)
+    return dataclasses.replace(tracks, visible=tracks.seen & inside)
