@@ -5,18 +5,20 @@ Needs a rig that is synchronised, or aligned already: the hull intersects masks 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ..compute.threads import MapLike
 from ..files.cache import Cache
 from ..files.digest import content_key
 from ..geometry import common_target
 from ..types import Camera, Video
+from ..types.checks import check_whole
 from .working import WorkingFrames
 
 WIDE = 1.0
@@ -103,6 +105,9 @@ class HullStereo:
             are compared, nearest by angle. misses: masks that may lack a voxel which their image contains.
         spread: distance of the eight sub-points around a point whose correlations are added. least: correlation
             below which a depth is not believed.
+        every: of so many moments one is measured; tracks between two that are have the mean of these, where both know
+            it. Dense maps are always measured.
+        chunk: moments whose depth is kept together.
     """
 
     voxel: float = 0.02
@@ -114,7 +119,12 @@ class HullStereo:
     misses: int = 1
     spread: int = 3
     least: float = 0.2
+    every: int = 1
     chunk: int = 25
+
+    def __post_init__(self) -> None:
+        check_whole("HullStereo.every", self.every, 1)
+        check_whole("HullStereo.chunk", self.chunk, 1)
 
     def __call__(
         self,
@@ -127,23 +137,30 @@ class HullStereo:
         """Depth along z of every track point (undistorted camera pixels, nan unseen), in world units, 0 unknown."""
         cache = cache or Cache()
         space = Space.of(self, rig)
-        starts = range(0, len(rig.index), self.chunk)
+        wanted = np.arange(0, len(rig.index), self.every)
+        chunks = [wanted[k : k + self.chunk] for k in range(0, len(wanted), self.chunk)]
         # without a key of the pixels nothing may be kept: the tracks alone do not say which images they came from
         store = cache if key else Cache()
         key = (*key, self, content_key(rig.index, *uv))
 
-        def part(first: int) -> dict[str, np.ndarray]:
-            return store.arrays("stereo", (*key, first), lambda: self._chunk(rig, space, uv, first))
+        def part(moments: Int[np.ndarray, " C"]) -> dict[str, np.ndarray]:
+            return store.arrays("stereo", (*key, int(moments[0])), lambda: self._chunk(rig, space, uv, moments))
 
         depth = [np.zeros(x.shape[:2], np.float32) for x in uv]
-        for arrays in map(part, starts):
+        known = [np.zeros(x.shape[1], bool) for x in uv]
+        for arrays in map(part, chunks):
             for v, out in enumerate(depth):
                 frames = arrays[f"frames{v}"]
                 out[:, frames] = arrays[f"depth{v}"]
+                known[v][frames] = True
+        if self.every > 1:
+            for x, z, k in zip(uv, depth, known, strict=True):
+                fill_between(z, np.isfinite(x[..., 0]), k, self.every)
         return depth
 
-    def _chunk(self, rig: Rig, space: Space, uv: Sequence[np.ndarray], first: int) -> dict[str, np.ndarray]:
-        moments = range(first, min(first + self.chunk, len(rig.index)))
+    def _chunk(
+        self, rig: Rig, space: Space, uv: Sequence[np.ndarray], moments: Int[np.ndarray, " C"]
+    ) -> dict[str, np.ndarray]:
         used = [[int(k) for s in moments if (k := rig.index[s, v]) >= 0] for v in range(len(uv))]
         out = {f"frames{v}": np.array(used[v], int) for v in range(len(uv))}
         out |= {f"depth{v}": np.zeros((len(uv[v]), len(used[v])), np.float32) for v in range(len(uv))}
@@ -227,6 +244,25 @@ class HullStereo:
         unit = space.unit
         depth, quality = choose_depth(scores, start, self.sweep[0] * unit, self.step * unit, 0.05 * unit, 0.6 / unit)
         return np.where(quality > self.least, depth, 0.0).astype(np.float32)
+
+
+def fill_between(
+    depth: Float[np.ndarray, "N T"], seen: Bool[np.ndarray, "N T"], measured: Bool[np.ndarray, " T"], reach: int
+) -> None:
+    """Give the frames that were not measured the depth between those that were, in place; 0 where one is unknown.
+
+    Args:
+        seen: where tracks are: depth is given nowhere else. reach: frames from one measured frame to the next, at most.
+    """
+    at = np.flatnonzero(measured)
+    for before, behind in itertools.pairwise(at):
+        if not 1 < behind - before <= reach:
+            continue
+        first, last = depth[:, before], depth[:, behind]
+        both = (first > 0) & (last > 0)
+        for k in range(before + 1, behind):
+            share = (k - before) / (behind - before)
+            depth[:, k] = np.where(both & seen[:, k], (1 - share) * first + share * last, 0.0)
 
 
 @dataclass(frozen=True, eq=False)

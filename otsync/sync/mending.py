@@ -188,11 +188,10 @@ def mend_by_windows(
 def _even(answer: Answer, tracks: Sequence[TrackSet], broken: Mapping[int, tuple[Break, ...]]) -> bool:
     """Whether the mended clocks of a pair run evenly beside all of their breaks."""
     for v in set(answer.pair) & broken.keys():
-        late = 0.0
         for found in broken[v]:
+            late = sum(b.jump for b in broken[v] if b.at < found.at)
             if not steady_beside({answer.pair: answer}, tracks, v, dataclasses.replace(found, at=found.at + late)):
                 return False
-            late += found.jump
     return True
 
 

@@ -20,7 +20,7 @@ from otsync.files.digest import content_key
 from otsync.io import Scene
 from otsync.priors.masks import MedianBackground
 from otsync.priors.slots import cache_key
-from otsync.priors.stereo import EmptyHull
+from otsync.priors.stereo import EmptyHull, HullStereo, TrackDepth
 from otsync.progress import Deadline, Progress
 from otsync.recordings.stages import Stages
 from otsync.types import Offsets, TrackSet, Video
@@ -38,6 +38,10 @@ from recon.scene.gaussians4d import Gaussians4D, scene_arrays, scene_from_arrays
 MANY: dict[str, Any] = {"count": 700, "min_life": 10, "apart": 4.0, "enough": 0}
 """Tracks for a scaffold: more and shorter ones than synchronisation asks for, since every limb must have some."""
 
+
+EVERY = 2
+"""Of so many moments stereo measures one for them: positions are smoothed over about three frames anyway. Half of what
+depth of all moments takes."""
 
 STAGES = Stages()
 """What tracks and masks are made by, where nothing else is asked for."""
@@ -61,6 +65,11 @@ def with_estimated(scene: Scene, stages: Stages, cache: Any, map: MapLike, progr
     return found.scene
 
 
+def sparse(stereo: TrackDepth) -> TrackDepth:
+    """The slot's stereo at one moment of :data:`EVERY`, where it knows how and was not told another number."""
+    return replace(stereo, every=EVERY) if isinstance(stereo, HullStereo) and stereo.every == 1 else stereo
+
+
 def lifted_tracks(
     scene: Scene, offsets: Offsets, cache: Any, map: MapLike, progress: Progress, stages: Stages = STAGES
 ) -> tuple[TrackSet, ...]:
@@ -71,7 +80,7 @@ def lifted_tracks(
     from otsync.recordings import routes as recordings
     from otsync.recordings.tracking import Selection
 
-    stages = replace(stages, selection=Selection(**MANY))
+    stages = replace(stages, selection=Selection(**MANY), stereo=sparse(stages.stereo))
     raw = recordings.track_all(scene, stages, cache, map, progress.tell)
     flat: list[TrackSet | None] = []
     for video, one in zip(scene.videos, raw, strict=True):

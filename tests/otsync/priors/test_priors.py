@@ -334,7 +334,8 @@ def test_depth_is_unknown_in_frames_without_a_map():
     np.testing.assert_array_equal(depth_at([None, np.full((H, W), 2.0)], tracks, uv), [[0, 2]])
 
 
-def test_hull_and_stereo_find_the_balls():
+def rig_of_balls(moments: int):
+    """Eight cameras around two balls that rest; per video pixels of points on the nearer one, and their depth."""
     cameras = ring(8)
     centres = np.array([[[0.3, 0.0, 0.1]], [[-0.4, 0.1, -0.2]]])
     colours = np.array([[200.0, 60, 60], [60, 90, 210]])
@@ -355,20 +356,40 @@ def test_hull_and_stereo_find_the_balls():
             a, bb, c = ray @ ray, -2 * ray @ local[nearest], local[nearest] @ local[nearest] - 0.09
             points.append(point)
             depths.append((-bb - np.sqrt(bb**2 - 4 * a * c)) / (2 * a))
-        videos.append(Video([image] * 2, camera, 30.0, name=str(v)))
-        masks.append(np.stack([mask] * 2))
-        uv.append(np.repeat(np.array(points)[:, None], 2, 1))
+        videos.append(Video([image] * moments, camera, 30.0, name=str(v)))
+        masks.append(np.stack([mask] * moments))
+        uv.append(np.repeat(np.array(points)[:, None], moments, 1))
         true.append(np.array(depths))
-    rig = Rig.at(videos, masks, np.zeros(8))
+    return Rig.at(videos, masks, np.zeros(8)), uv, true
+
+
+def test_hull_and_stereo_find_the_balls():
+    rig, uv, true = rig_of_balls(2)
     found = HullStereo()(rig, uv)
     error = np.concatenate([np.abs(z[:, 0] / t - 1)[z[:, 0] > 0] for z, t in zip(found, true, strict=True)])
     assert len(error) >= 16
     assert np.median(error) < 0.02
     with pytest.raises(ValueError, match="visual hull is empty"):
-        HullStereo()(Rig.at(videos, [np.zeros_like(m) for m in masks], np.zeros(8)), uv)
+        HullStereo()(replace(rig, masks=tuple(np.zeros_like(m) for m in rig.masks)), uv)
     with pytest.raises(ValueError, match="static"):
-        moving = replace(cameras[0], w2c=np.stack([cameras[0].w2c] * 2))
-        HullStereo()(Rig.at([replace(videos[0], camera=moving), *videos[1:]], masks, np.zeros(8)), uv)
+        moving = replace(rig.cameras[0], w2c=np.stack([rig.cameras[0].w2c] * 2))
+        HullStereo()(replace(rig, cameras=(moving, *rig.cameras[1:])), uv)
+
+
+def test_stereo_of_every_second_moment_fills_in_what_lies_between():
+    """The rig of balls once more, five moments of it, one track unseen in the third and another in the last."""
+    rig, uv, _ = rig_of_balls(5)
+    uv[0][0, 2], uv[1][1, 4] = np.nan, np.nan
+    all_of_them, some = HullStereo()(rig, uv), HullStereo(every=2)(rig, uv)
+    for whole, half, x in zip(all_of_them, some, uv, strict=True):
+        np.testing.assert_array_equal(half[:, ::2], whole[:, ::2])
+        between = half[:, 1::2]
+        known = (whole[:, :-1:2] > 0) & (whole[:, 2::2] > 0)
+        np.testing.assert_allclose(between[known], 0.5 * (whole[:, :-1:2] + whole[:, 2::2])[known], rtol=1e-6)
+        assert not between[~known].any() and not half[np.isnan(x[..., 0])].any()
+    assert (some[0][:, 1::2] > 0).any() and some[0][0, 1] == 0 and some[1][1, 3] == 0
+    with pytest.raises(ValueError, match="every"):
+        HullStereo(every=0)
 
 
 def test_the_rig_pairs_frames_of_one_moment():
