@@ -107,7 +107,7 @@ class HullStereo:
             below which a depth is not believed.
         every: of so many moments one is measured; tracks between two that are have the mean of these, where both know
             it. Dense maps are always measured.
-        chunk: moments whose depth is kept together.
+        chunk: moments whose depth is kept together, those in between included.
     """
 
     voxel: float = 0.02
@@ -138,7 +138,8 @@ class HullStereo:
         cache = cache or Cache()
         space = Space.of(self, rig)
         wanted = np.arange(0, len(rig.index), self.every)
-        chunks = [wanted[k : k + self.chunk] for k in range(0, len(wanted), self.chunk)]
+        size = max(1, self.chunk // self.every)
+        chunks = [wanted[k : k + size] for k in range(0, len(wanted), size)]
         # without a key of the pixels nothing may be kept: the tracks alone do not say which images they came from
         store = cache if key else Cache()
         key = (*key, self, content_key(rig.index, *uv))

@@ -7,6 +7,7 @@ are matched at the time that wins, and each window of what they share is matched
 from __future__ import annotations
 
 import dataclasses
+import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Protocol
 
@@ -23,6 +24,8 @@ from .places import NONE, parts_by_place
 from .rematching import NOISY, asks, at_each, at_peaks, evidence_of, winner
 from .verdict import NOTHING_COMMON, Answer, Verdict
 from .windows import EVERY, NEAR, Split, Windows, matches_of_parts
+
+log = logging.getLogger("otsync")
 
 MEASURED, SETTLED = 3, 0.02 / 30
 """How often a jump is measured anew, at most, and seconds by which it may still change."""
@@ -205,7 +208,11 @@ def _told(task: tuple[Job, list[Answer]]) -> list[Answer]:
     """What windows tell of a pair, around the best of its answers: readings, best first; none where it is not clear."""
     job, several = task
     best = max(several, key=evidence_of)
-    windows = Windows.of(job, Clock(best.refined.offset, best.refined.rate))
+    try:
+        windows = Windows.of(job, Clock(best.refined.offset, best.refined.rate))
+    except Exception as error:  # as of a pair that fails: the others live
+        log.warning("windows of pair %s: %s: %s", job.pair, type(error).__name__, error)
+        return []
     breaks = windows.breaks()
     explained = [best.refined.offset + split.late for split in breaks]
     if winner(several, explained) is None or not (breaks or windows.steady):

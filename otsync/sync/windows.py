@@ -40,6 +40,12 @@ MOMENTS = 12
 TRACKS = 300
 """Of each video, that take part: those that are seen longest."""
 
+EXTENT_AT = 48
+"""Moments that tell the extent of the scene."""
+
+LONG = 3000
+"""Frames from which on only those around a window are read at a time."""
+
 FEWEST = 3
 """Matches of a window, at least."""
 
@@ -109,20 +115,21 @@ class Windows:
             return cls(clock, np.zeros(0), late / fps, np.zeros((0, len(late))), np.zeros(0, bool))
         count = min(MOST, -(-(frames - length) // max(1, round(STEP * fps))) + 1)
         first = np.round(np.linspace(0, frames - length, count)).astype(int)
-        beside = around * every
-        grid = start + np.arange(-beside, frames + beside) / fps
-        at_a, at_b = sampled(a.times, a.xyz, a.seen, grid), sampled(b.times, b.xyz, b.seen, clock.own(grid))
         costs = (Cosine(),) if job.matcher is None else job.matcher.costs
         unlike = SynchronousMatching(clock.offset, clock.rate, costs).unlike(a, b)
-        extent = 0.5 * (rms_extent(at_a) + rms_extent(at_b))
-        found = np.zeros((count, len(late)))
-        if extent > 0:
-            look = _Look(at_a, at_b, unlike, extent, placed(a, b), fps)
-            for w, k in enumerate(first + beside):
-                found[w] = [look.evidence(k, k - frames_late, length) for frames_late in late]
-        there = _has_frames(a.times, grid) & _has_frames(b.times, clock.own(grid))
-        whole = np.array([there[k : k + length].mean() >= WHOLE for k in first + beside])
-        return cls(clock, start + first / fps, late / fps, np.maximum(found, 0.0), whole)
+        look = _Look(a, b, clock, unlike, fps)
+        if not look.extent(start, start + frames / fps) > 0:
+            return cls(clock, start + first / fps, late / fps, np.zeros((count, len(late))), np.ones(count, bool))
+        beside = around * every
+        found, whole = [], []
+        # of a long clip the curves of one window at a time are held
+        for some in [first] if frames <= LONG else first[:, None]:
+            begin, end = int(some[0]) - beside, int(some[-1]) + length + beside
+            part = look.at(start + np.arange(begin, end) / fps)
+            for k in some - begin:
+                found.append([part.evidence(int(k), int(k - step), length) for step in late])
+                whole.append(part.there[k : k + length].mean() >= WHOLE)
+        return cls(clock, start + first / fps, late / fps, np.maximum(np.array(found), 0.0), np.array(whole))
 
     @property
     def usual(self) -> float:
@@ -193,15 +200,43 @@ class Windows:
 
 @dataclass(frozen=True, eq=False)
 class _Look:
+    """Two videos on one clock, ``unlike`` their features, in units of costs; ``fps`` of what they are read at."""
+
+    a: TrackSet
+    b: TrackSet
+    clock: Clock
+    unlike: Float[np.ndarray, "Na Nb"] | float
+    fps: float
+
+    def extent(self, begin: float, end: float) -> float:
+        """Of the scene."""
+        a, b = self._positions(np.linspace(begin, end, EXTENT_AT))
+        return 0.5 * (rms_extent(a) + rms_extent(b))
+
+    def at(self, t: Float[np.ndarray, " G"]) -> _Part:
+        """The tracks at moments of a's clock."""
+        there = _has_frames(self.a.times, t) & _has_frames(self.b.times, self.clock.own(t))
+        extent = self.extent(float(t[0]), float(t[-1]))
+        return _Part(*self._positions(t), there, self.unlike, extent, placed(self.a, self.b), self.fps)
+
+    def _positions(self, t: Float[np.ndarray, " G"]) -> tuple[Float[np.ndarray, "Na G 3"], Float[np.ndarray, "Nb G 3"]]:
+        a, b = self.a, self.b
+        assert a.xyz is not None and b.xyz is not None
+        return sampled(a.times, a.xyz, a.seen, t), sampled(b.times, b.xyz, b.seen, self.clock.own(t))
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
     """Tracks of both videos on one grid of moments.
 
     Args:
-        a, b: (N,G,3). unlike: of their features, in units of costs. extent: of the scene.
-        both: whether places count. fps: of the grid.
+        a, b: (N,G,3). there: (G,) whether both videos have a frame. unlike: of their features, in units of costs.
+        extent: of the scene. both: whether places count. fps: of the grid.
     """
 
     a: Float[np.ndarray, "Na G 3"]
     b: Float[np.ndarray, "Nb G 3"]
+    there: Bool[np.ndarray, " G"]
     unlike: Float[np.ndarray, "Na Nb"] | float
     extent: float
     both: bool
@@ -209,7 +244,7 @@ class _Look:
 
     def evidence(self, at_a: int, at_b: int, length: int) -> float:
         """Nats of the matches that are made where a's frames from ``at_a`` on show what b's from ``at_b`` on do."""
-        if at_b < 0 or at_b + length > self.b.shape[1]:
+        if at_b < 0 or at_b + length > self.b.shape[1] or not self.extent > 0:
             return 0.0
         a, b = self.a[:, at_a : at_a + length], self.b[:, at_b : at_b + length]
         some = np.unique(np.linspace(0, length - 1, MOMENTS).round().astype(int))

@@ -77,6 +77,17 @@ def test_too_little_in_common_says_nothing():
     assert len(windows.begin) == 0 and windows.split() is None and not windows.steady and windows.usual == 0
 
 
+@pytest.mark.parametrize("jump", [0, 15])
+def test_a_long_clip_is_read_window_by_window_with_the_same_answer(jump, monkeypatch):
+    asked = job(jump, at=50)
+    whole = Windows.of(asked, Clock(1.0))
+    monkeypatch.setattr("otsync.sync.windows.LONG", 10)
+    parts = Windows.of(asked, Clock(1.0))
+    np.testing.assert_array_equal(parts.whole, whole.whole)
+    np.testing.assert_allclose(parts.evidence, whole.evidence, rtol=0.2, atol=0.02 * whole.evidence.max())
+    assert parts.steady == whole.steady == (jump == 0)
+
+
 def test_things_at_rest_are_not_steady():
     """Nothing tells their time, so that nothing frees their clock of a doubt."""
     x = np.repeat(np.random.default_rng(0).normal(size=(N, 1, 3)), 150, 1)
