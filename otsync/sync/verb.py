@@ -142,9 +142,9 @@ def synchronize(
                 verdict, jobs, bool(times) and matches is None, refining.trust.parted, judged, map
             )
         lags = list(map(lag_of, tracks))
-        doubted = with_lags(verdict.answers, lags, refining.trust.lag)
-        if doubted is not None:
-            verdict = judged(doubted)
+        lagged = with_lags(verdict.answers, lags, refining.trust.lag)
+        if lagged is not None:
+            verdict = judged(lagged)
         return to_offsets(original, verdict, time.perf_counter() - started, broken, lags)
 
 
