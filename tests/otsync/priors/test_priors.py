@@ -377,14 +377,14 @@ def test_hull_and_stereo_find_the_balls():
 
 
 def test_stereo_of_every_second_moment_fills_in_what_lies_between():
-    """The rig of balls once more, five moments of it, one track unseen in the third and another in the last."""
+    """The rig of balls once more, five moments of it, tracks unseen in the third, the last and the second."""
     rig, uv, _ = rig_of_balls(5)
-    uv[0][0, 2], uv[1][1, 4] = np.nan, np.nan
+    uv[0][0, 2], uv[1][1, 4], uv[2][0, 1] = np.nan, np.nan, np.nan
     all_of_them, some = HullStereo()(rig, uv), HullStereo(every=2)(rig, uv)
     for whole, half, x in zip(all_of_them, some, uv, strict=True):
         np.testing.assert_array_equal(half[:, ::2], whole[:, ::2])
         between = half[:, 1::2]
-        known = (whole[:, :-1:2] > 0) & (whole[:, 2::2] > 0)
+        known = (whole[:, :-1:2] > 0) & (whole[:, 2::2] > 0) & np.isfinite(x[:, 1::2, 0])
         np.testing.assert_allclose(between[known], 0.5 * (whole[:, :-1:2] + whole[:, 2::2])[known], rtol=1e-6)
         assert not between[~known].any() and not half[np.isnan(x[..., 0])].any()
     assert (some[0][:, 1::2] > 0).any() and some[0][0, 1] == 0 and some[1][1, 3] == 0

@@ -11,7 +11,9 @@ from otsync import Status, TrackSet, synchronize
 from otsync.align.likelihood import LikelihoodScan
 from otsync.bench.trust.worlds import CLASSES
 from otsync.refine.splines import SplineRefine
-from otsync.sync.pairs import Job
+from otsync.sync.mending import _told
+from otsync.sync.pairs import Job, run
+from otsync.sync.rematching import at_each
 from otsync.sync.windows import EVERY, NEAR, STEADY, Windows, matches_of_parts
 from otsync.types import Clock
 
@@ -123,6 +125,13 @@ def test_breaks_that_wrong_matches_hide_are_named_and_mended(name, seed, jump):
     (found,) = offsets.breaks[1]
     assert found.jump * FPS == pytest.approx(jump, abs=0.5)
     assert offsets.status[1].ok and world.errors(offsets)[0][0] < min(0.4, 3 * offsets.sigma[1] * FPS)
+
+
+def test_a_time_that_is_hardly_ahead_of_another_is_told_nothing_of():
+    asked = job()
+    (best,) = (run(once) for once in at_each(asked, (1.0,)))
+    later = replace(best, refined=replace(best.refined, offset=best.refined.offset + 1.0))
+    assert _told((asked, [best])) and not _told((asked, [best, later]))
 
 
 def test_a_doubt_that_wrong_matches_make_is_lifted():
