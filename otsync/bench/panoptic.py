@@ -14,14 +14,13 @@ import os
 import time
 import zlib
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..compute.threads import MapLike
+from ..compute.threads import MapLike, pool_of
 from ..costs.linear import Cosine
 from ..costs.positions import CurveDistance, MedianPosition
 from ..files.arrays import atomic_write
@@ -116,7 +115,7 @@ def run(
     tell: Callable[[str], None] = (lambda text: None) if json else print
     stages = stages_from(features=features)
     opened = open_scene(scene)
-    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+    with pool_of(os.cpu_count() or 1) as pool:
         kept = Cache(cache or out / "stages")
         material = Material.of(opened, stages, kept, pool.map, tell)
         rows, details = [], []

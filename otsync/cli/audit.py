@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import os
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import tyro
 
+from ..compute.threads import pool_of
 from ..progress import tell
 
 
@@ -51,7 +51,7 @@ class Audit:
         scene = open_scene(self.scene, allow_outside=self.allow_outside)
         if self.cameras:
             scene = scene.take(self.cameras)
-        with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        with pool_of(os.cpu_count() or 1) as pool:
             told = audit_scene(
                 scene, tolerance=self.tolerance, cache=Cache(self.out / "stages"), map=pool.map, tell=tell
             )

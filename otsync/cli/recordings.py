@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from ..compute.threads import pool_of
 from ..io import READERS
 from ..plugins import available
 from ..progress import tell
@@ -228,7 +228,7 @@ def sync_recording(
     known = None if truth is None else true_offsets(truth, scene.names)
     for note in scene.notes:
         tell(f"note: {note}")
-    with ThreadPoolExecutor(threads) as pool:
+    with pool_of(threads) as pool:
         found = solve(
             scene,
             method=method,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import _thread
 import errno
 import importlib
 import logging
@@ -10,6 +11,7 @@ import select
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -90,9 +92,11 @@ def run_command(
             OSError, a package that is not installed) give 2, an interrupt 130.
         interrupted: what an interrupted run leaves behind, in words.
 
-    SIGTERM is an interrupt like Ctrl-C. Where nobody reads standard output any more (``otsync ... | head``), the
+    SIGTERM is an interrupt like Ctrl-C, and so is what a library makes of one that it was not made for: another error.
+    Where nobody reads standard output any more (``otsync ... | head``), the
     command ends without a word, with the exit code of programs that SIGPIPE ends.
     """
+    told = Interrupted()
     try:
         try:
             rest = shared_options(list(sys.argv[1:] if args is None else args))
@@ -100,7 +104,7 @@ def run_command(
                 print(f"{prog} {__version__}")
                 return 0
             command = parsed(prog, commands(), rest, description + SHARED)
-            with ended_like_ctrl_c():
+            with ended_like_ctrl_c(told):
                 return command.run()
         finally:
             sys.stdout.flush()  # not later, when the interpreter ends and can only complain
@@ -122,6 +126,11 @@ def run_command(
         if "Use " not in said:  # our own name a file and what to do
             said += ". Use fewer frames or videos, or smaller images."
     except KeyboardInterrupt:
+        told.came = True
+    except Exception:
+        if not told.came:
+            raise
+    if told.came:
         code, said = 130, f"interrupted; {interrupted}"
     print(f"{prog}: {said}", file=sys.stderr)
     return code
@@ -170,9 +179,17 @@ def of_the_system(error: OSError) -> str:
     return f"{what}{error.strerror}. {REMEDIES.get(error.errno, 'Check the path and the disk.')}"
 
 
+class Interrupted:
+    """Whether a signal came that ends a command."""
+
+    came = False
+
+
 @contextmanager
-def ended_like_ctrl_c() -> Iterator[None]:
-    """SIGTERM, which schedulers and service managers send, raises KeyboardInterrupt, so that everything is cleared up.
+def ended_like_ctrl_c(told: Interrupted) -> Iterator[None]:
+    """Ctrl-C, and SIGTERM, which schedulers and service managers send, raise KeyboardInterrupt, so that everything is
+    cleared up; ``told`` remembers it. One that comes where no error can be raised (a library's callback) would be told
+    on standard error and forgotten: it comes again.
 
     Only a process's main thread can be told so.
     """
@@ -181,13 +198,38 @@ def ended_like_ctrl_c() -> Iterator[None]:
         return
 
     def interrupt(number: int, frame: Any) -> None:
+        told.came = True
         raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGTERM, interrupt)
+    def swallowed(error: Any) -> None:
+        if issubclass(error.exc_type, KeyboardInterrupt):
+            _thread.start_new_thread(once_more, ())
+        else:
+            hook(error)
+
+    def once_more() -> None:  # from another thread: here the error would be swallowed again
+        time.sleep(SWALLOWED)
+        if hasattr(signal, "pthread_kill"):  # wakes the main thread where it sleeps or waits
+            signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGTERM)
+        else:
+            _thread.interrupt_main(signal.SIGTERM)
+
+    hook, sys.unraisablehook = sys.unraisablehook, swallowed
+    before = {}
+    for number in (signal.SIGINT, signal.SIGTERM):
+        # an interrupt that somebody handles on his own, or ignores (nohup), is his
+        if number == signal.SIGTERM or signal.getsignal(number) is signal.default_int_handler:
+            before[number] = signal.signal(number, interrupt)
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL if before is None else before)
+        sys.unraisablehook = hook
+        for number, handler in before.items():
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
+
+
+SWALLOWED = 0.05
+"""Seconds until an interrupt that was swallowed comes again."""
 
 
 def parsed(prog: str, commands: Mapping[str, Load], args: list[str], description: str) -> Any:

@@ -13,6 +13,8 @@ from typing import Any
 
 import numba
 
+from .interrupts import uninterrupted
+
 log = logging.getLogger("otsync")
 
 _uncached_announced = False
@@ -31,7 +33,7 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         try:
             dispatcher = numba.njit(cache=True, **settings)(function)
             _tie_to_sources(dispatcher)
-            return dispatcher
+            return _untorn(dispatcher)
         except RuntimeError:  # "cannot cache function: no locator available"
             if not _uncached_announced:
                 _uncached_announced = True
@@ -39,9 +41,23 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
                     "no writable folder for compiled code: every process compiles it again. Set NUMBA_CACHE_DIR to a "
                     "folder of your own."
                 )
-            return numba.njit(**settings)(function)
+            return _untorn(numba.njit(**settings)(function))
 
     return compile_lazily
+
+
+def _untorn(dispatcher: Any) -> Any:
+    """The kernel, whose compilation no interrupt tears: LLVM's lock would stay closed, and other threads wait for it
+    without end.
+    """
+    compiled = dispatcher._compile_for_args
+
+    def whole(*args: Any, **named: Any) -> Any:
+        with uninterrupted():
+            return compiled(*args, **named)
+
+    dispatcher._compile_for_args = whole
+    return dispatcher
 
 
 _folder = pathlib.Path(__file__).parent

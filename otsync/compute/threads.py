@@ -14,6 +14,8 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any
 
+from .interrupts import uninterrupted
+
 MapLike = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 """Any callable like the builtin map: an executor's, a cluster's."""
 
@@ -122,6 +124,19 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_after_fork)
 
 
+def pool_of(threads: int, name: str = "otsync.map") -> ThreadPoolExecutor:
+    """A pool whose threads have all begun: an interrupt while one begins leaves it unknown to the pool for good, and
+    the process waits for it without end.
+    """
+    pool = ThreadPoolExecutor(threads, thread_name_prefix=name)
+    with uninterrupted():
+        begun = threading.Barrier(threads + 1)
+        for _ in range(threads):
+            pool.submit(begun.wait)
+        begun.wait()
+    return pool
+
+
 def for_each(kernel: Callable[..., Any], parts: Iterable[tuple], *shared: Any) -> None:
     """Call kernel(*part, *shared) for every part, on all threads; parts are taken in order, by whoever is free.
 
@@ -144,7 +159,7 @@ def for_each(kernel: Callable[..., Any], parts: Iterable[tuple], *shared: Any) -
     global _pool
     with _pool_lock:
         if _pool is None:
-            _pool = ThreadPoolExecutor(max(1, _threads - 1), thread_name_prefix="otsync")
+            _pool = pool_of(max(1, _threads - 1), "otsync")
         futures = [_pool.submit(work) for _ in range(helpers)]
     try:
         work()

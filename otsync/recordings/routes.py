@@ -19,7 +19,7 @@ the 4000 longest tracks of a video take (32 kB a frame) while it is tracked.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -109,16 +109,17 @@ def synchronize_scene(
         why = (*why, method.told())
     for line in why:
         tell(line)
-    with progress.stage("tracks"):
-        raw = track_all(scene, stages, cache, map, tell)
     if chosen == "tracks":
+        with progress.stage("tracks"):
+            raw = track_all(scene, stages, cache, map, tell)
         with progress.stage("lift"):
             lifted = lift_given(scene, raw, stages, cache, map)
         with progress.stage("synchronise"):
             offsets = with_doubts(pairs_in_space(lifted, reference, stages, cache, map), scene.doubtful)
         return Synchronized(without_times(offsets), tuple(lifted), chosen, why, None, progress.seconds)
+    with progress.stage("tracks"):
+        flat = track_all(scene, stages, cache, map, tell, lambda video, one: select(video, one, stages, scene.frame))
     with progress.stage("epipolar"):
-        flat = [select(video, r, stages, scene.frame) for video, r in zip(scene.videos, raw, strict=True)]
         first = without_times(pairs_in_pixels(flat, reference, stages, cache, map))
         astray = misplaced(first) | set(scene.doubtful)
         first = with_doubts(first, astray)
@@ -211,11 +212,17 @@ def lacks_stereo(scene: Scene, stages: Stages) -> str:
 
 
 def track_all(
-    scene: Scene, stages: Stages, cache: Cache, map: MapLike, tell: Tell = lambda text: None
-) -> list[dict[str, np.ndarray]]:
+    scene: Scene,
+    stages: Stages,
+    cache: Cache,
+    map: MapLike,
+    tell: Tell = lambda text: None,
+    keep: Callable[[Video, dict[str, np.ndarray]], Any] = lambda video, tracked: tracked,
+) -> list[Any]:
     """Masks, point tracks, descriptors and, where given, labels of every video; points that were given instead.
 
-    ValueError names the first frame that does not read.
+    ``keep`` is asked what of a video's tracks is kept in memory, which of long clips they would fill. ValueError names
+    the first frame that does not read.
     """
     started, done = time.perf_counter(), []
 
@@ -228,7 +235,7 @@ def track_all(
             "have none. Add them, leave these videos out, or take all points out of scene.json."
         )
 
-    def one(item: tuple[Video, Any, Any, Any, Any]) -> dict[str, np.ndarray]:
+    def one(item: tuple[Video, Any, Any, Any, Any]) -> Any:
         video, masks, labels, found, given = item
         if found is not None and given is not None:
             raise ValueError(
@@ -245,7 +252,7 @@ def track_all(
         done.append(video.name)
         spent = time.perf_counter() - started
         tell(f"tracks {len(done)}/{len(scene.videos)}: {video.name}, {len(tracked['uv'])} tracks, {spent:.1f} s")
-        return tracked
+        return keep(video, tracked)
 
     labels = scene.labels or (None,) * len(scene.videos)
     tracks = scene.tracks or (None,) * len(scene.videos)

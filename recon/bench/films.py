@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ import numpy as np
 
 from otsync.bench.record import Row, table, write_rows
 from otsync.bench.sync_acceptance import WRONG
-from otsync.compute.threads import MapLike
+from otsync.compute.threads import MapLike, pool_of
 from otsync.files.cache import Cache
 from otsync.io import open_scene
 from otsync.io.scene import Scene
@@ -73,7 +72,7 @@ def run(
         raise ValueError(f"--only: expected routes among {', '.join(known)}; found {unknown[0]}.")
     home = Path(cache or out / "films")
     rows: list[Row] = []
-    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+    with pool_of(os.cpu_count() or 1) as pool:
         for n in range(seeds):
             for row in answers(home, first_seed + n, FILMS[n % len(FILMS)], only or known, pool.map):
                 rows.append(row)

@@ -12,7 +12,6 @@ import math
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -22,6 +21,7 @@ import torch
 import tyro
 
 from otsync.bench.record import table, write_rows
+from otsync.compute.threads import pool_of
 from otsync.files.arrays import atomic_write
 from otsync.io import Scene
 from otsync.metrics import offset_error
@@ -366,7 +366,7 @@ def run(
     if known:
         tell(f"{len(known)} rows are kept from an earlier run; {len(wanted)} are to be measured")
     if wanted:
-        with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        with pool_of(os.cpu_count() or 1) as pool:
             material = material_of(scene, truth, protocol, kept, pool.map, progress)
             for which in wanted:
                 row = measure(which[0], choices[which[0]], material, protocol, *which[1:], kept, pool.map, lpips)

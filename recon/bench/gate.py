@@ -11,14 +11,13 @@ from __future__ import annotations
 import os
 import tempfile
 import time
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from otsync.bench import record
 from otsync.bench.match import YARD, yardstick
-from otsync.compute.threads import FEW, blas_for
+from otsync.compute.threads import FEW, blas_for, pool_of
 from otsync.files.cache import Cache
 from otsync.io import open_scene
 from otsync.metrics import offset_error
@@ -95,7 +94,7 @@ def measured() -> list[Row]:
 def whole_run() -> dict[str, float]:
     """What ``otsync run`` makes of images alone: offsets by the motion and after the fit, held-out pictures, speed."""
     capture = synthetic(**WHOLE)
-    with tempfile.TemporaryDirectory() as name, ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+    with tempfile.TemporaryDirectory() as name, pool_of(os.cpu_count() or 1) as pool:
         world, held = Path(name) / "world", [f.name for f in capture.held_out]
         write_capture(capture, world, masks=False, depth=False)
         scene, truth = open_scene(world), Offsets.load(world / "truth.json")

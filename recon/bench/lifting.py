@@ -11,7 +11,6 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ from scipy.stats import binned_statistic
 
 from otsync.bench.panoptic import MATCH_RADIUS, precision_near
 from otsync.bench.record import table, write_rows
-from otsync.compute.threads import get_threads
+from otsync.compute.threads import get_threads, pool_of
 from otsync.io import Scene
 from otsync.progress import counted
 from otsync.types import Offsets, TrackSet, Video
@@ -112,7 +111,7 @@ def run(
             f"up to {np.abs(truth.seconds).max():.4g} s."
         )
     kept, progress = Cache(cache or out / "stages"), Progress(tell)
-    with ThreadPoolExecutor(1) as pool:
+    with pool_of(1) as pool:
         material = material_of(scene, truth, lifting.protocol, kept, pool.map, progress)
         by_name = {t.name: t for t in material.tracks}
         names = [n for n in material.train if n in by_name]

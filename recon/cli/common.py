@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 import os
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from otsync.compute.threads import pool_of
 from otsync.progress import Deadline, Progress, tell
 from recon.cli.tables import offset_rows, offset_table, view_table
 
@@ -84,7 +84,7 @@ def reconstructed(
     if workers < 0:
         raise ValueError(f"--workers: expected 0 (one per core) or more; found {workers}.")
     known = None if truth is None else Offsets.load(truth)
-    with ThreadPoolExecutor(workers or os.cpu_count() or 1) as pool:
+    with pool_of(workers or os.cpu_count() or 1) as pool:
         outcome = reconstruct(
             scene,
             offsets,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -12,6 +11,7 @@ import tyro
 
 from otsync.cli.method import MethodOptions
 from otsync.cli.recordings import RecordingOptions
+from otsync.compute.threads import pool_of
 from recon.pipeline.plan import Plan
 
 WORTH_TELLING = 1.0
@@ -110,7 +110,7 @@ class Run:
             true_offsets(self.truth, tuple(names))  # names the videos that it lacks
         check_effects_of(self.plan, [v.camera.readout for v in scene.videos if v.name in names])
         cache, progress = Cache(self.recording.cache or self.out / "stages"), Progress(tell)
-        with ThreadPoolExecutor(threads) as pool:
+        with pool_of(threads) as pool:
             part = scene if self.plan.frames is None else cut(scene, *self.plan.frames)
             with progress.stage("reading"):  # the reconstruction cuts and reads again, from what is kept
                 part = readable(part, cache, pool.map, progress)

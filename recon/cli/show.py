@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Literal
 import tyro
 
 from otsync.cli.slots import one_of
+from otsync.compute.threads import pool_of
 from otsync.files.claim import claimed, refuse_parts_of_a_result
 from otsync.plugins import available, made
 from otsync.progress import counted, tell
@@ -159,7 +159,7 @@ class Eval:
         names = self.held_out or tuple(v.name for v in result.videos if v.held_out)
         if not names:
             raise ValueError("--held-out: expected names of videos; none was held out of this fit.")
-        with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        with pool_of(os.cpu_count() or 1) as pool:
             views, reason = evaluate(
                 result,
                 scene,

@@ -46,11 +46,16 @@ class JobDone:
 
 
 class Run:
-    """A fit under way: its parameters, and its steps."""
+    """A fit under way: its parameters, and its steps.
+
+    ``total`` is the number of steps in all, None until a budget has shown it; ``expected`` is guessed before that, for
+    records alone.
+    """
 
     def __init__(self, problem: Problem, rates: dict[str, float], snapshot: Snapshot | None, total: int | None):
         self.problem, self.rates = problem, rates
         self.scene, self.step, self.total = problem.scene, 0, total
+        self.expected: int | None = None
         self.groups = problem.groups()
         self.rows = np.zeros((0, 4 + len(problem.clips)))
         if snapshot is not None:
@@ -274,7 +279,7 @@ class Run:
         self._pull = self._no_pull()
 
     def record_due(self) -> bool:
-        every = max(1, (self.total or 10**9) // RECORDS)
+        every = max(1, (self.total or self.expected or 10**9) // RECORDS)
         return self.step % every == 0 or self.step == self.total
 
     def record(self, seconds: float) -> np.ndarray:

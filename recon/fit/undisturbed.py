@@ -1,12 +1,9 @@
-"""Conditions a fit runs under: one thread per frame, and short sections that Ctrl-C may not tear."""
+"""Conditions a fit runs under: one thread per frame."""
 
 from __future__ import annotations
 
-import signal
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
 
 import torch
 
@@ -29,19 +26,3 @@ def one_thread_each(batch: int) -> Iterator[None]:
     finally:
         torch.set_num_threads(torch_threads)
         set_threads(raster_threads)
-
-
-@contextmanager
-def uninterrupted() -> Iterator[None]:
-    """Ctrl-C inside waits for the end of the block; only the main thread receives it, elsewhere nothing changes."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    waiting: list[tuple[int, Any]] = []
-    before = signal.signal(signal.SIGINT, lambda number, frame: waiting.append((number, frame)))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-    if waiting and callable(before):
-        before(*waiting[0])

@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, field, fields, replace
 from os import PathLike
@@ -23,7 +22,8 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from otsync.compute.threads import MapLike
+from otsync.compute.interrupts import uninterrupted
+from otsync.compute.threads import MapLike, pool_of
 from otsync.progress import Deadline, is_quiet
 from otsync.types import Offsets, Status
 from otsync.types.status import in_order
@@ -32,7 +32,7 @@ from recon.fit.options import FitOptions
 from recon.fit.problem import Problem, assemble, check_groups
 from recon.fit.run import Diverged, Run
 from recon.fit.uncertainty import reconciled, relative_sigma, repeated, unreached, unsettled
-from recon.fit.undisturbed import one_thread_each, uninterrupted
+from recon.fit.undisturbed import one_thread_each
 from recon.footage.footage import Footage
 from recon.observe.effects import initial_parameters
 from recon.scene.gaussians4d import Gaussians4D
@@ -42,7 +42,16 @@ __all__ = ["Diverged", "History", "Reconstruction", "fit"]
 FIT_SHARE = 0.9
 """Of what is left of the whole job's time: views are compared and results written after the fit."""
 
-CALIBRATION = (20, 60)  # steps of a session between which the speed is taken when a budget in seconds is given
+GUESSED = (20, 60)
+"""Steps of a session between which the speed is taken first, where a budget in seconds is given: a guess alone."""
+
+CALIBRATED = (0.15, 0.3)
+"""Shares of the time between which the speed is taken for good. The first steps are slow: by them alone a fit was a
+fifth too short. No rate decays before (:class:`recon.fit.optimize.Decay`)."""
+
+RELEASED = 500
+"""Steps after which the memory of footage that lies in files is given back: what they read comes from the system's
+cache again."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,19 +150,20 @@ def fit(
     with ExitStack() as stack:
         each: MapLike = map
         if problem.device.type == "cpu":  # a GPU is fed by one thread: more would only wait for each other
-            each = stack.enter_context(ThreadPoolExecutor(options.batch + 1, thread_name_prefix="recon.fit")).map
+            each = stack.enter_context(pool_of(options.batch + 1, "recon.fit")).map
         stack.enter_context(one_thread_each(options.batch))
         hidden = True if is_quiet() else None  # None: hidden where there is no terminal
         bar = stack.enter_context(tqdm(total=run.total, initial=run.step, desc="fit", unit="step", disable=hidden))
-        calibrate = Calibration(options.budget, deadline)
+        calibrate = Calibration(options.budget, deadline) if run.total is None else None
         try:
             while run.total is None or run.step < run.total:
                 with uninterrupted():
                     run.advance(each, options.densify)
                     row = run.record(time.perf_counter() - started) if run.record_due() else None
                 bar.update()
-                if run.total is None:
-                    bar.total = run.total = calibrate(run.step)
+                if calibrate is not None:
+                    run.expected, run.total = calibrate(run.step)
+                    bar.total = run.expected
                 if row is not None:
                     bar.set_postfix_str(f"PSNR {row[3]:.1f}, offsets moved {_moved(problem, row[4:])} frames", False)
                 if watch is not None and row is not None:
@@ -161,6 +171,9 @@ def fit(
                     watch(assemble(run.scene, values).to("cpu"), f"step {run.step}, PSNR {row[3]:.1f} dB")
                 if keep.due():
                     keep.save(run.snapshot())
+                if run.step % RELEASED == 0:
+                    for one in footage:
+                        one.release()
         except KeyboardInterrupt:
             keep.save(run.snapshot())
             raise
@@ -169,22 +182,39 @@ def fit(
 
 
 class Calibration:
-    """Turns a budget in seconds into a number of steps, once the first ones of a session have shown their speed."""
+    """Turns a budget in seconds into a number of steps, as the steps show their speed."""
 
     def __init__(self, budget: float | None, deadline: Deadline | None = None):
-        self.budget, self.deadline, self.done, self.since = budget, deadline, 0, time.perf_counter()
+        assert budget is not None or deadline is not None  # only then is the number of steps open
+        self.deadline, self.done = deadline, 0
+        self.began = self.since = time.perf_counter()
+        self.seconds = float(budget or 0.0) if deadline is None else FIT_SHARE * deadline.left
+        self.first, self.again = 0, False
+        self.guess: int | None = None
+        self.known: int | None = None
 
-    def __call__(self, step: int) -> int | None:
-        """The number of steps in all; None until it is known."""
+    def __call__(self, step: int) -> tuple[int | None, int | None]:
+        """After a step: the number of steps in all as it is guessed, and as it is known; None before."""
         self.done += 1
-        if self.done == CALIBRATION[0]:
-            self.since = time.perf_counter()
-        if self.done < CALIBRATION[1]:
-            return None
-        assert self.budget is not None  # only then is the number of steps open
-        each = (time.perf_counter() - self.since) / (CALIBRATION[1] - CALIBRATION[0])
-        left = self.budget if self.deadline is None else step * each + FIT_SHARE * self.deadline.left
-        return max(2 * step, int(left / each))  # rates must have time to decay
+        now = time.perf_counter()
+        gone = now - self.began
+        if self.done == GUESSED[0] or (
+            self.guess is not None and not self.again and gone >= CALIBRATED[0] * self.seconds
+        ):
+            self.since, self.first, self.again = now, self.done, self.guess is not None
+        if self.guess is None and self.done >= GUESSED[1]:
+            self.guess = self._total(step, now)
+        if self.guess is not None and self.known is None and gone >= CALIBRATED[1] * self.seconds:
+            self.guess = self.known = self._total(step, now)
+        return self.guess, self.known
+
+    def _total(self, step: int, now: float) -> int:
+        steps = self.done - self.first
+        if not steps:  # the time was over before it could be measured
+            return 2 * step
+        each = (now - self.since) / steps
+        left = self.seconds - (now - self.began) if self.deadline is None else FIT_SHARE * self.deadline.left
+        return max(2 * step, step + int(left / each))  # rates must have time to decay
 
 
 def _moved(problem: Problem, seconds: np.ndarray) -> str:

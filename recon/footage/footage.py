@@ -1,6 +1,7 @@
-"""Footage of one video: frames at working size in memory, masks, the background, and where something moves.
+"""Footage of one video: frames at working size, masks, the background, and where something moves.
 
-Everything is kept as uint8: 150 frames of 320 x 180 are 26 MB, their masks 9 MB more.
+Everything is kept as uint8: 150 frames of 320 x 180 are 26 MB, their masks 9 MB more. In a run they lie in files, and
+only what is looked at is in memory.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,6 +20,7 @@ from scipy.ndimage import maximum_filter
 from scipy.spatial.transform import Rotation
 
 from otsync.compute.indices import evenly
+from otsync.files.scratch import Scratch, release
 from otsync.types import Camera, Video
 
 log = logging.getLogger("recon.footage")
@@ -93,8 +96,13 @@ class Footage:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of memory that the pixels take."""
+        """Bytes that the pixels take, in memory or in a file."""
         return sum(a.nbytes for a in (self.images, self.masks, self.background) if a is not None)
+
+    def release(self) -> None:
+        """Give the memory of the pixels back, where they lie in files: they are read again when they are asked for."""
+        release(self.images)
+        release(self.masks)
 
     def pose(self, frame: int) -> Float[np.ndarray, "4 4"]:
         """World to camera of a frame."""
@@ -130,6 +138,7 @@ def footage_of(
     width: int = 320,
     frames: slice | None = None,
     samples: int = 40,
+    folder: Path | None = None,
 ) -> Footage:
     """Read a video at working size.
 
@@ -139,6 +148,8 @@ def footage_of(
             undone (which needs OpenCV, and crops to the pixels that are seen).
         frames: which frames; None: all.
         samples: frames, spread over the clip, from which the background is taken (2 bytes of memory per value).
+        folder: where images and masks are put into files without a name (:class:`otsync.files.scratch.Scratch`); None:
+            they are held in memory.
 
     A frame that cannot be read, differs in size from the camera, or holds NaN is marked bad, with a warning that names
     it. Raises ValueError when no frame can be used, or when masks and frames do not pair up.
@@ -152,28 +163,33 @@ def footage_of(
     picks = range(len(video.frames))[frames or slice(None)]
     if not picks:
         raise ValueError(f"frames: expected some of the {len(video.frames)} of {video.name!r}; found none.")
-    images = np.zeros((len(picks), lens.size[1], lens.size[0], 3), np.uint8)
-    soft = None if masks is None else np.zeros(images.shape[:3], np.uint8)
+    seen = Scratch((lens.size[1], lens.size[0], 3), folder=folder)
+    over = None if masks is None else Scratch(seen.row[:2], folder=folder)
     bad = np.zeros(len(picks), bool)
     reason = ""
     for i, k in enumerate(picks):
+        image = mask = None
         try:
-            images[i] = lens.shrink(_image(video.frames[k], lens.full))
-            if soft is not None and masks is not None:
-                soft[i] = lens.shrink(_mask(masks[k], lens.full))
+            image = lens.shrink(_image(video.frames[k], lens.full))
+            if masks is not None:
+                mask = lens.shrink(_mask(masks[k], lens.full))
         except (ValueError, OSError, EOFError, SyntaxError) as error:
-            images[i], bad[i], reason = 0, True, f"{type(error).__name__}: {error}"
-            if soft is not None:
-                soft[i] = 0
+            image, bad[i], reason = None, True, f"{type(error).__name__}: {error}"
             log.warning("video %r, frame %d is left out: %s", video.name, k, reason)
+        seen.append(image)
+        if over is not None:
+            over.append(mask)
     if bad.all():
         raise ValueError(f"video {video.name!r}: expected frames that can be read; found none. The last one: {reason}")
+    images, soft = seen.array(), None if over is None else over.array()
     w2c = video.camera.w2c
     w2c = w2c[np.array(picks)] if w2c.ndim == 3 else w2c
-    background, seen = None, None
+    background, shown = None, None
     if soft is not None and w2c.ndim == 2:
-        background, seen = median_background(images[~bad], soft[~bad], samples)
-    return Footage(
+        good = np.flatnonzero(~bad)
+        chosen = good[evenly(len(good), samples)]
+        background, shown = median_background(images[chosen], soft[chosen], samples)
+    footage = Footage(
         name=video.name,
         images=images,
         times=video.times[np.array(picks)],
@@ -181,11 +197,13 @@ def footage_of(
         w2c=w2c,
         masks=soft,
         background=background,
-        background_seen=seen,
+        background_seen=shown,
         boxes=boxes_of(soft, bad, lens.size),
         readout=video.camera.readout,
         bad=bad,
     )
+    footage.release()
+    return footage
 
 
 def boxes_of(

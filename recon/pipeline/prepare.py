@@ -147,6 +147,8 @@ def prepare(
         gains = np.ones((len(footage), 3)) if static is None else static.gains
         given = Given(train, offsets, tuple(tracks), footage, gains, plan, cache, map, progress, stages)
         initial = initial_scene(given, static, start)
+    for one in (*footage, *held):
+        one.release()
     if static is not None:
         footage = tuple(
             f if f.background is None else with_backdrop(static, f, gains[v]) for v, f in enumerate(footage)

@@ -81,13 +81,18 @@ def lifted_tracks(
     from otsync.recordings.tracking import Selection
 
     stages = replace(stages, selection=Selection(**MANY), stereo=sparse(stages.stereo))
-    raw = recordings.track_all(scene, stages, cache, map, progress.tell)
-    flat: list[TrackSet | None] = []
-    for video, one in zip(scene.videos, raw, strict=True):
+
+    def keep(video: Video, tracked: dict[str, np.ndarray]) -> tuple[TrackSet | None, dict[str, np.ndarray] | None]:
         try:
-            flat.append(recordings.select(video, one, stages, scene.frame))
+            chosen = recordings.select(video, tracked, stages, scene.frame)
         except ValueError:
-            flat.append(None)
+            return None, None
+        return chosen, None if video.depth is None else tracked
+
+    kept = recordings.track_all(scene, stages, cache, map, progress.tell, keep)
+    flat, raw = [one for one, _ in kept], [one for _, one in kept]
+    for video, tracks in zip(scene.videos, flat, strict=True):
+        if tracks is None:
             progress.note(f"video {video.name}: nothing moves enough to be tracked; it only adds images")
     if not any(flat):
         raise ValueError(
@@ -95,11 +100,11 @@ def lifted_tracks(
             "masks, or choose a part of the recording with motion (--frames)."
         )
     out: list[TrackSet] = []
-    for v, (video, tracks) in enumerate(zip(scene.videos, flat, strict=True)):
-        if tracks is not None and video.depth is not None:
+    for video, tracked in zip(scene.videos, raw, strict=True):
+        if tracked is not None:
             part = scene.take([video.name])
             try:
-                out += recordings.lift_given(part, [raw[v]], stages, cache)
+                out += recordings.lift_given(part, [tracked], stages, cache)
             except ValueError as error:
                 progress.note(str(error))
     bare = [v for v, video in enumerate(scene.videos) if video.depth is None and flat[v] is not None]
@@ -113,8 +118,8 @@ def lifted_tracks(
         if lacking:
             progress.note(f"no tracks in space from {', '.join(scene.videos[v].name for v in bare)}: {lacking}")
         else:
-            kept = [v for v, t in enumerate(flat) if t is not None]
-            part, sets = scene.take([scene.names[v] for v in kept]), [t for t in flat if t is not None]
+            there = [v for v, t in enumerate(flat) if t is not None]
+            part, sets = scene.take([scene.names[v] for v in there]), [t for t in flat if t is not None]
             try:
                 depth = recordings.stereo_depth(part, sets, only(offsets, part.names), stages, cache, map)
             except EmptyHull as error:
@@ -123,7 +128,7 @@ def lifted_tracks(
                 progress.note(f"no tracks in space from {', '.join(part.names)}: {error}")
             else:
                 lifted = [stages.lift(t, z) for t, z in zip(sets, depth, strict=True)]
-                out += [t for v, t in zip(kept, lifted, strict=True) if v in bare and len(t)]
+                out += [t for v, t in zip(there, lifted, strict=True) if v in bare and len(t)]
     if not out:
         raise NoDepth("depth: expected depth where things move; no track could be lifted. Check the depth or masks.")
     return tuple(out)
@@ -143,7 +148,7 @@ def read_footage(
 
     def one(item: tuple[Video, Any]) -> Footage:
         video, given = item
-        return footage_of(video, tracking.masks(video, given, cache), width=width)
+        return footage_of(video, tracking.masks(video, given, cache), width=width, folder=cache.root)
 
     return tuple(map(one, list(zip(scene.videos, scene.masks, strict=True))))
 

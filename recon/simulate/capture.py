@@ -82,7 +82,7 @@ def synthetic(
     world = draw_world(seed)
     shift = np.concatenate([_offsets(offsets, cameras, seed), np.zeros(held_out)]) / FPS
     times = np.arange(frames) / FPS
-    lenses = [_camera(c, cameras, held_out, size, seed) for c in range(cameras + held_out)]
+    lenses = [ring_camera(c, cameras, held_out, size, seed) for c in range(cameras + held_out)]
     filming = [FilmingCamera.of(world, lens, c, effects, seed) for c, lens in enumerate(lenses)]
     filmed = [f.film(times + shift[c]) for c, f in counted(enumerate(filming), "filming", "camera", len(filming))]
     footage = []
@@ -108,7 +108,7 @@ def synthetic(
     )
 
 
-def _camera(c: int, cameras: int, held_out: int, size: tuple[int, int], seed: int) -> Camera:
+def ring_camera(c: int, cameras: int, held_out: int, size: tuple[int, int], seed: int) -> Camera:
     """Camera c of a ring around the scene; held-out ones stand half-way in the gaps, which are narrower for it."""
     gaps = np.ones(cameras)
     gaps[: min(held_out, cameras)] = 0.75

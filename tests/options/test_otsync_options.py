@@ -717,6 +717,7 @@ def test_options_of_bench_reach_a_suite_or_are_refused(tmp_path):
             (["--features", "daisy"], {"features": "daisy"}),
             (["--json"], {"json": True}),
             (["--cache", "kept"], {"cache": Path("kept")}),
+            (["--against", "a.json", "b.json"], {"against": (Path("a.json"), Path("b.json"))}),
         ):
             assert run(["bench", "spy", *args, "--out", str(tmp_path)])[0] == 0
             assert seen.pop() == (tmp_path, expected)
@@ -756,7 +757,7 @@ def rows() -> set[str]:
         "import-offsets": "source recording kind sigma offsets out allow_outside",
         "check": "scene every_frame allow_outside",
         "export": "recording offsets out what cameras width fps force allow_outside",
-        "bench": "suite scene out gate rebase promises first_seed seeds only sizes limit features json cache",
+        "bench": "suite scene out gate rebase promises first_seed seeds only sizes limit features json cache against",
         "plugins": "json",
     }
     shared = {row.replace("match matcher", "sync matcher") for row in algorithms if "matcher:" in row}  # the same slot

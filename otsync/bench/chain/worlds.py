@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from ...compute.threads import pool_of
 from ...files.cache import Cache
 from ...geometry import common_target, view_angle
 from ...io import open_scene
@@ -127,7 +127,7 @@ def real_cases(
     And for every second pair :data:`TOGETHER` cameras at once, which begin up to 30 frames apart.
     """
     opened = open_scene(scene)
-    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+    with pool_of(len(os.sched_getaffinity(0))) as pool:
         material = Material.of(opened, Stages(), Cache(cache), pool.map, say)
     rng = np.random.default_rng(seed)
     every = list(itertools.combinations(range(len(opened.videos)), 2))

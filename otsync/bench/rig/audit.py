@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import os
 import time
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ...compute.threads import pool_of
 from ...files.cache import Cache
 from ...io import open_scene
 from ...progress import counted
@@ -41,7 +41,7 @@ def run(
     opened = open_scene(scene)
     kept, stages = Cache(cache or out / "stages"), Stages()
     started = time.process_time()
-    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+    with pool_of(os.cpu_count() or 1) as pool:
         raw = track_all(opened, stages, kept, pool.map)
         rows: list[dict[str, Any]] = []
         trials = [(move, first_seed + n) for n in range(seeds) for move in MOVES]

@@ -14,14 +14,13 @@ import os
 import time
 import zlib
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ...compute.threads import MapLike
+from ...compute.threads import MapLike, pool_of
 from ...files.cache import Cache
 from ...io.scene import Scene, read_document, scene_from_document
 from ...priors.points import ChainedFlow
@@ -53,7 +52,7 @@ def run(
     draws: dict[int | str, np.ndarray] = {AS_FILMED: np.zeros(len(opened.videos), int)}
     for seed in range(first_seed, first_seed + seeds):
         draws[seed] = np.random.default_rng(seed).integers(0, MOST + 1, len(opened.videos))
-    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+    with pool_of(os.cpu_count() or 1) as pool:
         rows = _own_tracks(opened, draws, Cache(cache or out / "stages"), pool.map)
         files = their_sync.keypoint_files(root, opened.names)
         if files:

@@ -21,7 +21,7 @@ from recon.fit.optimize import RATES, without
 from recon.fit.options import DEFAULT_LOSSES, FitOptions
 from recon.fit.problem import Problem
 from recon.fit.run import Diverged, Run
-from recon.fit.verb import fit
+from recon.fit.verb import Calibration, fit
 from recon.losses import ImageLoss
 from recon.losses.image import Mask, Photometric
 from recon.losses.motion import Velocity
@@ -469,6 +469,22 @@ def test_a_budget_becomes_steps_that_decay_and_densify(capture, scene):
     assert len(result.scene) > len(scene)
     with pytest.raises(ValueError, match="budget: expected"):
         fit(scene, capture.footage, believed(capture), budget=float("inf"))
+
+
+@pytest.mark.parametrize("slow", [1.0, 1.5, 2.0])
+def test_a_budget_is_used_though_the_first_steps_are_slow(monkeypatch, slow):
+    """Steps of 10 ms, of which the first 200 take longer: the fit ends within a twentieth of its time."""
+    now = 0.0
+    monkeypatch.setattr(time, "perf_counter", lambda: now)
+    calibrate, guesses, total, step = Calibration(30.0), set(), None, 0
+    while total is None or step < total:
+        step += 1
+        now += 0.01 * (slow if step <= 200 else 1.0)
+        guess, total = calibrate(step)
+        guesses.add(guess)
+        assert total is None or step >= 0.2 * total
+    assert now == pytest.approx(30.0, rel=0.05)
+    assert None in guesses and len(guesses) <= 3  # none, a guess, what is known
 
 
 def test_other_rates_and_frame_times(capture, scene):
