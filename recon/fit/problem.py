@@ -140,7 +140,11 @@ class Problem:
 
     def key(self, *options: Any) -> str:
         """A hash of all that decides the result, the same in every process."""
-        footage, rates = [clip.footage for clip in self.clips], self.offsets.rates[self.index]
+        footage = []
+        for clip in self.clips:  # one after the other, or all pixels are in memory at once
+            footage.append(content_key(clip.footage))
+            clip.footage.release()
+        rates = self.offsets.rates[self.index]
         return content_key(scene_arrays(self.scene), self.start, rates, footage, *options)
 
     def pick(self, step: int) -> list[tuple[int, int]]:

@@ -49,7 +49,7 @@ CALIBRATED = (0.15, 0.3)
 """Shares of the time between which the speed is taken for good. The first steps are slow: by them alone a fit was a
 fifth too short. No rate decays before (:class:`recon.fit.optimize.Decay`)."""
 
-RELEASED = 500
+RELEASED = 100
 """Steps after which the memory of footage that lies in files is given back: what they read comes from the system's
 cache again."""
 

@@ -190,6 +190,7 @@ def compared(
             progress.note(f"held-out video {footage.name} is not compared: {error}")
         else:
             videos.append(FilmedBy.of(footage, looking.clock, looking.gain, own, held_out=True))
+        footage.release()
     for n in evenly(len(ready.footage), SHOWN_TRAINING).tolist():
         footage = ready.footage[n]
         try:
@@ -197,6 +198,7 @@ def compared(
             scores.append(looking.score(most=max(1, plan.views // 4), held_out=False))
         except ValueError as error:
             progress.note(f"video {footage.name} is not compared: {error}")
+        footage.release()
     return tuple(videos), tuple(scores)
 
 

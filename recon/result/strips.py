@@ -68,6 +68,7 @@ def _strip(footage: Footage, width: int, count: int) -> Strip:
     w, h = footage.size
     size = min(width, w), max(1, round(min(width, w) * h / w))
     pictures = [np.asarray(Image.fromarray(footage.images[k]).resize(size, Image.Resampling.BOX)) for k in frames]
+    footage.release()
     sheet, columns = tiled(pictures)
     buffer = io.BytesIO()
     Image.fromarray(sheet).save(buffer, "WEBP", quality=QUALITY, method=4)

@@ -320,7 +320,7 @@ def test_priors_of_a_fit(world, home):
 
 
 def test_how_long_and_where_a_fit_runs(fitted, world, home, monkeypatch):
-    monkeypatch.setattr("recon.fit.verb.CALIBRATION", (2, 5))
+    monkeypatch.setattr("recon.fit.verb.GUESSED", (2, 5))
     assert fitted("--budget", "0.01")[:3] not in (fitted()[:3], fitted("--steps", "5")[:3])
     refused(recon.cli.main, fitting(world, home / "o", "--device", "abacus"), "device")
     saved = []
