@@ -180,9 +180,10 @@ def of_the_system(error: OSError) -> str:
 
 
 class Interrupted:
-    """Whether a signal came that ends a command."""
+    """Whether a signal came that ends a command, and whether the command still runs."""
 
     came = False
+    runs = False
 
 
 @contextmanager
@@ -209,6 +210,8 @@ def ended_like_ctrl_c(told: Interrupted) -> Iterator[None]:
 
     def once_more() -> None:  # from another thread: here the error would be swallowed again
         time.sleep(SWALLOWED)
+        if not told.runs:  # it has ended, and what holds the process now would be killed
+            return
         if hasattr(signal, "pthread_kill"):  # wakes the main thread where it sleeps or waits
             signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGTERM)
         else:
@@ -220,9 +223,11 @@ def ended_like_ctrl_c(told: Interrupted) -> Iterator[None]:
         # an interrupt that somebody handles on his own, or ignores (nohup), is his
         if number == signal.SIGTERM or signal.getsignal(number) is signal.default_int_handler:
             before[number] = signal.signal(number, interrupt)
+    told.runs = True
     try:
         yield
     finally:
+        told.runs = False
         sys.unraisablehook = hook
         for number, handler in before.items():
             signal.signal(number, signal.SIG_DFL if handler is None else handler)

@@ -131,9 +131,14 @@ def pool_of(threads: int, name: str = "otsync.map") -> ThreadPoolExecutor:
     pool = ThreadPoolExecutor(threads, thread_name_prefix=name)
     with uninterrupted():
         begun = threading.Barrier(threads + 1)
-        for _ in range(threads):
-            pool.submit(begun.wait)
-        begun.wait()
+        try:
+            for _ in range(threads):
+                pool.submit(begun.wait)
+            begun.wait()
+        except RuntimeError:  # the system gives no more threads: those that have begun must not wait for them
+            begun.abort()
+            pool.shutdown(wait=False)
+            raise
     return pool
 
 

@@ -10,6 +10,7 @@ The clocks are written as a truth (``ball_offsets.json``), which ``--against`` h
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -45,6 +46,9 @@ ON_CIRCLE = 0.05
 FEWEST = 20
 """Frames in which a camera must see the ball for a clock of its own."""
 
+FARTHEST = 1.0
+"""Frames between a camera's clock and the mean: beyond, the centres of one frame no longer tell of one place."""
+
 STRETCHES = 10
 """Parts of the clip that the jackknife leaves out, one at a time."""
 
@@ -78,6 +82,12 @@ class Witness:
 def run(out: Path, *, scene: str | os.PathLike[str], against: Sequence[Path] = ()) -> int:
     """Write ``ball_offsets.json`` and a row a camera; a row an answer of ``against``. Exit code 0."""
     opened = open_scene(scene)
+    rates = {round(float(v.fps or 0), 6) for v in opened.videos}
+    if len(rates) > 1:
+        raise ValueError(
+            f"scene: expected videos of one frame rate; found {', '.join(f'{r:g}' for r in sorted(rates))} fps. A ball "
+            "is looked for at equal frames of a synchronised recording."
+        )
     with pool_of(os.cpu_count() or 1) as pool:
         seen = list(counted(pool.map(outlines, opened.videos), "ball", "camera", len(opened.videos)))
     told = witness([v.camera for v in opened.videos], joined(seen))
@@ -87,8 +97,8 @@ def run(out: Path, *, scene: str | os.PathLike[str], against: Sequence[Path] = (
         {
             "camera": name,
             "seen in frames": int(told.seen[v]),
-            "offset": round(float(told.frames[v]), 4),
-            "sigma": round(float(told.sigma[v]), 4),
+            "offset": _told(told.frames[v]),
+            "sigma": _told(told.sigma[v]),
         }
         for v, name in enumerate(names)
     ]
@@ -110,12 +120,21 @@ def run(out: Path, *, scene: str | os.PathLike[str], against: Sequence[Path] = (
     return 0
 
 
+def _told(value: float) -> float | None:
+    """Four digits; None where there is no answer."""
+    return round(float(value), 4) if np.isfinite(value) else None
+
+
 def _held(path: Path, truth: Offsets, fps: float) -> dict[str, Any]:
     """An answer beside the ball, and beside the claim that all cameras are synchronous; common shifts taken out."""
     found = Offsets.load(path)
-    both = [n for n in found.names if n in truth.names]
+    same = np.isfinite(found.seconds) & (found.component == found.reference)
+    both = [n for n, answered in zip(found.names, same, strict=True) if answered and n in truth.names]
     if len(both) < 3:
-        raise ValueError(f"{path}: expected three cameras that the ball tells of; found {len(both)}.")
+        raise ValueError(
+            f"{path}: expected offsets of three cameras that the ball tells of; found {len(both)}. Give an answer on "
+            "this recording."
+        )
     ours = np.array([found.seconds[found.names.index(n)] for n in both])
     true = np.array([truth.seconds[truth.names.index(n)] for n in both])
     beside = offset_error(ours, true, fps, "median")
@@ -231,7 +250,7 @@ def _through(points: np.ndarray) -> np.ndarray | None:
 def witness(cameras: Sequence[Camera], seen: Centres) -> Witness:
     """Offsets in frames, their mean 0, with the jackknife's sigma.
 
-    ValueError where cameras move, or fewer than three see the ball in :data:`FEWEST` frames.
+    ValueError where cameras move, fewer than three see the ball in :data:`FEWEST` frames, or one is far from the mean.
     """
     if any(c.w2c.ndim == 3 for c in cameras):
         raise ValueError("scene: expected static cameras: a ball tells clocks only where the cameras stand.")
@@ -240,17 +259,25 @@ def witness(cameras: Sequence[Camera], seen: Centres) -> Witness:
     asked = often >= FEWEST
     if asked.sum() < 3:
         raise ValueError(
-            f"scene: expected a red ball that three cameras see in {FEWEST} frames or more; "
+            f"scene: expected a red ball that three cameras see at one place in {FEWEST} frames or more; "
             f"{int(asked.sum())} do. Choose a recording with one, or film a ball of one strong colour."
         )
     seen = seen.take(asked[seen.camera])
+    chosen = np.flatnonzero(asked)
+    cameras = [cameras[int(v)] for v in chosen]
+    seen = dataclasses.replace(seen, camera=np.searchsorted(chosen, seen.camera))
     solved, residual, start = _solve(cameras, seen)
+    if np.abs(solved).max() > FARTHEST:
+        raise ValueError(
+            f"scene: expected a recording whose cameras are within {FARTHEST:g} frame of each other; the ball says "
+            f"{np.abs(solved).max():.2f}. Synchronise it first (otsync sync)."
+        )
     edges = np.linspace(seen.frame.min(), seen.frame.max() + 1, STRETCHES + 1)
     part = np.searchsorted(edges, seen.frame, side="right") - 1
     without = []
     for one in counted(range(STRETCHES), "ball", "fit", STRETCHES):
         rest = part != one
-        if rest.any() and not rest.all() and np.bincount(seen.camera[rest], minlength=len(cameras))[asked].all():
+        if rest.any() and not rest.all() and np.bincount(seen.camera[rest], minlength=len(cameras)).all():
             without.append(_solve(cameras, seen.take(rest), start)[0])
     n = len(without)
     if n < 2:
@@ -258,8 +285,9 @@ def witness(cameras: Sequence[Camera], seen: Centres) -> Witness:
     else:
         apart = np.array(without) - np.mean(without, axis=0)
         sigma = np.sqrt((n - 1) / n * (apart**2).sum(0))
-    known = np.where(asked, 1.0, np.nan)
-    return Witness(solved * known, sigma * known, often, residual)
+    frames, sigmas = np.full((2, len(asked)), np.nan)
+    frames[chosen], sigmas[chosen] = solved, sigma
+    return Witness(frames, sigmas, often, residual)
 
 
 def in_space(cameras: Sequence[Camera], seen: Centres) -> Centres:

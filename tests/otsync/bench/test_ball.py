@@ -109,13 +109,49 @@ def test_hands_and_edges(videos):
     assert ball.ball_in(whole[:, int(x) :]) is None  # at the image's edge
 
 
+def test_a_camera_that_sees_no_ball_has_no_answer_and_no_say(videos, seen):
+    cameras = [v.camera for v in videos]
+    told = ball.witness(cameras, seen.take((seen.camera != 2) | (seen.frame < 5)))
+    others = [0, 1, 3, 4]
+    assert np.isnan(told.frames[2]) and np.isnan(told.sigma[2]) and told.seen[2] == 5
+    assert told.frames[others] == pytest.approx(TRUE[others] - TRUE[others].mean(), abs=0.01)
+
+
+def test_a_ball_that_lies_still_tells_no_clock(videos):
+    """What was drawn is far from the truth, and says so."""
+    rng = np.random.default_rng(3)
+    cameras = [v.camera for v in videos]
+    uv = np.concatenate([c.project(path(np.full((60, 1), 3.0)))[:, 0] for c in cameras])
+    n = len(cameras)
+    still = ball.Centres(
+        np.repeat(np.arange(n), 60),
+        np.tile(np.arange(60), n),
+        uv + 0.1 * rng.standard_normal(uv.shape),
+        np.ones(60 * n) * 8,
+    )
+    try:
+        told = ball.witness(cameras, still)
+    except ValueError as error:
+        assert "within 1 frame" in str(error)
+    else:
+        assert told.sigma.max() > 0.2
+        assert (np.abs(told.frames - (TRUE - TRUE.mean())) < 3 * told.sigma + 0.01).all()
+
+
 def test_what_is_refused(videos, seen):
     cameras = [v.camera for v in videos]
     moving = [replace(cameras[0], w2c=np.repeat(cameras[0].w2c[None], 60, 0)), *cameras[1:]]
     with pytest.raises(ValueError, match="expected static cameras"):
         ball.witness(moving, seen)
-    with pytest.raises(ValueError, match="red ball that three cameras see in 20 frames or more; 0 do"):
+    with pytest.raises(ValueError, match="that three cameras see at one place in 20 frames or more; 0 do"):
         ball.witness(cameras, seen.take(seen.camera < 2))
+    off = replace(seen, frame=seen.frame + (seen.camera == 1))
+    with pytest.raises(ValueError, match="within 1 frame of each other; the ball says 1"):
+        ball.witness(cameras, off)
+    far = ball.witness(cameras, replace(seen, frame=seen.frame + 5 * (seen.camera == 1)))
+    others = [0, 2, 3, 4]  # one that sees the ball elsewhere has no answer; those that agree have theirs
+    assert np.isnan(far.frames[1])
+    assert far.frames[others] == pytest.approx(TRUE[others] - TRUE[others].mean(), abs=0.01)
 
 
 def test_answers_are_held_against_the_ball(videos, tmp_path, capsys):
@@ -145,4 +181,8 @@ def test_answers_are_held_against_the_ball(videos, tmp_path, capsys):
     assert right["correlation"] > 0.99 and said["mean, beside 0"] == 0 and said["correlation"] is None
     Offsets.known(names[:2], np.zeros(2), FPS).save(tmp_path / "few.json")
     assert main(["bench", "ball", str(tmp_path), "--out", str(out), "--against", str(tmp_path / "few.json")]) == 2
-    assert "expected three cameras that the ball tells of; found 2" in capsys.readouterr().err
+    assert "expected offsets of three cameras that the ball tells of; found 2" in capsys.readouterr().err
+    entries[0]["fps"] = 25.0
+    (tmp_path / "scene.json").write_text(json.dumps(scene))
+    assert main(["bench", "ball", str(tmp_path), "--out", str(out)]) == 2
+    assert "expected videos of one frame rate; found 25, 30 fps" in capsys.readouterr().err
