@@ -339,9 +339,12 @@ def _solve(
         i, w = _weights(seen.frame + offsets[seen.camera] - first, T)
         point = np.einsum("nk,nkd->nd", w, places[i[:, None] + np.arange(-1, 3)])
         local = np.einsum("nij,nj->ni", w2c[:, :3, :3], point) + w2c[:, :3, 3]
-        towards = local / np.linalg.norm(local, axis=1, keepdims=True)
-        middle = towards[:, :2] * towards[:, 2:] / (towards[:, 2:] ** 2 - sine[:, None])
-        return np.einsum("nij,nj->ni", K[:, :2, :2], middle) + K[:, :2, 2] + shifts[seen.camera] - seen.pixel
+        return (
+            np.einsum("nij,nj->ni", K[:, :2, :2], outline_middle(local, sine))
+            + K[:, :2, 2]
+            + shifts[seen.camera]
+            - seen.pixel
+        )
 
     def residuals(x: np.ndarray) -> np.ndarray:
         places, offsets, shifts = split(x)
@@ -357,6 +360,16 @@ def _solve(
     )
     offsets = split(solved.x)[1]
     return offsets - offsets.mean(), float(np.median(np.abs(misses(solved.x)))), solved.x
+
+
+def outline_middle(local: np.ndarray, sine: np.ndarray) -> np.ndarray:
+    """Middles (N,2) of the outlines of balls at ``local`` (N,3) in camera axes, on the plane z = 1.
+
+    Args:
+        sine: (N,) squared sine of half the angle that each ball is seen under.
+    """
+    towards = local / np.linalg.norm(local, axis=1, keepdims=True)
+    return towards[:, :2] * towards[:, 2:] / (towards[:, 2:] ** 2 - sine[:, None])
 
 
 def _weights(at: np.ndarray, T: int) -> tuple[np.ndarray, np.ndarray]:

@@ -87,9 +87,9 @@ def test_the_middle_of_an_outline_is_not_the_centre_s_image():
     found = np.array([ball.ball_in(drawn(camera, p, fine=8))[:2] for p in far]) - camera.K[:2, 2]
     distance = np.linalg.norm(at, axis=1)
     beyond = np.median(np.linalg.norm(found, axis=1) - distance)
-    sine = (RADIUS / np.linalg.norm(camera.to_camera(far[:, None])[:, 0], axis=1)) ** 2
-    cosine = 1 / (1 + (distance / camera.K[0, 0]) ** 2)
-    expected = np.median(distance * sine / (cosine - sine))
+    local = camera.to_camera(far[:, None])[:, 0]
+    middle = ball.outline_middle(local, (RADIUS / np.linalg.norm(local, axis=1)) ** 2) * camera.K[0, 0]
+    expected = np.median(np.linalg.norm(middle, axis=1) - distance)
     assert 0.2 < expected < 0.5 and beyond == pytest.approx(expected, abs=0.08)
 
 
