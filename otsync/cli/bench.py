@@ -51,8 +51,8 @@ class Bench:
     """Which benchmark; "all": every one that needs no recording, but for films, thresholds and scale, which take
     hours."""
     scene: tyro.conf.Positional[Path | None] = None
-    """A truly synchronised recording (its folder or scene.json): of panoptic, audit, shifts and ball; if you like,
-    of chain, own-frames and calibrate."""
+    """A truly synchronised recording (its folder or scene.json): of panoptic, audit, shifts, ball and budget; if you
+    like, of chain, own-frames and calibrate."""
     out: Path = Path("bench/out")
     """Folder for CSV, JSON and plots."""
     gate: bool = False
@@ -63,8 +63,8 @@ class Bench:
     """For sync and match: measure what is promised, on fresh seeds, instead of the tables; for trust: exit code 1 where
     it is not kept."""
     first_seed: int | None = None
-    """For core, match, sync, panoptic, chain, own-frames, trust, thresholds, calibrate, audit, shifts and scale: where
-    they begin; default: the suite's own."""
+    """For core, match, sync, panoptic, chain, own-frames, trust, thresholds, calibrate, audit, shifts, scale and
+    budget: where they begin; default: the suite's own."""
     seeds: int | None = None
     """For core, match, sync, chain, own-frames, trust, thresholds, calibrate, audit and shifts: how many; default: the
     suite's own."""
@@ -72,7 +72,7 @@ class Bench:
     """For match, hard-cases and chain: names of the solvers to run; for calibrate of the worlds, for trust of the
     classes, for thresholds of the limits, for scale of the sizes; default: all."""
     sizes: tuple[int, ...] = ()
-    """For match: numbers of tracks; default: 200 to 50,000."""
+    """For match: numbers of tracks; default: 200 to 50,000. For budget: seconds; default: 90 to 450."""
     limit: float | None = None
     """For match: CPU seconds that a matcher may take for a world; default: 60."""
     features: str | None = None
