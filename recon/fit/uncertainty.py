@@ -7,9 +7,9 @@ At the end of a fit each frame of a video proposes one Gauss-Newton step of that
 with the residuals r of its pixels. Pixels of one frame err together (a wrong shape, a highlight), frames further apart
 much less: so frames, not pixels, are taken as independent (a sandwich estimate, White 1980). What the frames agree on
 beyond the answer is a bias that the fit did not follow, and is added. The motion is held, so this is a lower bound:
-what a short fit has not settled yet is added too (:func:`unsettled`), and what it could not have reached
-(:func:`unreached`); the clock that the fit began with, where it has a sigma of its own, is the other witness
-(:func:`reconciled`).
+what a short fit has not settled yet is added too (:func:`unsettled`), what it could not have reached
+(:func:`unreached`), and what it still has from its start (:func:`unseen`); the clock that the fit began with, where it
+has a sigma of its own, is the other witness (:func:`reconciled`).
 """
 
 from __future__ import annotations
@@ -28,6 +28,8 @@ Target = Callable[[int, int], Tensor]
 FRAMES = 12
 CONTRADICTION = 3.0  # sigmas between two answers, from which one of them is wrong
 STEP = 0.1  # frames between the instants of the central difference, half
+IMAGES = 80  # of a video, after which a fit keeps 1/e of the error that its start had: filmed rigs, docs/trust.md
+EPOCHS = 0.9  # times that it has then seen every frame; the motion, which carries the start's clocks, is local in time
 
 
 def newton_sigma(
@@ -82,6 +84,23 @@ def unreached(start_sigma: np.ndarray, reach: float) -> np.ndarray:
         reach: seconds that all steps together can move an offset.
     """
     return np.where(np.isfinite(start_sigma), np.fmax(start_sigma - reach, 0.0), 0.0)
+
+
+def unseen(start_sigma: np.ndarray, moved: np.ndarray, images: float, epochs: float) -> np.ndarray:
+    """[V] seconds of the start's error that a fit may still have, because it has seen too few pictures.
+
+    The scene that a fit begins with was made with the start's clocks, of each video's own tracks and depth: so each
+    video agrees with itself, however wrong its clock. Pictures undo that in time. A start without a sigma tells by how
+    far the fit has gone from it: the share that it had to go is as large as the share that it keeps.
+
+    Args:
+        start_sigma: one standard deviation of the clocks that it began with, seconds; nan or 0: no witness.
+        moved: seconds from the start to the fit's answer. images: of a video that it has seen. epochs: times that it
+            has seen every frame.
+    """
+    kept = np.exp(-min(images / IMAGES, epochs / EPOCHS))
+    known = np.isfinite(start_sigma) & (start_sigma > 0)
+    return kept * np.where(known, start_sigma, np.abs(moved) / max(1.0 - kept, 1e-9))
 
 
 def relative_sigma(sigma: np.ndarray, reference: int) -> np.ndarray:

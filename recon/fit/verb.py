@@ -31,7 +31,7 @@ from recon.fit.checkpoint import Checkpoint
 from recon.fit.options import FitOptions
 from recon.fit.problem import Problem, assemble, check_groups
 from recon.fit.run import Diverged, Run
-from recon.fit.uncertainty import reconciled, relative_sigma, repeated, unreached, unsettled
+from recon.fit.uncertainty import reconciled, relative_sigma, repeated, unreached, unseen, unsettled
 from recon.fit.undisturbed import one_thread_each
 from recon.footage.footage import Footage
 from recon.observe.effects import initial_parameters
@@ -234,11 +234,14 @@ def _finish(run: Run, seconds: float) -> Reconstruction:
     flags = list(p.offsets.flags)
     if "offsets" in run.adam.groups:
         moving = unsettled(_offsets_by_step(run, values["offsets"].cpu().numpy()), p.reference)
-        fitted = np.hypot(run.sigma(values), moving)
         before = relative_sigma(sigma, p.reference)
+        images = run.step * p.batch / len(p.clips)
+        own = unseen(before, refined - p.start, images, run.step * p.batch / len(p.keys))
+        fitted = np.hypot(np.hypot(run.sigma(values), moving), own)
         together = repeated if p.offsets.stats.get(PHOTOMETRIC) else reconciled
         refined, sigma, contradicted = together(p.start, before, refined, fitted, p.reference)
-        sigma = np.hypot(sigma, unreached(before, run.reach("offsets")))
+        # what both have from the start is no better known for having been averaged
+        sigma = np.hypot(np.fmax(sigma, own), unreached(before, run.reach("offsets")))
         for v in np.flatnonzero(contradicted):
             flags[p.index[v]] = in_order((*flags[p.index[v]], Status.CONTRADICTED))
     clocks = torch.as_tensor(refined).to(values["offsets"])

@@ -593,3 +593,14 @@ def test_a_fit_of_few_steps_is_as_unsure_of_the_clocks_as_it_began(capture, scen
         assert (found.sigma[1:] * 30 >= 0.7 - reach - 1e-6).all() and not any(s.ok for s in found.status[1:])
     longer = fit(scene, capture.footage, start, steps=60).offsets
     assert (longer.sigma[1:] < found.sigma[1:]).all()
+
+
+def test_a_fit_that_was_too_short_does_not_claim_its_clocks(capture):
+    """The scene is made of every video's own tracks at a wrong clock: at first each of them agrees with itself."""
+    start = replace(believed(capture), sigma=np.array([0.0, 0.35, 0.35]) / 30)
+    scene = true_scene(capture)
+    short = fit(scene, capture.footage, start, steps=40, seed=3).offsets
+    # 27 images a video keep exp(-27 / 80) of what was unknown, so the answer is no better than .25 frame
+    assert (short.sigma[1:] * 30 > 0.24).all()
+    longer = fit(scene, capture.footage, start, steps=360, seed=3).offsets  # 240 images a video
+    assert (longer.sigma[1:] < 0.7 * short.sigma[1:]).all()

@@ -6,7 +6,16 @@ import numpy as np
 import pytest
 import torch
 
-from recon.fit.uncertainty import newton_sigma, reconciled, relative_sigma, repeated, sandwich, unreached, unsettled
+from recon.fit.uncertainty import (
+    newton_sigma,
+    reconciled,
+    relative_sigma,
+    repeated,
+    sandwich,
+    unreached,
+    unseen,
+    unsettled,
+)
 
 
 def test_sandwich_is_the_variance_of_the_weighted_step():
@@ -135,3 +144,15 @@ def test_a_fit_of_a_fit_does_not_count_its_pictures_twice():
     assert offset.tolist() == fitted.tolist()
     assert sigma[0] == 0.0 and sigma[1] == 0.004  # averaged it would be .0024
     assert contradicted.tolist() == [False, False, True] and sigma[2] >= 0.1
+
+
+def test_a_fit_that_has_seen_few_pictures_keeps_its_start_s_error():
+    start, moved = np.array([0.0, 0.01, np.nan]), np.array([0.0, 0.002, 0.003])
+    np.testing.assert_allclose(unseen(start, moved, 1e4, 1e3), 0.0, atol=1e-12)
+    few = unseen(start, moved, 2.0, 0.1)
+    assert few[0] == 0 and 0.009 / 1.2 < few[1] < 0.01
+    assert few[2] > 0.003  # it has gone a small part of its way: most is still to go
+    long_clip = unseen(start, moved, 200.0, 0.2)  # every frame hardly once
+    assert long_clip[1] > unseen(start, moved, 200.0, 3.0)[1]
+    half = unseen(start, moved, 80 * np.log(2), 10.0)
+    np.testing.assert_allclose(half, [0.0, 0.005, 0.003])  # half is kept, half is done
