@@ -149,7 +149,7 @@ class Run:
         with torch.no_grad():
             return compose_over(compose(observe, p.effects, values)(shot), clip.behind(box))
 
-    def sigma(self, values: dict[str, Tensor]) -> np.ndarray:
+    def sigma(self, values: dict[str, Tensor], map: MapLike = map) -> np.ndarray:
         """See :func:`recon.fit.uncertainty.newton_sigma`."""
         p = self.problem
         return newton_sigma(
@@ -159,6 +159,7 @@ class Run:
             p.reference,
             len(p.clips),
             self.scene.frame_step,
+            map=map,
         )
 
     def image_gradient(

@@ -15,21 +15,26 @@ has a sigma of its own, is the other witness (:func:`reconciled`).
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from otsync.compute.indices import evenly
+from otsync.compute.threads import MapLike
 
 Look = Callable[[int, int, float], Tensor]
 Target = Callable[[int, int], Tensor]
 
-FRAMES = 12
+FRAMES = 48
 CONTRADICTION = 3.0  # sigmas between two answers, from which one of them is wrong
 STEP = 0.1  # frames between the instants of the central difference, half
-IMAGES = 80  # of a video, after which a fit keeps 1/e of the error that its start had: filmed rigs, docs/trust.md
-EPOCHS = 0.9  # times that it has then seen every frame; the motion, which carries the start's clocks, is local in time
+GOLDEN = (5**0.5 - 1) / 2
+AVERAGED = 0.8  # share of the steps from which on clocks are averaged: Adam's last steps still shake each of them
+BEFORE = 0.6  # and from which on those are that they are held against
+LEFT = 1.5  # of the last move that is still to go: .6 / (1 - .6)
+IMAGES = 65  # of a video, after which a fit keeps 1/e of the error that its start had: filmed rigs, docs/trust.md
+EPOCHS = 0.7  # times that it has then seen every frame; the motion, which carries the start's clocks, is local in time
 
 
 def newton_sigma(
@@ -40,37 +45,78 @@ def newton_sigma(
     n_videos: int,
     frame_step: float,
     frames: int = FRAMES,
+    map: MapLike = map,
 ) -> np.ndarray:
     """[V] standard deviations in seconds, of each offset relative to the reference's; 0 there, nan where nothing moves.
 
     Args:
         look: (video, frame, seconds) -> the image [h,w,3] that the scene gives, that much later than the frame.
         target: (video, frame) -> the frame's own pixels [h,w,3].
-        keys: (K,2) the (video, frame) that took part in the fit.
+        keys: (K,2) the (video, frame) that took part in the fit. frames: of a video that vote, at most. map: calls
+            the votes.
     """
     variance = np.full(n_videos, np.nan)
-    with torch.no_grad():
-        for v in range(n_videos):
-            own = keys[keys[:, 0] == v, 1]
-            if len(own) < 2:
-                continue
-            chosen = own[evenly(len(own), frames)]
-            votes = np.array([_vote(look, target, v, int(k), STEP * frame_step) for k in chosen])
-            variance[v] = sandwich(votes[:, 0], votes[:, 1])
+    for v in range(n_videos):
+        own = keys[keys[:, 0] == v, 1]
+        if len(own) < 2:
+            continue
+        chosen = own[scattered(len(own), frames)]
+        votes = np.array(list(map(partial(_vote, look, target, STEP * frame_step, v), chosen.tolist())))
+        variance[v] = sandwich(votes[:, 0], votes[:, 1])
     sigma = np.sqrt(variance + variance[reference])
     sigma[reference] = 0.0
     return sigma
 
 
-def unsettled(history: np.ndarray, reference: int) -> np.ndarray:
-    """[V] how far each offset, relative to the reference's, still moved in the last third of a fit.
+def scattered(count: int, most: int) -> np.ndarray:
+    """Indices of at most ``most`` of ``count`` frames, one in each of as many equal stretches, at uneven distances.
+
+    Knots of a motion stand at even distances, and what errs between two of them errs alike between the next two: frames
+    at even distances would all err alike, or none of them would.
+    """
+    if count <= most:
+        return np.arange(count)
+    stretch = np.arange(most)
+    return ((stretch + stretch * GOLDEN % 1.0) * count / most).astype(int)
+
+
+def averaged(history: np.ndarray) -> np.ndarray:
+    """[V] clocks of the last steps' mean (Polyak and Juditsky 1992), seconds; what all share is that of the last step.
+
+    The steps shake each clock by about its rate; their mean is nearer to where they shake about. What all clocks share
+    moves with the scene, which is that of the last step.
 
     Args:
         history: (R,1+V) rows of (step, offsets in seconds) in order, the first one at the start, the last at the end.
     """
-    relative = history[:, 1:] - history[:, 1 + reference, None]
-    early = np.flatnonzero(history[:, 0] <= 2 / 3 * history[-1, 0])  # the start is always among them
-    return np.abs(relative[early[-1] :] - relative[-1]).max(0)
+    return _mean_of(history, AVERAGED, 1.0) + history[-1, 1:].mean()
+
+
+def unsettled(history: np.ndarray, reference: int) -> np.ndarray:
+    """[V] seconds that each offset, relative to the reference's, had left to go, by how far it last went.
+
+    That is from the mean of one fifth of a fit's steps to the mean of the last fifth; moves are taken to become three
+    fifths of themselves from one to the next.
+
+    Args:
+        history: as of :func:`averaged`.
+    """
+    went = _mean_of(history, AVERAGED, 1.0) - _mean_of(history, BEFORE, AVERAGED)
+    return LEFT * np.abs(went - went[reference])
+
+
+def _mean_of(history: np.ndarray, begin: float, end: float) -> np.ndarray:
+    """[V] mean offsets, without what all share, of a share of the steps; of the last row before it, where it has none.
+
+    The last row is part of the last share alone.
+    """
+    steps, offsets = history[:, 0] / max(history[-1, 0], 1e-9), history[:, 1:]
+    own = offsets - offsets.mean(1, keepdims=True)
+    inside = (steps >= begin) & ((steps < end) | (end >= 1.0))
+    if not inside.any():
+        before = np.flatnonzero(steps < end)
+        inside[before[-1] if len(before) else 0] = True
+    return own[inside].mean(0)
 
 
 def unreached(start_sigma: np.ndarray, reach: float) -> np.ndarray:
@@ -162,8 +208,9 @@ def sandwich(g: np.ndarray, h: np.ndarray) -> float:
     return float(spread + step**2)
 
 
-def _vote(look: Look, target: Target, v: int, k: int, step: float) -> tuple[float, float]:
+def _vote(look: Look, target: Target, step: float, v: int, k: int) -> tuple[float, float]:
     """(g, h) of one frame."""
-    residual = (look(v, k, 0.0) - target(v, k)).double()
-    rate = (look(v, k, step) - look(v, k, -step)).double() / (2 * step)
+    with torch.no_grad():  # per thread
+        residual = (look(v, k, 0.0) - target(v, k)).double()
+        rate = (look(v, k, step) - look(v, k, -step)).double() / (2 * step)
     return float((residual * rate).sum()), float(rate.square().sum())

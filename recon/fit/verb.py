@@ -31,7 +31,7 @@ from recon.fit.checkpoint import Checkpoint
 from recon.fit.options import FitOptions
 from recon.fit.problem import Problem, assemble, check_groups
 from recon.fit.run import Diverged, Run
-from recon.fit.uncertainty import reconciled, relative_sigma, repeated, unreached, unseen, unsettled
+from recon.fit.uncertainty import averaged, reconciled, relative_sigma, repeated, unreached, unseen, unsettled
 from recon.fit.undisturbed import one_thread_each
 from recon.footage.footage import Footage
 from recon.observe.effects import initial_parameters
@@ -178,7 +178,7 @@ def fit(
             keep.save(run.snapshot())
             raise
         keep.save(run.snapshot())
-        return _finish(run, time.perf_counter() - started)
+        return _finish(run, time.perf_counter() - started, each)
 
 
 class Calibration:
@@ -223,21 +223,25 @@ def _moved(problem: Problem, seconds: np.ndarray) -> str:
     return f"{np.abs(moved - moved[problem.reference]).max():.3f}"
 
 
-def _finish(run: Run, seconds: float) -> Reconstruction:
+def _finish(run: Run, seconds: float, map: MapLike) -> Reconstruction:
     """Put the reference back where it was, and say how sure each clock is."""
     p = run.problem
     values = {n: v.detach() for n, v in run.values().items()}
     scene = assemble(run.scene, values)
+    history = _offsets_by_step(run, values["offsets"].cpu().numpy())
+    if "offsets" in run.adam.groups:
+        values["offsets"] = torch.as_tensor(averaged(history)).to(values["offsets"])
     refined = values["offsets"].cpu().numpy()
     drift = float(refined[p.reference] - p.start[p.reference])
     refined, sigma = refined - drift, p.offsets.sigma[p.index]
     flags = list(p.offsets.flags)
     if "offsets" in run.adam.groups:
-        moving = unsettled(_offsets_by_step(run, values["offsets"].cpu().numpy()), p.reference)
+        moving = unsettled(history, p.reference)
         before = relative_sigma(sigma, p.reference)
         images = run.step * p.batch / len(p.clips)
         own = unseen(before, refined - p.start, images, run.step * p.batch / len(p.keys))
-        fitted = np.hypot(np.hypot(run.sigma(values), moving), own)
+        # votes of frames tell less than all where the start still speaks in each of them
+        fitted = np.hypot(np.fmax(run.sigma(values, map), own), moving)
         together = repeated if p.offsets.stats.get(PHOTOMETRIC) else reconciled
         refined, sigma, contradicted = together(p.start, before, refined, fitted, p.reference)
         # what both have from the start is no better known for having been averaged
@@ -254,18 +258,18 @@ def _finish(run: Run, seconds: float) -> Reconstruction:
         rates=_put(p.offsets.rates, p.index, values["clock_rates"].cpu().numpy()),
         stats=dict(p.offsets.stats) | ({PHOTOMETRIC: 1.0} if "offsets" in run.adam.groups else {}),
     ).judged_by_sigma()
-    history = History.of(run.rows)
+    told = History.of(run.rows)
     stats = {
         "steps": float(run.step),
         "seconds": seconds,
         "images": float(run.step * p.batch),
         "gaussians": float(len(scene)),
-        "loss": float(history.loss[-1]) if len(history.loss) else math.nan,
-        "psnr": float(history.psnr[-1]) if len(history.psnr) else math.nan,
+        "loss": float(told.loss[-1]) if len(told.loss) else math.nan,
+        "psnr": float(told.psnr[-1]) if len(told.psnr) else math.nan,
         "drift_frames": drift / scene.frame_step,
     }
     learned = {n: values[n].cpu() for n in initial_parameters(p.effects, len(p.clips))}
-    return Reconstruction(scene, offsets, learned, history, stats)
+    return Reconstruction(scene, offsets, learned, told, stats)
 
 
 def _offsets_by_step(run: Run, reached: np.ndarray) -> np.ndarray:

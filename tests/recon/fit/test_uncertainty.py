@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from recon.fit.uncertainty import (
+    averaged,
     newton_sigma,
     reconciled,
     relative_sigma,
@@ -124,10 +125,21 @@ def test_witnesses_cover_the_truth_as_often_as_they_say():
     assert contradicted.mean() < 0.01
 
 
-def test_what_still_moved_is_told():
-    history = np.array([[0, 0, 0], [60, 0.0, 0.5], [70, 0.1, 0.9], [100, 0.1, 1.0]])
-    assert unsettled(history, 0) == pytest.approx([0, 0.4])  # since the last row of the first two thirds
-    assert unsettled(history[[0, -1]], 0) == pytest.approx([0, 0.9])  # nothing between is known: all the way counts
+def test_what_still_moves_is_told():
+    history = np.array(
+        [[0, 0, 0], [50, 0, -7], [60, 0, 0.4], [70, 0.2, 0.8], [80, 0, 0.8], [90, 0.3, 1.3], [100, 0, 0.9]]
+    )
+    assert unsettled(history, 0) == pytest.approx([0, 1.5 * (0.9 - 0.5)])  # from one fifth's mean to the last one's
+    drifting = history + np.array([0, 1, 1]) * history[:, :1]  # the scene goes, and all clocks with it
+    assert unsettled(drifting, 0) == pytest.approx([0, 0.6])
+    # where nothing is known between, all of the way counts
+    assert unsettled(np.array([[0, 0, 0], [100, 0.1, 1.0]]), 0) == pytest.approx([0, 1.5 * 0.9])
+    # a clock that goes on as it went: three fifths of each move
+    steps = np.arange(0, 1001)
+    left = 0.6 ** (steps / 200)
+    told = unsettled(np.column_stack([steps, np.zeros(1001), left]), 0)[1]
+    found = averaged(np.column_stack([steps, np.zeros(1001), left]))
+    assert told == pytest.approx(found[1] - found[0], rel=0.01)
 
 
 def test_a_start_relative_to_another_video_brings_the_references_error():
@@ -154,5 +166,19 @@ def test_a_fit_that_has_seen_few_pictures_keeps_its_start_s_error():
     assert few[2] > 0.003  # it has gone a small part of its way: most is still to go
     long_clip = unseen(start, moved, 200.0, 0.2)  # every frame hardly once
     assert long_clip[1] > unseen(start, moved, 200.0, 3.0)[1]
-    half = unseen(start, moved, 80 * np.log(2), 10.0)
+    half = unseen(start, moved, 65 * np.log(2), 10.0)
     np.testing.assert_allclose(half, [0.0, 0.005, 0.003])  # half is kept, half is done
+
+
+def test_clocks_are_the_mean_of_the_last_steps_and_what_they_share_is_the_last_one_s():
+    rng = np.random.default_rng(2)
+    steps = np.arange(0, 1001, 5.0)
+    own, shared = np.array([0.0, 1.0, -2.0]), 0.01 * steps[:, None]  # the scene drifts, and all clocks with it
+    shaken = own + shared + 0.1 * rng.standard_normal((len(steps), 3))
+    found = averaged(np.column_stack([steps, shaken]))
+    assert np.abs(found - found[0] - own).max() < 0.06  # one step by itself is off by .1
+    assert found.mean() == pytest.approx(shaken[-1].mean())
+    early = shaken.copy()
+    early[steps < 800] += [0, 50, -50]
+    np.testing.assert_allclose(averaged(np.column_stack([steps, early])), found)
+    np.testing.assert_allclose(averaged(np.array([[0.0, 1, 2], [0, 1, 2]])), [1, 2])  # no step at all
