@@ -144,6 +144,7 @@ class Eval:
         from otsync.files.cache import Cache
         from otsync.progress import Progress
         from otsync.types import Offsets
+        from recon.evaluate.figures import WINDOW, coherence_of
         from recon.pipeline.verb import evaluate, offset_figures, true_seconds
         from recon.result.folder import load_result, metrics_of
 
@@ -172,6 +173,10 @@ class Eval:
                 progress=Progress(tell),
             )
         document, lines = metrics_of(views, {}, reason), [view_table(views, reason)]
+        changed = coherence_of(result.scene)
+        document["motion"] = {"neighbour_change_pixels": changed, "window_seconds": WINDOW}
+        if changed is not None:
+            lines.append(f"motion: within {WINDOW:g} s distances of neighbours change by {changed:.2f} working pixels")
         if self.truth is not None:
             error = offset_figures(result.offsets, true_seconds(Offsets.load(self.truth), result.offsets))
             if error["mean_frames"] is None:

@@ -21,7 +21,10 @@ from torch import Tensor
 from recon.evaluate.lpips import Lpips
 from recon.losses.ssim import ssim_map
 from recon.losses.window import STANDARD
+from recon.scene.gaussians4d import Gaussians4D
 
+WINDOW = 48 / 30  # seconds over which distances of neighbours are compared
+FAINT = 0.1  # opacity from which on a Gaussian is seen
 SMALLEST_MASK = 50  # pixels: with fewer, a frame has no figures for what moves
 
 
@@ -90,6 +93,21 @@ def coherence(tracks: Float[np.ndarray, "N T 3"], neighbours: int = 3, moment: i
     _, near = cKDTree(tracks[:, moment]).query(tracks[:, moment], k=neighbours + 1)
     apart = np.linalg.norm(tracks[near[:, 1:]] - tracks[:, None], axis=-1)
     return float(np.median(np.abs(apart - apart[..., moment : moment + 1]).mean(2)))
+
+
+def coherence_of(scene: Gaussians4D, seconds: float = WINDOW) -> float | None:
+    """:func:`coherence` of a scene's own Gaussians in working pixels: the mean over windows of ``seconds``.
+
+    Faint ones do not count. None for a scene that is too small, or shorter than a window of two frames.
+    """
+    times = np.arange(math.ceil(scene.span[0] / scene.frame_step), scene.span[1] / scene.frame_step) * scene.frame_step
+    length = min(round(seconds / scene.frame_step), len(times))
+    seen = scene.dynamic.opacities.detach().numpy() > FAINT
+    if length < 2 or seen.sum() < 4:
+        return None
+    starts = range(0, len(times) - length + 1, length)
+    told = [coherence(scene.tracks(times[k : k + length])[seen]) for k in starts]
+    return float(np.mean(told)) / scene.footprint
 
 
 @dataclass(frozen=True)

@@ -136,7 +136,7 @@ class FromImages(Start):
     reads_geometry: ClassVar[bool] = False
     ignores: ClassVar[tuple[str, ...]] = (
         *OnTracks.ignores,
-        *("scaffold.robust", "scaffold.smooth.acceleration", "seeding.support", "seeding.reach"),
+        *("scaffold.robust", "scaffold.smooth.acceleration", "seeding.support", "seeding.share", "seeding.reach"),
     )
 
     def __call__(self, given: Given) -> Gaussians4D:

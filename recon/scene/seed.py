@@ -33,6 +33,9 @@ logger = logging.getLogger("recon.seed")
 INSIDE = 230
 """Masks of 0..255 from which a pixel shows only what moves: at edges the background's colour and depth mix in."""
 
+NEARBY, MOST_NEARBY = 2.5, 48
+"""Voxels around one that it is compared with, and how many of them at most."""
+
 APART = 8 * 1 / 30
 """Seconds between the moments at which seeds are taken."""
 
@@ -45,6 +48,9 @@ class Seeding:
     """Working pixels between the Gaussians that what moves begins with: finer is slower and shows more."""
     support: int = 2
     """Pixels that must have seen a voxel, so that stray depths seed nothing."""
+    share: float = 0.25
+    """Of the pixels that the fullest voxel nearby has seen it, which a voxel must have: noisy depth makes a thick shell
+    around a surface, and its middle is the fullest."""
     reach: float = 1.3
     """Voxels within which a Gaussian of an earlier moment counts as being there already."""
     scale: float = 0.55
@@ -58,6 +64,7 @@ class Seeding:
         for name in ("voxel", "reach", "scale"):
             check_number(name, getattr(self, name))
         check_whole("support", self.support, 1)
+        check_number("share", self.share, 0, 1)
         check_number("opacity", self.opacity, 0, 1)
         check_whole("sh_degree", self.sh_degree, 0, 4)
 
@@ -134,9 +141,11 @@ def cloud_at(
 
 
 def thinned(
-    points: Float[np.ndarray, "P 3"], colors: Float[np.ndarray, "P 3"], voxel: float, support: int
+    points: Float[np.ndarray, "P 3"], colors: Float[np.ndarray, "P 3"], voxel: float, support: int, share: float = 0.0
 ) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 3"]]:
-    """Mean position and colour of every voxel that at least ``support`` points fell into."""
+    """Mean position and colour of voxels that hold ``support`` points, and a ``share`` of the fullest one's nearby."""
+    if not len(points):
+        return points, colors
     _, inverse, count = np.unique(
         np.floor(points / voxel).astype(np.int64), axis=0, return_inverse=True, return_counts=True
     )
@@ -146,8 +155,11 @@ def thinned(
         sums = [np.bincount(inverse, values[:, c], len(count)) for c in range(3)]
         return np.stack(sums, 1) / np.maximum(count, 1)[:, None]
 
-    keep = count >= support
-    return mean(points)[keep], mean(colors)[keep]
+    middles = mean(points)
+    near = cKDTree(middles).query(middles, range(1, MOST_NEARBY + 1), distance_upper_bound=NEARBY * voxel)[1]
+    fullest = np.append(count, 0)[near].max(1)
+    keep = (count >= support) & (count >= share * fullest)
+    return middles[keep], mean(colors)[keep]
 
 
 def seed(
@@ -198,6 +210,7 @@ def seed(
                 ),
                 voxel,
                 options.support,
+                options.share,
             )
             if len(means) and len(points):
                 here = motion.warp(means, _upright(len(means)), float(t))[0].detach().numpy()

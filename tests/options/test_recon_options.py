@@ -98,6 +98,7 @@ PLAN = {
     "scaffold.blend": "--scaffold.blend dual-quaternion",
     "seeding.voxel": "--voxel 4",
     "seeding.support": "--seeding.support 3",
+    "seeding.share": "--seeding.share 0.9",
     "seeding.reach": "--seeding.reach 0.5",
     "seeding.scale": "--seeding.scale 0.8",
     "seeding.opacity": "--seeding.opacity 0.5",
@@ -172,7 +173,7 @@ def plain(x: Any) -> Any:
 def lighter() -> Iterator[pytest.MonkeyPatch]:
     """Fits that do not ask how sure the clocks are, which takes longer than a few steps and is no option."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("recon.fit.run.Run.sigma", lambda self, values: np.zeros(len(self.problem.clips)))
+        patch.setattr("recon.fit.run.Run.sigma", lambda self, values, map: np.zeros(len(self.problem.clips)))
         yield patch
 
 

@@ -276,7 +276,7 @@ def test_every_row_can_be_measured_and_a_seed_is_the_fits_too(world, monkeypatch
         return fit(scene, footage, offsets, options)
 
     monkeypatch.setattr(bench, "fit", spied)
-    monkeypatch.setattr("recon.fit.run.Run.sigma", lambda self, values: np.zeros(len(self.problem.clips)))
+    monkeypatch.setattr("recon.fit.run.Run.sigma", lambda self, values, map: np.zeros(len(self.problem.clips)))
     cache = world[2]
     for name in names:
         row = OWN[name]

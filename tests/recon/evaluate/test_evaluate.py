@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from recon.bench import paper_table
 from recon.evaluate import figures as evaluate
-from recon.evaluate.figures import acceleration, coherence, following_error, psnr, score_image, ssim
+from recon.evaluate.figures import acceleration, coherence, coherence_of, following_error, psnr, score_image, ssim
 from recon.evaluate.lpips import Lpips
 
 
@@ -107,6 +108,27 @@ def test_coherence_is_zero_for_rigid_motion_and_measures_growth():
     assert coherence(line, neighbours=2, moment=0) > 1.5 * expected
     with pytest.raises(ValueError, match="tracks"):
         coherence(tracks[:3])
+
+
+def test_coherence_of_a_scene_is_that_of_its_windows_in_pixels_without_what_is_faint():
+    points = np.random.default_rng(0).normal(size=(30, 1, 3))
+    faint = np.arange(30) >= 20
+
+    def tracks(times):
+        grown = points * (1 + 0.1 * np.asarray(times)[None, :, None])
+        return np.where(faint[:, None, None], 50 * grown, grown)
+
+    opacities = torch.tensor(np.where(faint, 0.05, 0.9), requires_grad=True)
+    dynamic = SimpleNamespace(opacities=opacities)
+    scene = SimpleNamespace(span=(0.0, 95 / 30), frame_step=1 / 30, footprint=0.02, dynamic=dynamic, tracks=tracks)
+    times = np.arange(95) / 30
+    windows = [coherence(tracks(times[k : k + 48])[~faint]) for k in (0,)]  # what is left is shorter than a window
+    assert coherence_of(scene) == pytest.approx(windows[0] / 0.02)
+    halves = [coherence(tracks(times[k : k + 24])[~faint]) for k in (0, 24, 48)]
+    assert coherence_of(scene, 24 / 30) == pytest.approx(np.mean(halves) / 0.02)
+    assert coherence_of(SimpleNamespace(**{**vars(scene), "span": (0.0, 1 / 30)})) is None
+    nothing = SimpleNamespace(opacities=torch.full((30,), 0.01))
+    assert coherence_of(SimpleNamespace(**{**vars(scene), "dynamic": nothing})) is None
 
 
 def test_following_error_is_what_the_tracks_drift_by():

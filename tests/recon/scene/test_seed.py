@@ -77,6 +77,24 @@ def test_thinning_keeps_means_and_needs_support():
     assert sorted(at[:, 0].tolist()) == pytest.approx([-0.15, 0.2]) and len(color) == 2
 
 
+def test_a_thick_shell_is_thinned_to_its_middle():
+    rng = np.random.default_rng(1)
+    flat = np.stack([*rng.uniform(0, 20, (2, 60_000)), rng.normal(0, 1.5, 60_000)], 1)  # a surface, seen unsurely
+    edge = np.stack([*rng.uniform(30, 40, (2, 900)), np.full(900, 0.5)], 1)  # another one, which few pixels show
+    points = np.concatenate([flat, edge])
+    thick, _ = thinned(points, points, 1.0, 2)
+    thin, _ = thinned(points, points, 1.0, 2, 0.25)
+    thick_by, thin_by = (np.percentile(np.abs(found[:, 2]), 90) for found in (thick, thin))
+    assert thick_by > 3 > thin_by > 1.5
+    assert len(thin) < 0.7 * len(thick)
+
+    def at_edge(found):
+        return (found[:, 0] > 29).sum()
+
+    assert at_edge(thin) > 0.97 * at_edge(thick) > 90  # only what stands beside something fuller is left out
+    assert thinned(points[:0], points[:0], 1.0, 2, 0.25)[0].shape == (0, 3)
+
+
 def test_later_moments_add_only_what_is_new(capture):
     whole = planted(capture)
     count = np.bincount(whole.motion.binding.rest.numpy())
