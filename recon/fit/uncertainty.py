@@ -33,8 +33,8 @@ GOLDEN = (5**0.5 - 1) / 2
 AVERAGED = 0.8  # share of the steps from which on clocks are averaged: Adam's last steps still shake each of them
 BEFORE = 0.6  # and from which on those are that they are held against
 LEFT = 1.5  # of the last move that is still to go: .6 / (1 - .6)
-IMAGES = 65  # of a video, after which a fit keeps 1/e of the error that its start had: filmed rigs, docs/trust.md
-EPOCHS = 0.7  # times that it has then seen every frame; the motion, which carries the start's clocks, is local in time
+IMAGES = 75  # of a video, after which a fit keeps 1/e of the error that its start had: filmed rigs, docs/trust.md
+EPOCHS = 0.8  # times that it has then seen every frame; the motion, which carries the start's clocks, is local in time
 
 
 def newton_sigma(

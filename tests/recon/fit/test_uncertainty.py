@@ -166,7 +166,7 @@ def test_a_fit_that_has_seen_few_pictures_keeps_its_start_s_error():
     assert few[2] > 0.003  # it has gone a small part of its way: most is still to go
     long_clip = unseen(start, moved, 200.0, 0.2)  # every frame hardly once
     assert long_clip[1] > unseen(start, moved, 200.0, 3.0)[1]
-    half = unseen(start, moved, 65 * np.log(2), 10.0)
+    half = unseen(start, moved, 75 * np.log(2), 10.0)
     np.testing.assert_allclose(half, [0.0, 0.005, 0.003])  # half is kept, half is done
 
 
