@@ -121,7 +121,7 @@ def test_the_fields_of_a_reconstruction(tmp_path):
     score = ViewScore("a", Clock(), gain, times, (), dict.fromkeys(names, 1.0))
     metrics = metrics_of([score], {"steps": 1.0}, "no weights")
     listed = set(rows("docs/formats.md", "metrics.json"))
-    assert listed == {*metrics, *metrics["views"][0], "offset_error"}
+    assert listed == {*metrics, *metrics["views"][0], "offset_error", "motion"}
 
 
 def test_the_readme_is_short_and_begins_with_what_it_is():
