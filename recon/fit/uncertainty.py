@@ -4,12 +4,13 @@ At the end of a fit each frame of a video proposes one Gauss-Newton step of that
 
     g_k = sum_pixels r dI/dt,   h_k = sum_pixels (dI/dt)^2,   step = - sum_k g_k / sum_k h_k
 
-with the residuals r of its pixels. Pixels of one frame err together (a wrong shape, a highlight), frames further apart
-much less: so frames, not pixels, are taken as independent (a sandwich estimate, White 1980). What the frames agree on
-beyond the answer is a bias that the fit did not follow, and is added. The motion is held, so this is a lower bound:
-what a short fit has not settled yet is added too (:func:`unsettled`), what it could not have reached
-(:func:`unreached`), and what it still has from its start (:func:`unseen`); the clock that the fit began with, where it
-has a sigma of its own, is the other witness (:func:`reconciled`).
+with the residuals r of its pixels. Pixels of one frame err together (a wrong shape, a highlight), and frames while what
+they show moves one way; those further apart much less: so stretches of frames, not pixels, are taken as independent (a
+sandwich estimate, White 1980). What the frames agree on beyond the answer is a bias that the fit did not follow, and is
+added. The motion is held, so this is a lower bound, and another one stands beside it: a scene that shows its frames
+badly may do so by its clocks (:func:`by_misfit`). What a short fit has not settled yet is added (:func:`unsettled`),
+what it could not have reached (:func:`unreached`), and what it still has from its start (:func:`unseen`); the clock
+that the fit began with, where it has a sigma of its own, is the other witness (:func:`reconciled`).
 """
 
 from __future__ import annotations
@@ -30,6 +31,8 @@ FRAMES = 48
 CONTRADICTION = 3.0  # sigmas between two answers, from which one of them is wrong
 STEP = 0.1  # frames between the instants of the central difference, half
 GOLDEN = (5**0.5 - 1) / 2
+MISFIT = 0.1  # s; of filmed rigs and rooms whose fits were short or poor: docs/trust.md
+STRETCHES = 4  # of a clip that a variance is taken from, at least
 AVERAGED = 0.8  # share of the steps from which on clocks are averaged: Adam's last steps still shake each of them
 BEFORE = 0.6  # and from which on those are that they are held against
 LEFT = 1.5  # of the last move that is still to go: .6 / (1 - .6)
@@ -62,7 +65,7 @@ def newton_sigma(
             continue
         chosen = own[scattered(len(own), frames)]
         votes = np.array(list(map(partial(_vote, look, target, STEP * frame_step, v), chosen.tolist())))
-        variance[v] = sandwich(votes[:, 0], votes[:, 1])
+        variance[v] = max(sandwich(votes[:, 0], votes[:, 1]), by_misfit(votes[:, 2], votes[:, 3]) ** 2)
     sigma = np.sqrt(variance + variance[reference])
     sigma[reference] = 0.0
     return sigma
@@ -199,18 +202,41 @@ def repeated(
 
 
 def sandwich(g: np.ndarray, h: np.ndarray) -> float:
-    """Variance of -sum(g)/sum(h) about zero, with the terms taken as independent; nan when h vanishes."""
+    """Variance of -sum(g)/sum(h) about zero, with stretches of the terms taken as independent; nan when h vanishes.
+
+    The stretches are as long as makes the variance largest: where a shape is wrong, frames err together for as long as
+    it moves one way. One of them has a single term at the least, and there are :data:`STRETCHES` at the least.
+    """
     total = h.sum()
     if not total > 0 or len(g) < 2:
         return float("nan")
     step = -g.sum() / total
-    spread = len(g) / (len(g) - 1) * np.square(g + h * step).sum() / total**2
-    return float(spread + step**2)
+    left, spread = g + h * step, 0.0
+    for length in range(1, max(1, len(g) // STRETCHES) + 1):
+        each = np.add.reduceat(left, np.arange(0, len(g), length))
+        spread = max(spread, len(each) / (len(each) - 1) * float(np.square(each).sum()))
+    return spread / float(total) ** 2 + float(step) ** 2
 
 
-def _vote(look: Look, target: Target, step: float, v: int, k: int) -> tuple[float, float]:
-    """(g, h) of one frame."""
+def by_misfit(residual: np.ndarray, rate: np.ndarray) -> float:
+    """One sigma in seconds, of what a scene that shows frames badly may have made of their clock.
+
+    The residuals are as large as if time were off by tau from place to place: tau² = Σ w r² / Σ w (dI/dt)² over the
+    pixels, by w = (dI/dt)², so that what stands still does not count. What of it the clock takes grows with tau itself:
+    a body that is shown badly is shown so alike in many frames. So sigma is tau² / :data:`MISFIT`, as it is of tracks
+    (``otsync.refine.splines.COMMON_ERRORS``).
+
+    Args:
+        residual, rate: the two sums of every frame.
+    """
+    return float(residual.sum() / rate.sum()) / MISFIT if rate.sum() > 0 else 0.0
+
+
+def _vote(look: Look, target: Target, step: float, v: int, k: int) -> tuple[float, float, float, float]:
+    """(g, h) of one frame, and its sums for :func:`by_misfit`."""
     with torch.no_grad():  # per thread
         residual = (look(v, k, 0.0) - target(v, k)).double()
         rate = (look(v, k, step) - look(v, k, -step)).double() / (2 * step)
-    return float((residual * rate).sum()), float(rate.square().sum())
+    weight = rate.square().mean(-1, keepdim=True)
+    misfit, pace = (weight * residual.square()).sum(), (weight * rate.square()).sum()
+    return float((residual * rate).sum()), float(rate.square().sum()), float(misfit), float(pace)
