@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..clocks.common import CommonClock
+from ..compute.indices import blocks
 from .peaks import vertex
 from .signal import Signal
 
@@ -88,13 +89,16 @@ def local_curves(
     def frames(seconds: float) -> int:
         return max(1, round(seconds * pair.fps))
 
-    a, b = Signal.of(pair.a), Signal.of(pair.b)
     step = frames(STEP)
     count = -(-pair.a.shape[1] // step) + 1
     out = np.zeros((count, len(lags)))
     begin = np.zeros(len(lags), np.int64)
-    kernels.windowed_evidence(*a.arrays, *b.arrays, lags, begin, step, frames(LEAST_WINDOW), floor, weight, out)
-    return out / max(len(pair.a), 1)
+    for some in blocks(len(pair.a), max(pair.a.shape[1], pair.b.shape[1])):  # of long clips few matches at a time
+        a, b = Signal.of(pair.a[some]), Signal.of(pair.b[some])
+        arrays = *a.arrays, *b.arrays, lags, begin, step, frames(LEAST_WINDOW), floor, weight[some], out
+        kernels.windowed_evidence(*arrays)
+    out /= max(len(pair.a), 1)
+    return out
 
 
 def path_of(curves: Float[np.ndarray, "W K"], price: float) -> Int[np.ndarray, " W"]:

@@ -220,18 +220,19 @@ def window_score(
     """
     from . import kernels
 
-    a, b = Signal.of(pair.a), Signal.of(pair.b)
-
     def frames(seconds: float) -> int:
         return max(1, round(seconds * pair.fps))
 
     def at(some: Int[np.ndarray, " L"]) -> Float[np.ndarray, " L"]:
         total, begin = np.zeros((1, len(some))), np.maximum(some, 0)  # treats a and b alike
         block, few = frames(BLOCK), frames(MIN_WINDOW)
-        kernels.windowed_evidence(*a.arrays, *b.arrays, some, begin, block, few, floor, weight, total)
+        for part in blocks(len(pair.a), max(pair.a.shape[1], pair.b.shape[1])):  # of long clips few matches at a time
+            a, b = Signal.of(pair.a[part]), Signal.of(pair.b[part])
+            arrays = *a.arrays, *b.arrays, some, begin, block, few, floor, weight[part], total
+            kernels.windowed_evidence(*arrays)
         return total[0] / len(pair.a)
 
-    if direct(a, b, lags):
+    if direct(pair.a.shape[:2], pair.b.shape[1], lags):
         return at(lags)
     some, common = evenly(len(lags), BACKGROUND), pair.overlap(lags)
     score = common * float(np.median(at(lags[some]) / common[some]))
@@ -261,18 +262,22 @@ def statistics(
     """Frames in common, Var a + Var b and Var(a - b) of every match at every lag."""
     from . import kernels
 
-    if not direct(a, b, lags):
+    if not direct(a.arrays[1].shape, b.arrays[1].shape[1], lags):
         return lag_statistics(a, b, lags, least)
     out = tuple(np.zeros((len(a.arrays[0]), len(lags))) for _ in range(3))
     kernels.lag_statistics(*a.arrays, *b.arrays, lags, least, *out)
     return out  # type: ignore[return-value]
 
 
-def direct(a: Signal, b: Signal, lags: Int[np.ndarray, " K"]) -> bool:
-    """Whether sums over the common frames of every match and lag are made one by one: see :data:`DIRECT`."""
-    Ta, Tb = a.arrays[0].shape[2], b.arrays[0].shape[2]
+def direct(a: tuple[int, ...], Tb: int, lags: Int[np.ndarray, " K"]) -> bool:
+    """Whether sums over the common frames of every match and lag are made one by one: see :data:`DIRECT`.
+
+    Args:
+        a: matches, and frames of the first video. Tb: frames of the second.
+    """
+    M, Ta = a
     common = np.minimum(Ta, Tb + lags) - np.maximum(0, lags)
-    return len(a.arrays[0]) * float(np.maximum(common, 0).sum()) <= DIRECT
+    return M * float(np.maximum(common, 0).sum()) <= DIRECT
 
 
 def noise_floor(count: np.ndarray, power: np.ndarray, residual: np.ndarray) -> float:

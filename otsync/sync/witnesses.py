@@ -13,7 +13,7 @@ import math
 
 import numpy as np
 
-from ..clocks.common import readable, strongest
+from ..clocks.common import readable, strongest, thinned
 from ..refine.common_motion import common_motion
 from ..refine.gauss_newton import fit_clock, neighbours
 from ..refine.splines import SplineRefine
@@ -98,7 +98,8 @@ def left_over(answer: Answer, job: Job) -> Job | None:
     rest = [np.setdiff1d(np.arange(len(t)), column) for t, column in zip((a, b), explained.T, strict=True)]
     if min(map(len, rest)) < REST:
         return None
-    return dataclasses.replace(job, a=a.take(rest[0]), b=b.take(rest[1]))
+    # of a long clip every few frames tell as much, and take less
+    return dataclasses.replace(job, a=thinned(a).take(rest[0]), b=thinned(b).take(rest[1]))
 
 
 def once_more(job: Job, first: Answer) -> list[Job]:
