@@ -7,10 +7,11 @@ At the end of a fit each frame of a video proposes one Gauss-Newton step of that
 with the residuals r of its pixels. Pixels of one frame err together (a wrong shape, a highlight), and frames while what
 they show moves one way; those further apart much less: so stretches of frames, not pixels, are taken as independent (a
 sandwich estimate, White 1980). What the frames agree on beyond the answer is a bias that the fit did not follow, and is
-added. The motion is held, so this is a lower bound, and another one stands beside it: a scene that shows its frames
-badly may do so by its clocks (:func:`by_misfit`). What a short fit has not settled yet is added (:func:`unsettled`),
-what it could not have reached (:func:`unreached`), and what it still has from its start (:func:`unseen`); the clock
-that the fit began with, where it has a sigma of its own, is the other witness (:func:`reconciled`).
+added. Where videos are few, the motion itself could take up much of a clock's error. All this is a lower bound, and
+another one stands beside it: a scene that shows its frames badly may do so by its clocks (:func:`by_misfit`). What a
+short fit has not settled yet is added (:func:`unsettled`), what it could not have reached (:func:`unreached`), and what
+it still has from its start (:func:`unseen`); the clock that the fit began with, where it has a sigma of its own, is the
+other witness (:func:`reconciled`).
 """
 
 from __future__ import annotations
@@ -66,6 +67,9 @@ def newton_sigma(
         chosen = own[scattered(len(own), frames)]
         votes = np.array(list(map(partial(_vote, look, target, STEP * frame_step, v), chosen.tolist())))
         variance[v] = max(sandwich(votes[:, 0], votes[:, 1]), by_misfit(votes[:, 2], votes[:, 3]) ** 2)
+    shown = int(np.isfinite(variance).sum())
+    if shown > 1:  # V videos have 2 V numbers of a point, three of which tell where it is, and none of time
+        variance *= 2 * shown / (2 * shown - 3)
     sigma = np.sqrt(variance + variance[reference])
     sigma[reference] = 0.0
     return sigma
