@@ -44,7 +44,7 @@ APART = 8 * 1 / 30
 class Seeding:
     """How densely Gaussians begin."""
 
-    voxel: tyro.conf.OmitArgPrefixes[float] = 2.3
+    voxel: tyro.conf.OmitArgPrefixes[float] = 2.7
     """Working pixels between the Gaussians that what moves begins with: finer is slower and shows more."""
     support: int = 2
     """Pixels that must have seen a voxel, so that stray depths seed nothing."""

@@ -1123,8 +1123,8 @@ BREAKS = (
     Break(
         "fit-sigma-without-bias",
         "recon/fit/uncertainty.py",
-        "return float(spread + step**2)",
-        "return float(spread)",
+        "return spread / float(total) ** 2 + float(step) ** 2",
+        "return spread / float(total) ** 2",
         SIGMA,
         "sigma forgets the step on which all frames agree",
     ),
