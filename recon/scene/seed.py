@@ -50,7 +50,7 @@ class Seeding:
     """Pixels that must have seen a voxel, so that stray depths seed nothing."""
     share: float = 0.25
     """Of the pixels that the fullest voxel nearby has seen it, which a voxel must have: noisy depth makes a thick shell
-    around a surface, and its middle is the fullest."""
+    around a surface, and its middle is the fullest. 0: the whole shell."""
     reach: float = 1.3
     """Voxels within which a Gaussian of an earlier moment counts as being there already."""
     scale: float = 0.55
@@ -64,7 +64,8 @@ class Seeding:
         for name in ("voxel", "reach", "scale"):
             check_number(name, getattr(self, name))
         check_whole("support", self.support, 1)
-        check_number("share", self.share, 0, 1)
+        if self.share != 0:
+            check_number("share", self.share, 0, 1)
         check_number("opacity", self.opacity, 0, 1)
         check_whole("sh_degree", self.sh_degree, 0, 4)
 

@@ -240,7 +240,7 @@ def test_the_soft_norm_is_smooth_and_zero_at_zero():
 
 
 def test_weights_are_the_studys_but_for_neighbours():
-    """1.0 and .02 a metre for acceleration and velocity, where a footprint is 1.33 cm; between five and six times the .6 of ARAP
+    """1.0 and .02 a metre for acceleration and velocity, where a footprint is 1.33 cm; five to six times the .6 of ARAP
     and lengths: fits are longer than the study's, and coherence goes as they go on.
     """
     usual = [loss for loss in DEFAULT_LOSSES if isinstance(loss, MotionLoss)]
