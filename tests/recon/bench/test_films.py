@@ -48,6 +48,15 @@ def test_answers_are_held_against_the_truth(tmp_path, monkeypatch):
     assert asked == ["depth", "stereo"]  # the fit begins from the answer with depth that is there already
 
 
+def test_a_video_that_an_answer_leaves_out_is_refused():
+    names = ("a", "b", "c")
+    truth = Offsets.known(names, np.array([0, 1, 2]) / 30, 30.0)
+    found = replace(Offsets.known(("a", "c"), np.array([0, 2.5]) / 30, 30.0), sigma=np.array([0, 0.01]))
+    b, c = films.told("fit", 3, names, found, truth)
+    assert b["error"] is None and not b["trusted"] and b["flags"] == "refused"
+    assert c["error"] == pytest.approx(0.5) and c["sigma"] == pytest.approx(0.3) and c["trusted"]
+
+
 def test_a_route_that_there_is_not_is_refused(tmp_path):
     with pytest.raises(ValueError, match="--only: expected routes among depth, pixels, stereo, fit; found deep"):
         films.run(tmp_path, only=("deep",))
