@@ -140,7 +140,7 @@ def told(route: str, seed: int, names: Sequence[str], found: Offsets | None, tru
             "video": name,
             "error": None if error is None else float(error),
             "sigma": None if sigma is None else float(sigma),
-            "trusted": found is not None and v is not None and answered and found.status[v].ok,
+            "trusted": bool(found is not None and v is not None and answered and found.status[v].ok),
             "flags": "refused" if found is None or v is None else " ".join(flag.code for flag in found.flags[v]),
         }
 

@@ -53,7 +53,7 @@ def test_a_video_that_an_answer_leaves_out_is_refused():
     truth = Offsets.known(names, np.array([0, 1, 2]) / 30, 30.0)
     found = replace(Offsets.known(("a", "c"), np.array([0, 2.5]) / 30, 30.0), sigma=np.array([0, 0.01]))
     b, c = films.told("fit", 3, names, found, truth)
-    assert b["error"] is None and not b["trusted"] and b["flags"] == "refused"
+    assert b["error"] is None and b["trusted"] is False and b["flags"] == "refused"
     assert c["error"] == pytest.approx(0.5) and c["sigma"] == pytest.approx(0.3) and c["trusted"]
 
 
