@@ -600,7 +600,7 @@ def test_a_fit_that_was_too_short_does_not_claim_its_clocks(capture):
     start = replace(believed(capture), sigma=np.array([0.0, 0.35, 0.35]) / 30)
     scene = true_scene(capture)
     short = fit(scene, capture.footage, start, steps=40, seed=3).offsets
-    # 27 images a video keep exp(-27 / 75) of what was unknown
+    # 27 images a video keep exp(-27 / 90) of what was unknown
     assert (short.sigma[1:] * 30 > 0.24).all()
     longer = fit(scene, capture.footage, start, steps=360, seed=3).offsets  # 240 images a video
     assert (longer.sigma[1:] < 0.7 * short.sigma[1:]).all()
