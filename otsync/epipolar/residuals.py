@@ -13,14 +13,9 @@ from ..clocks.common import in_space
 from ..clocks.splines import TrackSplines
 from ..compute.medians import known_median
 from ..geometry import seen_pixels
-from ..refine.common_error import Sums
+from ..refine.common_error import FITTED, Sums
 from ..refine.gauss_newton import CLUSTER, GROUPS, jackknife, neighbours
 from ..types import TrackSet
-
-COMMON = 3.4
-"""Factor on the error that residuals show to be common: with it 68 % of the answers from pixels of filmed scenes lie
-within one sigma (`otsync bench films`, seeds 80 to 91 and 400 to 413). From depth less is needed: here every pixel of a
-limb is a candidate for every other, and all of them slide together."""
 
 MAD = 1.4826
 """Median absolute deviation to standard deviation."""
@@ -150,7 +145,7 @@ class Residuals:
         """One sigma, s, of errors that tracks have in common: see :func:`otsync.refine.common_error.common_error`."""
         R, J = found.residual[..., None], found.slope[..., None]
         sums = Sums.of(R, J, found.weight, self.group, 2 * round(window * self.fps))
-        return COMMON * math.sqrt(sums.variance())
+        return FITTED * math.sqrt(sums.variance())
 
     def scatter(self, found: Step) -> float:
         """One sigma, s: by neighbourhoods of tracks or by blocks of time, whichever is larger."""

@@ -444,7 +444,7 @@ def test_a_start_that_is_only_coarse_is_judged_by_the_fit(world, tmp_path, capsy
         video |= {"sigma_seconds": 0.5 / 30, "status": "coarse", "flags": ["coarse"]}
     (tmp_path / "o.json").write_text(json.dumps(document))
     args = ["fit", str(world), "--offsets", str(tmp_path / "o.json"), "--out", str(tmp_path / "r"), "--width", "96"]
-    args += ["--backdrop-steps", "9", "--steps", "60", "--held-out", "held0"]
+    args += ["--backdrop-steps", "9", "--steps", "120", "--held-out", "held0"]
     code = main(args if refined else [*args, "--freeze", "offsets"])
     told = capsys.readouterr().err
     offsets = load_result(tmp_path / "r").offsets
