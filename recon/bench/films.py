@@ -126,23 +126,28 @@ def fitted(scene: Scene, start: Offsets | None, out: Path, cache: Cache, map: Ma
 
 def told(route: str, seed: int, names: Sequence[str], found: Offsets | None, truth: Offsets) -> Iterator[Row]:
     """A row for every video but the first, which is the reference; without error and sigma where there is no answer."""
+    reference = truth.names.index(names[0])
     for name in names[1:]:
-        # a fit leaves out what was not synchronised
-        v = found.names.index(name) if found is not None and name in found.names else None
-        answered = found is not None and v is not None and np.isfinite(found.seconds[v]) and found.component[v] == 0
-        error = sigma = None
-        if found is not None and v is not None and answered:
-            known = truth.between(truth.names.index(names[0]), truth.names.index(name))
-            error, sigma = abs(found.between(0, v) - known) * found.fps[0], found.sigma[v] * found.fps[0]
-        yield {
+        row: dict[str, Any] = {
             "route": route,
             "seed": seed,
             "video": name,
-            "error": None if error is None else float(error),
-            "sigma": None if sigma is None else float(sigma),
-            "trusted": bool(found is not None and v is not None and answered and found.status[v].ok),
-            "flags": "refused" if found is None or v is None else " ".join(flag.code for flag in found.flags[v]),
+            "error": None,
+            "sigma": None,
+            "trusted": False,
         }
+        # a fit leaves out what was not synchronised
+        v = found.names.index(name) if found is not None and name in found.names else None
+        if found is None or v is None:
+            yield row | {"flags": "refused"}
+            continue
+        row["flags"] = " ".join(flag.code for flag in found.flags[v])
+        if np.isfinite(found.seconds[v]) and found.component[v] == 0:
+            known = truth.between(reference, truth.names.index(name))
+            row["error"] = float(abs(found.between(0, v) - known) * found.fps[0])
+            row["sigma"] = float(found.sigma[v] * found.fps[0])
+            row["trusted"] = found.status[v].ok
+        yield row
 
 
 def summary(route: str, rows: Sequence[Row]) -> Row:

@@ -32,7 +32,7 @@ from recon.backdrop.fit import StaticFit
 from recon.bench.configurations import Configuration, check_heeded, configurations
 from recon.bench.plot import plot
 from recon.bench.rows import KEY, find, measured_before, paper_tables
-from recon.evaluate.figures import acceleration, coherence, following_error
+from recon.evaluate.figures import FAINT, acceleration, coherence, following_error
 from recon.evaluate.lpips import Lpips
 from recon.evaluate.views import view
 from recon.fit.options import FitOptions
@@ -282,7 +282,7 @@ def motion_figures(scene: Gaussians4D, ready: Prepared, kept: Sequence[TrackSet]
 
     kept: tracks that no row was built from, on the clocks of ``ready.offsets``. unit: footprint, alike for all rows.
     """
-    seen = scene.dynamic.opacities.detach() > 0.1
+    seen = scene.dynamic.opacities.detach() > FAINT
     times = np.arange(math.ceil(scene.span[0] / scene.frame_step), scene.span[1] / scene.frame_step) * scene.frame_step
     tracks = scene.tracks(times)[seen.numpy()]
     errors = []

@@ -76,7 +76,7 @@ def newton_sigma(
 
 
 def scattered(count: int, most: int) -> np.ndarray:
-    """Indices of at most ``most`` of ``count`` frames, one in each of as many equal stretches, at uneven distances.
+    """Indices of at most ``most`` of ``count`` frames, about one in each of as many stretches, at uneven distances.
 
     Knots of a motion stand at even distances, and what errs between two of them errs alike between the next two: frames
     at even distances would all err alike, or none of them would.
@@ -84,7 +84,7 @@ def scattered(count: int, most: int) -> np.ndarray:
     if count <= most:
         return np.arange(count)
     stretch = np.arange(most)
-    return ((stretch + stretch * GOLDEN % 1.0) * count / most).astype(int)
+    return np.unique(((stretch + stretch * GOLDEN % 1.0) * count / most).astype(int))
 
 
 def averaged(history: np.ndarray) -> np.ndarray:

@@ -236,18 +236,9 @@ def _finish(run: Run, seconds: float, map: MapLike) -> Reconstruction:
     refined, sigma = refined - drift, p.offsets.sigma[p.index]
     flags = list(p.offsets.flags)
     if "offsets" in run.adam.groups:
-        moving = unsettled(history, p.reference)
-        before = relative_sigma(sigma, p.reference)
-        images = run.step * p.batch / len(p.clips)
-        own = unseen(before, refined - p.start, images, run.step * p.batch / len(p.keys))
-        # votes of frames tell less than all where the start still speaks in each of them
-        fitted = np.hypot(np.fmax(run.sigma(values, map), own), moving)
-        together = repeated if p.offsets.stats.get(PHOTOMETRIC) else reconciled
-        refined, sigma, contradicted = together(p.start, before, refined, fitted, p.reference)
-        # what both have from the start is no better known for having been averaged
-        sigma = np.hypot(np.fmax(sigma, own), unreached(before, run.reach("offsets")))
-        for v in np.flatnonzero(contradicted):
-            flags[p.index[v]] = in_order((*flags[p.index[v]], Status.CONTRADICTED))
+        refined, sigma, raised = _witnessed(run, refined, sigma, run.sigma(values, map), history)
+        for v, flag in raised:
+            flags[p.index[v]] = in_order((*flags[p.index[v]], flag))
     clocks = torch.as_tensor(refined).to(values["offsets"])
     scene = replace(scene, motion=scene.motion.shifted(-drift, clocks)).to("cpu")
     offsets = replace(
@@ -270,6 +261,33 @@ def _finish(run: Run, seconds: float, map: MapLike) -> Reconstruction:
     }
     learned = {n: values[n].cpu() for n in initial_parameters(p.effects, len(p.clips))}
     return Reconstruction(scene, offsets, learned, told, stats)
+
+
+def _witnessed(
+    run: Run, refined: np.ndarray, start_sigma: np.ndarray, votes: np.ndarray, history: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, list[tuple[int, Status]]]:
+    """What start and pictures together say of the clocks: offsets and sigma [V], seconds, and flags by video.
+
+    Args:
+        refined: offsets of the fit. start_sigma: of the clocks that it began with. votes: sigma of the frames' votes.
+        history: as of :func:`recon.fit.uncertainty.averaged`.
+    """
+    p = run.problem
+    before = relative_sigma(start_sigma, p.reference)
+    seen = run.step * p.batch
+    own = unseen(before, refined - p.start, seen / len(p.clips), seen / len(p.keys))
+    # votes of frames tell less than all where the start still speaks in each of them
+    fitted = np.hypot(np.maximum(votes, own), unsettled(history, p.reference))
+    together = repeated if p.offsets.stats.get(PHOTOMETRIC) else reconciled
+    offsets, sigma, contradicted = together(p.start, before, refined, fitted, p.reference)
+    # what both have from the start is no better known for having been averaged
+    sigma = np.hypot(np.maximum(sigma, own), unreached(before, run.reach("offsets")))
+    # where nothing moves, in a video or in the reference, pictures tell nothing: the start stands
+    blind = ~np.isfinite(votes)
+    offsets, sigma = np.where(blind, p.start, offsets), np.where(blind, before, sigma)
+    raised = [(int(v), Status.CONTRADICTED) for v in np.flatnonzero(contradicted & ~blind)]
+    raised += [(int(v), Status.STATIC) for v in np.flatnonzero(blind & ~np.isfinite(before))]
+    return offsets, sigma, raised
 
 
 def _offsets_by_step(run: Run, reached: np.ndarray) -> np.ndarray:

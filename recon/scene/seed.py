@@ -49,8 +49,8 @@ class Seeding:
     support: int = 2
     """Pixels that must have seen a voxel, so that stray depths seed nothing."""
     share: float = 0.25
-    """Of the pixels that the fullest voxel nearby has seen it, which a voxel must have: noisy depth makes a thick shell
-    around a surface, and its middle is the fullest. 0: the whole shell."""
+    """Share of the pixels of the fullest voxel nearby that a voxel must hold: noisy depth makes a thick shell around a
+    surface, and the middle of the shell is the fullest. 0: the whole shell."""
     reach: float = 1.3
     """Voxels within which a Gaussian of an earlier moment counts as being there already."""
     scale: float = 0.55

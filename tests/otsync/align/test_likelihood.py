@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
 
 import numpy as np
 import pytest
 
 from otsync import LikelihoodScan, Matches, Refused, Status, TrackSet, align
+from otsync.align.breaks import local_curves
 from otsync.align.likelihood import Curves, Signal, evidence, noise_floor, statistics, velocity_score
 from otsync.align.peaks import separate_peaks, vertex
 from otsync.clocks.common import common_clock
@@ -229,3 +231,28 @@ def test_weights_count_matches_as_often_as_they_say():
     alone = [velocity_score(pair, lags, 2, 12, 12.0 * (np.arange(12) == m)) for m in range(12)]
     np.testing.assert_allclose(weighted, np.average(alone, axis=0, weights=weight))
     assert not np.allclose(weighted, velocity_score(pair, lags, 2, 12))
+
+
+def test_a_few_matches_at_a_time_say_what_all_of_them_say(monkeypatch):
+    """Long clips are read so; here every clip is long. Weights go with their matches."""
+    a, b = moving_pair(7, frames=120, n=11, noise=0.01)
+    matches = Matches(np.stack([np.arange(11)] * 2, 1), weight=np.linspace(0.2, 2.0, 11))
+    pair = common_clock(a, b, matches)
+    lags = np.arange(-30, 31)
+    whole = evidence(pair, lags, matches.shares).total, local_curves(pair, lags, 0.01, matches.shares)
+    parts = []
+
+    def three_at_a_time(rows, columns):
+        parts.append(rows)
+        return [slice(k, k + 3) for k in range(0, rows, 3)]
+
+    # ``otsync.align`` is a function, too, which hides the package from a path in words
+    scan, breaks = (sys.modules[f"otsync.align.{name}"] for name in ("likelihood", "breaks"))
+    for module in (scan, breaks):
+        monkeypatch.setattr(module, "blocks", three_at_a_time)
+    monkeypatch.setattr(scan, "DIRECT", 0)  # windows at the peaks alone
+    long = evidence(pair, lags, matches.shares).total
+    np.testing.assert_allclose(local_curves(pair, lags, 0.01, matches.shares), whole[1], rtol=1e-9, atol=1e-9)
+    assert np.argmax(long) == np.argmax(whole[0])
+    np.testing.assert_allclose(long.max(), whole[0].max(), rtol=1e-6)
+    assert parts and set(parts) == {11}

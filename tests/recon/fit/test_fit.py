@@ -604,3 +604,18 @@ def test_a_fit_that_was_too_short_does_not_claim_its_clocks(capture):
     assert (short.sigma[1:] * 30 > 0.24).all()
     longer = fit(scene, capture.footage, start, steps=360, seed=3).offsets  # 240 images a video
     assert (longer.sigma[1:] < 0.7 * short.sigma[1:]).all()
+
+
+@pytest.mark.parametrize(("known", "flag"), [(0.35, "coarse"), (np.nan, "static"), (0.0, None)])
+def test_a_video_in_which_nothing_moves_keeps_the_clock_that_it_began_with(capture, scene, known, flag):
+    """Its pictures tell nothing of time: neither the fit's answer nor its sigma is one."""
+    off = capture.footage[2]
+    turned = np.diag([-1.0, 1, -1, 1])
+    still = replace(off, w2c=turned @ off.w2c, images=np.repeat(off.images[:1], len(off.images), 0))
+    start = np.array([0.0, 0.3, 0.2]) / 30
+    told = replace(believed(capture, start), sigma=np.array([0, known, known]) / 30)
+    found = fit(scene, (*capture.footage[:2], still), told, steps=120).offsets
+    assert found.seconds[2] == pytest.approx(start[2])
+    np.testing.assert_allclose(found.sigma[2] * 30, known)
+    assert [f.code for f in found.flags[2]] == ([flag] if flag else [])
+    assert np.isfinite(found.sigma[1]) and found.seconds[1] != pytest.approx(start[1])

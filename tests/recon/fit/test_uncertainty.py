@@ -13,6 +13,7 @@ from recon.fit.uncertainty import (
     relative_sigma,
     repeated,
     sandwich,
+    scattered,
     unreached,
     unseen,
     unsettled,
@@ -214,3 +215,13 @@ def test_a_scene_that_shows_its_frames_badly_is_unsure_of_their_clocks():
         np.sqrt(2) * 2 * 0.02**2 / 0.08, rel=0.05
     )  # two videos: a quarter is left of what they tell
     assert sigma(0.01) == pytest.approx(sigma(0.02) / 4, rel=0.05)
+
+
+@pytest.mark.parametrize("count", [2, 47, 48, 60, 75, 90, 150, 900])
+def test_frames_that_vote_stand_between_knots_in_every_way(count):
+    chosen = scattered(count, 48)
+    assert (np.diff(chosen) > 0).all() and 0.7 * min(count, 48) < len(chosen) <= 48  # none votes twice
+    assert chosen[0] >= 0 and chosen[-1] < count
+    if count >= 90:  # knots stand every four frames; eight would be the even distance in a clip of 384
+        phases = np.bincount(scattered(8 * 48, 48) % 4, minlength=4)
+        assert phases.min() >= 10
