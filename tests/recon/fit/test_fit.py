@@ -21,6 +21,7 @@ from recon.fit.optimize import RATES, without
 from recon.fit.options import DEFAULT_LOSSES, FitOptions
 from recon.fit.problem import Problem
 from recon.fit.run import Diverged, Run
+from recon.fit.uncertainty import averaged
 from recon.fit.verb import Calibration, fit
 from recon.losses import ImageLoss
 from recon.losses.image import Mask, Photometric
@@ -619,3 +620,16 @@ def test_a_video_in_which_nothing_moves_keeps_the_clock_that_it_began_with(captu
     np.testing.assert_allclose(found.sigma[2] * 30, known)
     assert [f.code for f in found.flags[2]] == ([flag] if flag else [])
     assert np.isfinite(found.sigma[1]) and found.seconds[1] != pytest.approx(start[1])
+
+
+def test_the_clocks_are_the_mean_of_the_last_steps_and_doubt_what_they_had_left_to_go(capture, scene, monkeypatch):
+    start = believed(capture, np.array([0.0, 0.4, -0.3]) / 30)
+    done = fit(scene, capture.footage, start, steps=60)
+    rows = np.column_stack([done.history.step, done.history.offsets])
+    want = averaged(np.vstack([[0, *start.seconds], rows, rows[-1]]))
+    found = done.offsets.seconds
+    np.testing.assert_allclose(found - found[0], want - want[0], atol=1e-9)
+    last = rows[-1, 1:] - rows[-1, 1]
+    assert np.abs(found - found[0] - last).max() > 1e-6  # which is not where the last step left them
+    monkeypatch.setattr(sys.modules["recon.fit.verb"], "unsettled", lambda history, reference: np.array([0, 0.5, 0.5]))
+    assert (fit(scene, capture.footage, start, steps=60).offsets.sigma[1:] > 0.5).all()
