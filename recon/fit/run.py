@@ -16,7 +16,7 @@ from recon.fit.checkpoint import Snapshot
 from recon.fit.densify import Densify
 from recon.fit.optimize import Adam, Decay, check_rates
 from recon.fit.problem import Problem, assemble, scene_groups
-from recon.fit.uncertainty import newton_sigma
+from recon.fit.uncertainty import FRAMES, newton_sigma
 from recon.losses.image import Seen
 from recon.losses.motion import Draw
 from recon.observe.cameras import Clip, compose_over, feature_image, observer, observer_at_once
@@ -131,6 +131,13 @@ class Run:
             self._since += zip(r.losses, r.psnrs, strict=True)
             if r.pull is not None:
                 self._pull += r.pull
+
+    def steps_after(self) -> int:
+        """Steps that take as long as what :meth:`sigma` looks at: three renderings a vote."""
+        if "offsets" not in self.adam.groups:
+            return 0
+        votes = np.minimum(np.unique(self.problem.keys[:, 0], return_counts=True)[1], FRAMES).sum()
+        return int(3 * votes / self.problem.batch)
 
     def reach(self, group: str) -> float:
         """How far Adam's steps so far can have moved an entry of a group, in the group's own unit."""

@@ -154,7 +154,7 @@ def fit(
         stack.enter_context(one_thread_each(options.batch))
         hidden = True if is_quiet() else None  # None: hidden where there is no terminal
         bar = stack.enter_context(tqdm(total=run.total, initial=run.step, desc="fit", unit="step", disable=hidden))
-        calibrate = Calibration(options.budget, deadline) if run.total is None else None
+        calibrate = Calibration(options.budget, deadline, run.steps_after()) if run.total is None else None
         try:
             while run.total is None or run.step < run.total:
                 with uninterrupted():
@@ -182,11 +182,16 @@ def fit(
 
 
 class Calibration:
-    """Turns a budget in seconds into a number of steps, as the steps show their speed."""
+    """Turns a budget in seconds into a number of steps, as the steps show their speed.
 
-    def __init__(self, budget: float | None, deadline: Deadline | None = None):
+    Args:
+        budget: seconds of the fit; of none, a share of what is left of the ``deadline``. after: steps that the work
+            after the last one is worth.
+    """
+
+    def __init__(self, budget: float | None, deadline: Deadline | None = None, after: int = 0):
         assert budget is not None or deadline is not None  # only then is the number of steps open
-        self.deadline, self.done = deadline, 0
+        self.deadline, self.after, self.done = deadline, after, 0
         self.began = self.since = time.perf_counter()
         self.seconds = float(budget or 0.0) if deadline is None else FIT_SHARE * deadline.left
         self.first, self.again = 0, False
@@ -214,7 +219,7 @@ class Calibration:
             return 2 * step
         each = (now - self.since) / steps
         left = self.seconds - (now - self.began) if self.deadline is None else FIT_SHARE * self.deadline.left
-        return max(2 * step, step + int(left / each))  # rates must have time to decay
+        return max(2 * step, step + int(left / each) - self.after)  # rates must have time to decay
 
 
 def _moved(problem: Problem, seconds: np.ndarray) -> str:

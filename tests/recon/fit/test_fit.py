@@ -472,19 +472,22 @@ def test_a_budget_becomes_steps_that_decay_and_densify(capture, scene):
         fit(scene, capture.footage, believed(capture), budget=float("inf"))
 
 
+@pytest.mark.parametrize("after", [0, 400])
 @pytest.mark.parametrize("slow", [1.0, 1.5, 2.0])
-def test_a_budget_is_used_though_the_first_steps_are_slow(monkeypatch, slow):
-    """Steps of 10 ms, of which the first 200 take longer: the fit ends within a twentieth of its time."""
+def test_a_budget_is_used_though_the_first_steps_are_slow(monkeypatch, slow, after):
+    """Steps of 10 ms, of which the first 200 take longer: the fit, and what follows it, end within a twentieth of
+    their time.
+    """
     now = 0.0
     monkeypatch.setattr(time, "perf_counter", lambda: now)
-    calibrate, guesses, total, step = Calibration(30.0), set(), None, 0
+    calibrate, guesses, total, step = Calibration(30.0, after=after), set(), None, 0
     while total is None or step < total:
         step += 1
         now += 0.01 * (slow if step <= 200 else 1.0)
         guess, total = calibrate(step)
         guesses.add(guess)
         assert total is None or step >= 0.2 * total
-    assert now == pytest.approx(30.0, rel=0.05)
+    assert now + 0.01 * after == pytest.approx(30.0, rel=0.05)
     assert None in guesses and len(guesses) <= 3  # none, a guess, what is known
 
 
@@ -633,3 +636,10 @@ def test_the_clocks_are_the_mean_of_the_last_steps_and_doubt_what_they_had_left_
     assert np.abs(found - found[0] - last).max() > 1e-6  # which is not where the last step left them
     monkeypatch.setattr(sys.modules["recon.fit.verb"], "unsettled", lambda history, reference: np.array([0, 0.5, 0.5]))
     assert (fit(scene, capture.footage, start, steps=60).offsets.sigma[1:] > 0.5).all()
+
+
+def test_votes_take_as_long_as_some_steps(capture, scene):
+    frames = sum(len(f.times) for f in capture.footage)
+    for options, want in ((FitOptions(batch=2), 3 * frames / 2), (FitOptions(freeze=("offsets",)), 0)):
+        problem = Problem.of(scene, capture.footage, believed(capture), options)
+        assert Run(problem, options.active_rates(), None, None).steps_after() == want
