@@ -16,6 +16,7 @@ other witness (:func:`reconciled`).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import partial
 
@@ -139,12 +140,12 @@ def unreached(start_sigma: np.ndarray, reach: float) -> np.ndarray:
     return np.where(np.isfinite(start_sigma), np.fmax(start_sigma - reach, 0.0), 0.0)
 
 
-def unseen(start_sigma: np.ndarray, moved: np.ndarray, images: float, epochs: float) -> np.ndarray:
+def unseen(start_sigma: np.ndarray, moved: np.ndarray, reference: int, *, images: float, epochs: float) -> np.ndarray:
     """[V] seconds of the start's error that a fit may still have, because it has seen too few pictures.
 
     The scene that a fit begins with was made with the start's clocks, of each video's own tracks and depth: so each
-    video agrees with itself, however wrong its clock. Pictures undo that in time. A start without a sigma tells by how
-    far the fit has gone from it: the share that it had to go is as large as the share that it keeps.
+    video agrees with itself, however wrong its clock. Pictures undo that in time. Of starts without a sigma it tells by
+    how far the fit has gone from all of them, rms: what is kept is to that as the shares are.
 
     Args:
         start_sigma: one standard deviation of the clocks that it began with, seconds; nan or 0: no witness.
@@ -153,7 +154,12 @@ def unseen(start_sigma: np.ndarray, moved: np.ndarray, images: float, epochs: fl
     """
     kept = np.exp(-min(images / IMAGES, epochs / EPOCHS))
     known = np.isfinite(start_sigma) & (start_sigma > 0)
-    return kept * np.where(known, start_sigma, np.abs(moved) / max(1.0 - kept, 1e-9))
+    others = ~known
+    others[reference] = False
+    gone = math.sqrt(float(np.square(moved[others]).mean())) if others.any() else 0.0
+    left = kept * np.where(known, start_sigma, gone / max(1.0 - kept, 1e-9))
+    left[reference] = 0.0
+    return left
 
 
 def relative_sigma(sigma: np.ndarray, reference: int) -> np.ndarray:

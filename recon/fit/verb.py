@@ -280,7 +280,8 @@ def _witnessed(
     p = run.problem
     before = relative_sigma(start_sigma, p.reference)
     seen = run.step * p.batch
-    own = unseen(before, refined - p.start, seen / len(p.clips), seen / len(p.keys))
+    per_video, per_frame = seen / len(p.clips), seen / len(p.keys)
+    own = unseen(before, refined - p.start, p.reference, images=per_video, epochs=per_frame)
     # votes of frames tell less than all where the start still speaks in each of them
     fitted = np.hypot(np.maximum(votes, own), unsettled(history, p.reference))
     together = repeated if p.offsets.stats.get(PHOTOMETRIC) else reconciled

@@ -169,15 +169,19 @@ def test_a_fit_of_a_fit_does_not_count_its_pictures_twice():
 
 
 def test_a_fit_that_has_seen_few_pictures_keeps_its_start_s_error():
-    start, moved = np.array([0.0, 0.01, np.nan]), np.array([0.0, 0.002, 0.003])
-    np.testing.assert_allclose(unseen(start, moved, 1e4, 1e3), 0.0, atol=1e-12)
-    few = unseen(start, moved, 2.0, 0.1)
+    start, moved = np.array([0.0, 0.01, np.nan, np.nan]), np.array([0.0, 0.002, 0.005, -0.001])
+    rms = np.sqrt((0.005**2 + 0.001**2) / 2)  # of those without a sigma: one of them has hardly moved by chance
+
+    def left(images, epochs):
+        return unseen(start, moved, 0, images=images, epochs=epochs)
+
+    np.testing.assert_allclose(left(1e4, 1e3), 0.0, atol=1e-12)
+    few = left(2.0, 0.1)
     assert few[0] == 0 and 0.009 / 1.2 < few[1] < 0.01
-    assert few[2] > 0.003  # it has gone a small part of its way: most is still to go
-    long_clip = unseen(start, moved, 200.0, 0.2)  # every frame hardly once
-    assert long_clip[1] > unseen(start, moved, 200.0, 3.0)[1]
-    half = unseen(start, moved, 90 * np.log(2), 10.0)
-    np.testing.assert_allclose(half, [0.0, 0.005, 0.003])  # half is kept, half is done
+    assert few[2] == few[3] > rms  # they have gone a small part of their way: most is still to go
+    assert left(200.0, 0.2)[1] > left(200.0, 3.0)[1]  # a long clip has hardly been seen
+    np.testing.assert_allclose(left(90 * np.log(2), 10.0), [0.0, 0.005, rms, rms])  # half is kept, half is done
+    assert unseen(start[:1], moved[:1], 0, images=1, epochs=1).tolist() == [0.0]
 
 
 def test_clocks_are_the_mean_of_the_last_steps_and_what_they_share_is_the_last_one_s():
