@@ -88,6 +88,8 @@ def cut(scene: str | os.PathLike[str], folder: Path, seed: int) -> tuple[Path, P
             f"{root}: expected three videos and more, of more than {2 * MOST} frames each; found "
             f"{len(opened.videos)}, of {shortest}. Film longer."
         )
+    if folder.resolve().is_relative_to(root.resolve()):  # a copy of it would hold itself
+        raise ValueError(f"--out: expected a folder outside of the recording {root}; found {folder.parent}.")
     late = np.random.default_rng(seed).integers(0, MOST + 1, len(opened.videos))
     videos: list[dict[str, Any]] = []
     for entry, video, lost in zip(document["videos"], opened.videos, late, strict=True):

@@ -45,6 +45,12 @@ def test_short_recordings_are_refused(recording, tmp_path, monkeypatch):
         budget.cut(recording, tmp_path / "a", 3)
 
 
+def test_results_inside_of_the_recording_are_refused(recording):
+    with pytest.raises(ValueError, match="--out: expected a folder outside of the recording"):
+        budget.cut(recording, recording / "bench" / "a", 3)
+    assert not (recording / "bench").exists()
+
+
 def test_rows_that_are_kept_are_not_measured_again(recording, tmp_path, monkeypatch):
     asked = []
 
