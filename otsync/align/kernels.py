@@ -94,6 +94,23 @@ def variances(s):
     return max((both - own) / c, 0.0), max(rest / c, 0.0)
 
 
+@kernel()
+def lives(weight):
+    """The frames from which on, and before which, each match of ``weight`` (M,T) is seen: (M,2), 0 where never.
+
+    Of long clips a track lives in a small part: loops over lags and frames read nothing beside it.
+    """
+    M, T = weight.shape
+    out = np.zeros((M, 2), np.int64)
+    for m in range(M):
+        for t in range(T):
+            if weight[m, t] > 0:
+                if out[m, 1] == 0:
+                    out[m, 0] = t
+                out[m, 1] = t + 1
+    return out
+
+
 @kernel(fastmath={"contract", "reassoc", "nsz"})
 def lag_statistics(a, wa, qa, b, wb, qb, lags, least, count, power, residual):
     """Variances of every match over its common frames at every lag; the mean over exactly these frames is removed.
@@ -101,13 +118,12 @@ def lag_statistics(a, wa, qa, b, wb, qb, lags, least, count, power, residual):
     a (M,3,Ta), b (M,3,Tb): 0 where unseen; wa (M,Ta), wb: 1 seen, 0 not; qa = |a|^2, qb. Frame i of a meets i - lag of
     b. Fills (M,K): frames in common; Var(a) + Var(b); Var(a - b). All 0 below ``least`` frames in common.
     """
-    M, _, Ta = a.shape
-    Tb = b.shape[2]
+    lives_a, lives_b = lives(wa), lives(wb)
     s = np.empty(10)
-    for m in range(M):
+    for m in range(len(a)):
         for n in range(len(lags)):
             k = lags[n]
-            lo, hi = max(0, k), min(Ta, Tb + k)
+            lo, hi = max(lives_a[m, 0], lives_b[m, 0] + k), min(lives_a[m, 1], lives_b[m, 1] + k)
             if hi - lo < least:
                 continue
             common_sums(a, wa, qa, b, wb, qb, m, lo, hi, k, s)
@@ -126,24 +142,24 @@ def windowed_evidence(a, wa, qa, b, wb, qb, lags, begin, block, least, floor, we
     every sample is in two. The lags are spread over threads.
     """
     at_once = max(1, SAMPLES_AT_ONCE // max(a.shape[0] * a.shape[2], 1))
-    arrays = a, wa, qa, b, wb, qb, lags, begin, block, least, floor, weight, out
+    arrays = a, wa, qa, lives(wa), b, wb, qb, lives(wb), lags, begin, block, least, floor, weight, out
     for_each(add_evidence, ranges(len(lags), at_once), *arrays)
 
 
 @kernel(fastmath={"contract", "reassoc", "nsz"})
-def add_evidence(first, end, a, wa, qa, b, wb, qb, lags, begin, block, least, floor, weight, out):
+def add_evidence(first, end, a, wa, qa, lives_a, b, wb, qb, lives_b, lags, begin, block, least, floor, weight, out):
     """:func:`windowed_evidence` of the lags first:end."""
-    M, _, Ta = a.shape
-    Tb = b.shape[2]
     sums = np.empty((2, 10))
     whole = np.empty(10)
-    for m in range(M):
+    for m in range(len(a)):
         for n in range(first, end):
             k = lags[n]
-            lowest, highest = max(0, k), min(Ta, Tb + k)
+            lowest, highest = max(lives_a[m, 0], lives_b[m, 0] + k), min(lives_a[m, 1], lives_b[m, 1] + k)
+            if highest - lowest < least:
+                continue
             blocks = (highest - begin[n] + block - 1) // block
             sums[:] = 0.0
-            for j in range(blocks + 1):
+            for j in range(max(0, (lowest - begin[n]) // block), blocks + 1):
                 now, before = sums[j % 2], sums[1 - j % 2]
                 now[:] = 0.0
                 lo, hi = max(lowest, begin[n] + j * block), min(begin[n] + (j + 1) * block, highest)

@@ -8,22 +8,24 @@ from ..compute.jit import kernel
 
 
 @kernel()
-def epipolar_evidence(A, B, F, pairs, k0, k1, min_frames, window, min_window, mean, count):
-    """Epipolar residuals of candidate pairs at every lag.
+def epipolar_evidence(A, B, F, pairs, lives_a, lives_b, low, edge, min_frames, window, min_window, mean, count):
+    """Epipolar residuals of candidate pairs at every lag at which both tracks live.
 
-    A (Na,Ta,2), B (Nb,Tb,2): pixels, nan unseen. F (Fa,Fb,3,3): one per pose, axes of length 1 when static. Frame t
-    of a meets frame t - k of b for the lags k0..k1. Writes the residuals' mean square per sample, over windows of
-    ``window`` frames (aligned to a's clock) with their mean removed: ``mean[0]``; and raw: ``mean[1]``; nan where
-    fewer than ``min_frames`` samples (``min_window`` per window) exist; and ``count`` the samples behind each.
+    A (Na,Ta,2), B (Nb,Tb,2): pixels, nan unseen; lives_a (Na,2), lives_b (Nb,2): the frames from which on, and before
+    which, each is seen. F (Fa,Fb,3,3): one per pose, axes of length 1 when static. Frame t of a meets frame t - k of b;
+    candidate m is asked at the lags from low[m] on, whose answers stand from edge[m] to edge[m + 1]: in ``mean[0]`` the
+    residuals' mean square per sample, over windows of ``window`` frames (aligned to a's clock) with their mean removed;
+    in ``mean[1]`` the raw one; nan where fewer than ``min_frames`` samples (``min_window`` per window) exist; and in
+    ``count`` the samples behind each.
     """
-    Ta, Tb = A.shape[1], B.shape[1]
     moves_a, moves_b = F.shape[0] > 1, F.shape[1] > 1
     for m in range(pairs.shape[0]):
         i, j = pairs[m, 0], pairs[m, 1]
-        for k in range(k0, k1 + 1):
+        for at in range(edge[m], edge[m + 1]):
+            k = low[m] + at - edge[m]
             within, raw, n_within, n_raw = 0.0, 0.0, 0, 0
             n, s, q = 0, 0.0, 0.0
-            first, last = max(0, k), min(Ta, Tb + k)
+            first, last = max(lives_a[i, 0], lives_b[j, 0] + k), min(lives_a[i, 1], lives_b[j, 1] + k)
             for t in range(first, last):
                 xa, ya, xb, yb = A[i, t, 0], A[i, t, 1], B[j, t - k, 0], B[j, t - k, 1]
                 if not (np.isnan(xa) or np.isnan(xb)):
@@ -45,8 +47,8 @@ def epipolar_evidence(A, B, F, pairs, k0, k1, min_frames, window, min_window, me
                         n_within += n
                     n, s, q = 0, 0.0, 0.0
             if n_within >= min_frames:
-                mean[0, m, k - k0] = within / n_within
-                count[0, m, k - k0] = n_within
+                mean[0, at] = within / n_within
+                count[0, at] = n_within
             if n_raw >= min_frames:
-                mean[1, m, k - k0] = raw / n_raw
-                count[1, m, k - k0] = n_raw
+                mean[1, at] = raw / n_raw
+                count[1, at] = n_raw

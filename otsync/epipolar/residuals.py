@@ -105,14 +105,21 @@ class Residuals:
         """Sampson distances in pixels, nan where either is unseen."""
         t = self.times - offset
         xb = self.splines.sample(t)[..., :2]
-        frames_a = np.arange(len(self.times)) if self.F.shape[0] > 1 else np.zeros(len(t), int)
-        index = np.clip(np.round((t - self.b_start) * self.fps).astype(int), 0, self.F.shape[1] - 1)
-        F = self.F[np.minimum(frames_a, self.F.shape[0] - 1), index]
-        one = np.ones((*xb.shape[:2], 1))
-        ha, hb = np.concatenate([self.xa, one], 2), np.concatenate([xb, one], 2)
-        la, lb = np.einsum("tij,mtj->mti", F, ha), np.einsum("tij,mti->mtj", F, hb)
+        hb = homogeneous(xb)
+        if self.F.shape[:2] == (1, 1):
+            la, lb = self.lines, hb @ self.F[0, 0][:, :2]
+        else:
+            frames_a = np.arange(len(self.times)) if self.F.shape[0] > 1 else np.zeros(len(t), int)
+            index = np.clip(np.round((t - self.b_start) * self.fps).astype(int), 0, self.F.shape[1] - 1)
+            F = self.F[np.minimum(frames_a, self.F.shape[0] - 1), index]
+            la, lb = np.einsum("tij,mtj->mti", F, homogeneous(self.xa)), np.einsum("tij,mti->mtj", F, hb)
         norm = np.sqrt(la[..., 0] ** 2 + la[..., 1] ** 2 + lb[..., 0] ** 2 + lb[..., 1] ** 2)
         return (hb * la).sum(2) / np.maximum(norm, 1e-300)
+
+    @cached_property
+    def lines(self) -> Float[np.ndarray, "M T 3"]:
+        """a's points as lines of b's image; of static cameras."""
+        return homogeneous(self.xa) @ self.F[0, 0].T
 
     def solve(self, offset: float, window: float, iterations: int, reach: float) -> tuple[float, Step]:
         """Offset, s, and what its last step saw; nan when nothing overlaps."""
@@ -181,6 +188,10 @@ class Residuals:
         """Neighbourhoods of a's tracks: those of one limb err alike."""
         middle = np.nan_to_num(known_median(self.xa, 1))  # some tracks a's clock never sees
         return neighbours(in_space(middle[:, None])[:, 0], GROUPS)
+
+
+def homogeneous(x: Float[np.ndarray, "M T 2"]) -> Float[np.ndarray, "M T 3"]:
+    return np.concatenate([x, np.ones((*x.shape[:2], 1))], 2)
 
 
 def detrended(x: Float[np.ndarray, "M T"], known: Bool[np.ndarray, "M T"], half: int) -> Float[np.ndarray, "M T"]:

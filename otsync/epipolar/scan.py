@@ -140,10 +140,11 @@ class EpipolarScan(Aligner):
         weight: Float[np.ndarray, " M"] | None = None,
     ) -> Float[np.ndarray, " K"]:
         """Summed evidence per lag, in nats; mean over the mixtures of a's and of b's tracks."""
-        scores = self.scores(xa, xb, F, pairs, lags, fps, unit)
-        if not scores:
+        told = self.scores(xa, xb, F, pairs, lags, fps, unit)
+        if not np.isfinite(told.mean).any():
             return np.zeros(len(lags))
-        both = np.sum(scores, axis=0)
+        both = np.full((len(pairs), len(lags)), -np.inf)
+        both[told.candidate, told.lag] = told.nats.sum(0)
         return 0.5 * (mixture(both, pairs[:, 0], weight) + mixture(both, pairs[:, 1], weight))
 
     def scores(
@@ -155,44 +156,33 @@ class EpipolarScan(Aligner):
         lags: np.ndarray,
         fps: float,
         unit: float,
-    ) -> list[Float[np.ndarray, "M K"]]:
+    ) -> Told:
         """Log-likelihood of every candidate and lag against the typical one, by motion and by position; -inf unseen."""
-        from .kernels import epipolar_evidence
-
-        shape = (2, len(pairs), len(lags))
-        mean, count = np.full(shape, np.nan), np.zeros(shape)
         least, window = max(2, round(self.min_seen * fps)), max(4, round(self.window * fps))
-        epipolar_evidence(
-            np.ascontiguousarray(xa),
-            np.ascontiguousarray(xb),
-            F,
-            pairs,
-            int(lags[0]),
-            int(lags[-1]),
-            least,
-            window,
-            max(LEAST_SAMPLES, round(MIN_WINDOW * fps)),
-            mean,
-            count,
-        )
-        out = []
+        told = residuals_by_lag(xa, xb, F, pairs, lags, least, window, max(LEAST_SAMPLES, round(MIN_WINDOW * fps)))
+        mean, count, nats = told.mean, told.count, np.full(told.mean.shape, -np.inf)
         for kind, scale in enumerate((self.motion_scale, self.position_scale)):
-            level = np.log1p(mean[kind] / (scale * unit) ** 2)
-            known = np.isfinite(level)
+            known = np.isfinite(mean[kind])
             if known.any():
-                weight = count[kind] / (2 * INDEPENDENT) * (30 / fps)
-                out.append(np.where(known, -weight * (level - np.median(level[known])), -np.inf))
-        return out
+                level = np.log1p(mean[kind, known] / (scale * unit) ** 2)
+                weight = count[kind, known] / (2 * INDEPENDENT) * (30 / fps)
+                nats[kind, known] = -weight * (level - np.median(level))
+            else:
+                nats[kind] = 0.0  # the other kind alone is asked
+        return replace(told, nats=nats)
 
     def support(
         self, xa: np.ndarray, xb: np.ndarray, F: np.ndarray, pairs: np.ndarray, lag: int, fps: float, unit: float
     ) -> Float[np.ndarray, " M"]:
         """Each candidate's share of its tracks' mixtures at ``lag``, the outlier included; in [0, 1]."""
-        scores = self.scores(xa, xb, F, pairs, np.arange(lag - 1, lag + 2), fps, unit)
+        told = self.scores(xa, xb, F, pairs, np.arange(lag - 1, lag + 2), fps, unit)
         share = np.zeros(len(pairs))
-        if not scores:
+        if not np.isfinite(told.mean).any():
             return share
-        likelihood = np.exp(np.minimum(np.sum([s.max(1) for s in scores], 0), MIXTURE_CAP))
+        best = np.full((2, len(pairs)), -np.inf)
+        for kind in (0, 1):
+            np.maximum.at(best[kind], told.candidate, told.nats[kind])
+        likelihood = np.exp(np.minimum(best.sum(0), MIXTURE_CAP))
         for side in (0, 1):
             total = np.bincount(pairs[:, side], likelihood)[pairs[:, side]]
             share += 0.5 * likelihood / (total + 1.0)
@@ -239,6 +229,62 @@ class EpipolarScan(Aligner):
                 "margin": margin,
             },
         )
+
+
+@dataclass(frozen=True, eq=False)
+class Told:
+    """What candidates say at the lags at which both of their tracks live: one entry each.
+
+    Args:
+        candidate, lag: (E,) indices. mean: (2,E) square pixels, of residuals without the mean of each window, and of
+            the residuals themselves; nan where too few. count: (2,E) samples behind them. nats: (2,E).
+    """
+
+    candidate: Int[np.ndarray, " E"]
+    lag: Int[np.ndarray, " E"]
+    mean: Float[np.ndarray, "2 E"]
+    count: Float[np.ndarray, "2 E"]
+    nats: Float[np.ndarray, "2 E"]
+
+
+def residuals_by_lag(
+    xa: Float[np.ndarray, "Na Ta 2"],
+    xb: Float[np.ndarray, "Nb Tb 2"],
+    F: Float[np.ndarray, "Fa Fb 3 3"],
+    pairs: Int[np.ndarray, "M 2"],
+    lags: Int[np.ndarray, " K"],
+    least: int,
+    window: int,
+    least_in_window: int,
+) -> Told:
+    """Mean square epipolar residuals of candidates at every lag; ``nats`` are nan still.
+
+    Work and memory grow with how long tracks live, not with the clip.
+
+    Args:
+        lags: frames, one after the other. least: samples that tell anything. window: frames. least_in_window: samples.
+    """
+    from .kernels import epipolar_evidence
+
+    lives_a, lives_b = (_lives(x) for x in (xa, xb))
+    (begin_a, end_a), (begin_b, end_b) = lives_a[pairs[:, 0]].T, lives_b[pairs[:, 1]].T
+    low = np.maximum(lags[0], begin_a + least - end_b)
+    high = np.minimum(lags[-1], end_a - least - begin_b)
+    many = np.maximum(0, high - low + 1)
+    edge = np.concatenate([[0], np.cumsum(many)])
+    mean, count = np.full((2, edge[-1]), np.nan), np.zeros((2, edge[-1]))
+    arrays = np.ascontiguousarray(xa), np.ascontiguousarray(xb), F, pairs, lives_a, lives_b, low, edge
+    epipolar_evidence(*arrays, least, window, least_in_window, mean, count)
+    candidate = np.repeat(np.arange(len(pairs)), many)
+    lag = np.arange(edge[-1]) - edge[candidate] + low[candidate] - lags[0]
+    return Told(candidate, lag, mean, count, np.full(mean.shape, np.nan))
+
+
+def _lives(x: Float[np.ndarray, "N T 2"]) -> Int[np.ndarray, "N 2"]:
+    """The frames from which on, and before which, every track is seen; 0 and 0 of those that never are."""
+    seen = np.isfinite(x[..., 0])
+    ends = np.stack([seen.argmax(1), x.shape[1] - seen[:, ::-1].argmax(1)], 1)
+    return np.where(seen.any(1)[:, None], ends, 0)
 
 
 def mixture(

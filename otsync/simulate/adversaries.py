@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from .body import N_KINDS, Parts, euler, thing
-from .motions import TAU, Wander
-from .scenes import Poses, Scene, tennis
+from .body import FOREARM, LEFT, N_KINDS, SHIN, THIGH, UPPER_ARM, Parts, euler, thing
+from .motions import TAU, Actor, Cycle, Wander, posture, sway_scale
+from .scenes import Poses, Scene, stage, tennis
 
 HORSE, PARCEL = N_KINDS + 8, N_KINDS + 9
 
@@ -55,6 +55,35 @@ def looped(scene: Scene, seconds: float) -> Scene:
 def loop(rng: np.random.Generator) -> Scene:
     """One player whose motion repeats exactly every 1 to 2 seconds."""
     return looped(tennis(rng), rng.uniform(1.0, 2.0))
+
+
+def strides(rng: np.random.Generator) -> Scene:
+    """Two people on treadmills, each a stride a second: every stride is nearly the one before."""
+
+    def walker(aside: float) -> Actor:
+        cycles = []
+        for side, ahead in ((0, 0.0), (LEFT, np.pi)):
+            swing = rng.uniform(0.4, 0.6)
+            cycles += [
+                Cycle(THIGH + side, 0, swing, 1, ahead),
+                Cycle(SHIN + side, 0, 0.7 * swing, 1, ahead + np.pi / 2),
+                Cycle(UPPER_ARM + side, 0, -rng.uniform(0.3, 0.5), 1, ahead),
+                Cycle(FOREARM + side, 0, rng.uniform(0.1, 0.3), 1, ahead + 0.6),
+            ]
+        return Actor(
+            posture=posture(elbows=0.7, knees=0.5),
+            sway=Wander(rng, 45, sway_scale(0.04), 0.15, 0.9),
+            walk=Wander(rng, 2, 0.04, 0.1, 0.4),
+            turning=Wander(rng, 1, 0.05, 0.1, 0.4),
+            place=(aside, rng.uniform(-0.3, 0.3)),
+            heading=rng.uniform(0, TAU),
+            cycle_rate=rng.uniform(0.97, 1.03),
+            cycle_wobble=Wander(rng, 1, 0.06, 0.1, 0.4),
+            cycles=tuple(cycles),
+            size=rng.uniform(0.93, 1.08),
+        )
+
+    return stage([walker(-0.6), walker(0.6)], [])
 
 
 def carousel(rng: np.random.Generator) -> Scene:
@@ -128,6 +157,7 @@ ADVERSARIES: dict[str, Callable[[np.random.Generator], Scene]] = {
     "canon": canon,
     "unison": unison,
     "loop": loop,
+    "strides": strides,
     "carousel": carousel,
     "belt": belt,
     "flock": flock,

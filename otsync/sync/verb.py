@@ -32,7 +32,7 @@ from .pairs import Job, Refit, run, run_refit, with_rate
 from .parts import broken_part, unvouched
 from .rematching import contested, rematching
 from .verdict import Answer, Verdict, judge
-from .witnesses import elsewhere, left_over, once_more, parted
+from .witnesses import elsewhere, left_over, once_more, parted, scan_only
 
 
 def synchronize(
@@ -182,7 +182,7 @@ def with_witnesses_heard(
     doubted = {job.pair for job in asked if parted(answers[job.pair], job.a, job.b) > limit}
     unexplained = [left_over(answers[job.pair], job) for job in asked if rest and job.pair not in doubted]
     others = [job for job in unexplained if job is not None]
-    first = list(map(run, others))
+    first = list(map(run, [scan_only(job) for job in others]))
     again = [job for other, answer in zip(others, first, strict=True) for job in once_more(other, answer)]
     shared = {job.pair: Seen.by(answers[job.pair], job.a, job.b)[1] for job in asked}
     middle = {pair: (seen.begin + seen.end) / 2 for pair, seen in shared.items()}

@@ -10,14 +10,17 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
 from ..clocks.common import readable, strongest, thinned
 from ..refine.common_motion import common_motion
 from ..refine.gauss_newton import fit_clock, neighbours
+from ..refine.slot import Refiner
 from ..refine.splines import SplineRefine
-from ..types import Alignment, Clock, TrackSet
+from ..refine.unrefined import Unrefined
+from ..types import Alignment, Clock, Matches, Status, TrackSet
 from .pairs import Job
 from .rematching import at_each
 from .verdict import Answer
@@ -102,10 +105,33 @@ def left_over(answer: Answer, job: Job) -> Job | None:
     return dataclasses.replace(job, a=thinned(a).take(rest[0]), b=thinned(b).take(rest[1]))
 
 
+def scan_only(job: Job) -> Job:
+    """The work without the fit: the times that compete are known before it."""
+    return dataclasses.replace(job, refiner=Unrefined())
+
+
 def once_more(job: Job, first: Answer) -> list[Job]:
-    """The work on a pair whose first answer is known: matched once more, at each of the times that compete for it."""
+    """The work on a pair whose scan is known: matched once more, at each of the times that compete for it; fitted where
+    that may say something.
+    """
     times = competing(first.scanned) if first.finite else []
-    return at_each(job, times)
+    return at_each(dataclasses.replace(job, refiner=WhereSound(job.refiner)), times)
+
+
+@dataclass(frozen=True)
+class WhereSound(Refiner):
+    """Fits only what the scan leaves no doubt of: an answer that keeps its flags says nothing here."""
+
+    refiner: Refiner
+
+    @property
+    def needs_xyz(self) -> bool:  # type: ignore[override]
+        return self.refiner.needs_xyz
+
+    def __call__(self, a: TrackSet, b: TrackSet, matches: Matches, alignment: Alignment) -> Alignment:
+        # features that look unrelated are no doubt of an answer in space: see without_answered_doubt
+        doubtful = set(alignment.flags) - {Status.NO_MATCH}
+        return alignment if doubtful else self.refiner(a, b, matches, alignment)
 
 
 def competing(scan: Alignment) -> list[float]:

@@ -227,6 +227,9 @@ CLASSES: dict[str, Callable[[int], World]] = {
         plain, preset="hard", classes=("basketball", "football"), first=(In(1, PartLate()),)
     ),
     "exact loop": partial(plain, motion="loop"),
+    "strides": partial(plain, motion="strides"),
+    "strides, hard": partial(plain, motion="strides", preset="hard"),
+    "strides, one frozen": partial(plain, motion="strides", first=(In(1, Freeze(30)),)),
     "carousel": partial(plain, motion="carousel", alike=True),
     "belt": partial(plain, motion="belt", alike=True),
     "flock": partial(plain, motion="flock", alike=True),

@@ -12,10 +12,9 @@ from hypothesis import strategies as st
 from otsync import Alignment, Matches, Status, TrackSet, synchronize
 from otsync.align.peaks import separate_peaks
 from otsync.costs.positions import CurveDistance, MedianPosition, SynchronousDistance, capped, scene_scale
-from otsync.epipolar.kernels import epipolar_evidence
 from otsync.epipolar.refine import EpipolarRefine
 from otsync.epipolar.residuals import Residuals, Step, detrended
-from otsync.epipolar.scan import TRACK_CAP, EpipolarScan, mixture
+from otsync.epipolar.scan import TRACK_CAP, EpipolarScan, Told, mixture, residuals_by_lag
 from otsync.geometry import common_target, fundamental, fundamentals, sampson, undistort, view_angle
 from otsync.match.candidates import Candidates
 from otsync.types import Camera
@@ -168,7 +167,9 @@ def test_motion_and_position_must_be_of_one_candidate():
         def scores(self, *problem):
             motion, position = np.zeros((2, 2, 5))
             motion[0, 1], position[1, 1], motion[0, 3], position[0, 3] = 9.0, 9.0, 8.0, 8.0
-            return [motion, position]
+            candidate, lag = np.indices((2, 5)).reshape(2, -1)
+            nats = np.stack([motion.ravel(), position.ravel()])
+            return Told(candidate, lag, np.ones((2, 10)), np.ones((2, 10)), nats)
 
     nothing, lags = np.zeros((1, 5, 2)), np.arange(5)
     total = Fixed().evidence(nothing, nothing, np.eye(3)[None, None], np.array([[0, 0], [0, 1]]), lags, 30.0, 1.0)
@@ -298,14 +299,47 @@ def test_a_moving_camera_stands_at_every_frame_where_its_pose_says():
     A, B = rng.uniform(0, 300, (2, 25, 2)), rng.uniform(0, 300, (1, 20, 2))
     A[0, 7:9] = np.nan
     F, pairs = fundamentals(a, moving), np.array([[0, 0], [1, 0]])
+    told = residuals_by_lag(A, B, F, pairs, np.arange(-3, 6), 4, 10, 3)
     mean, count = np.full((2, 2, 9), np.nan), np.zeros((2, 2, 9))
-    epipolar_evidence(A, B, F, pairs, -3, 5, 4, 10, 3, mean, count)
+    mean[:, told.candidate, told.lag], count[:, told.candidate, told.lag] = told.mean, told.count
     for m in range(2):
         for k in range(-3, 6):
             t = np.arange(max(0, k), min(25, 20 + k))
             e = np.array([sampson(F[0, s - k], A[m, [s]], B[0, [s - k]])[0] for s in t])
             assert mean[1, m, k + 3] == pytest.approx(np.nanmean(e**2))
             assert count[1, m, k + 3] == np.isfinite(e).sum()
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**31))
+def test_only_lags_at_which_both_tracks_live_are_asked_and_none_is_forgotten(seed):
+    """Every lag by itself, over the whole clip: what is left out has too few samples."""
+    rng = np.random.default_rng(seed)
+    frames, least, window, within = rng.integers(20, 60, 2), 5, 10, 3
+    A, B = (rng.uniform(0, 300, (3, n, 2)) for n in frames)
+    for x in (A, B):
+        for track in x:
+            begin, end = np.sort(rng.integers(0, len(track) + 1, 2))
+            track[:begin], track[end:], track[rng.random(len(track)) < 0.2] = np.nan, np.nan, np.nan
+    F, pairs = rng.normal(size=(1, 1, 3, 3)), np.argwhere(np.ones((3, 3)))
+    lags = np.arange(-frames[1] + 5, frames[0] - 4)
+    told = residuals_by_lag(A, B, F, pairs, lags, least, window, within)
+    where = zip(told.candidate, told.lag, strict=True)
+    found = {at: (told.mean[:, e], told.count[:, e]) for e, at in enumerate(where)}
+    for m, (i, j) in enumerate(pairs):
+        for k, lag in enumerate(lags):
+            t = np.arange(max(0, lag), min(frames[0], frames[1] + lag))
+            e = sampson(F[0, 0], A[i, t], B[j, t - lag])
+            raw = e[np.isfinite(e)]
+            parts = [e[(t // window == w) & np.isfinite(e)] for w in range(frames[0] // window + 1)]
+            parts = [p - p.mean() for p in parts if len(p) >= within]
+            centred = np.concatenate([*parts, []])
+            for kind, x in enumerate((centred, raw)):
+                if len(x) < least:
+                    assert (m, k) not in found or np.isnan(found[m, k][0][kind])
+                else:
+                    assert found[m, k][0][kind] == pytest.approx((x**2).mean(), rel=1e-6, abs=1e-9)
+                    assert found[m, k][1][kind] == len(x)
 
 
 def test_one_step_of_the_fit_goes_nearly_all_the_way():

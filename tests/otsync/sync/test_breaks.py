@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from otsync import synchronize
-from otsync.align.breaks import by_chance, likely, partners
+from otsync.align.breaks import beside_returns, by_chance, like_itself, likely, local_curves, partners
 from otsync.bench.trust.worlds import CLASSES
 from otsync.clocks.common import CommonClock
 from otsync.clocks.splines import TrackSplines
@@ -61,6 +61,40 @@ def test_frames_without_a_partner_are_no_part_and_speak_against_none(name, seed,
     assert offsets.ok and world.errors(offsets)[0][0] < 0.2
     (found,) = offsets.breaks[0] + offsets.breaks[1]
     assert found.jump == pytest.approx(jump, abs=1 / 30 if jump < -2 else 0.2 / 30)
+
+
+def test_motion_that_comes_back_breaks_no_clock():
+    """Of two strides either may suit a second better; a frozen stride is seen all the same."""
+    world = CLASSES["strides"](301)
+    offsets = synchronize(list(world.tracks))
+    assert world.errors(offsets)[0][0] < 0.1 and offsets.flags[1] == (Status.AMBIGUOUS,)
+    assert all(Status.BROKEN_CLOCK not in a.flags for a in offsets.alignments.values())
+    world = CLASSES["strides, one frozen"](303)
+    offsets = synchronize(list(world.tracks))
+    (found,) = offsets.breaks[1]
+    assert offsets.ok and world.errors(offsets)[0][0] < 0.15 and found.still == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("period", [0.0, 30.0])
+def test_what_motion_that_comes_back_makes_is_taken_off_and_nothing_else(period):
+    """One of two videos is late by 30 frames from its middle on: clear where motion wanders, not where it repeats."""
+    rng = np.random.default_rng(1)
+    t = np.arange(-60, 240)
+    wander = np.cumsum(rng.normal(size=(20, 300, 3)), 1)
+    wander = np.stack([np.convolve(w, np.ones(9) / 9, "same") for w in wander.transpose(0, 2, 1).reshape(60, -1)])
+    wander = wander.reshape(20, 3, 300).transpose(0, 2, 1)
+    shown = np.sin(2 * np.pi * t / period + rng.uniform(0, 6, (20, 3, 1))).transpose(0, 2, 1) if period else wander
+    k = np.arange(150)
+    a, b = shown[:, 60 + k], shown[:, 60 + k + 30 * (k >= 75)]
+    pair = CommonClock(*(x + 0.02 * rng.normal(size=x.shape) for x in (a, b)), 30.0, 0.0)
+    lags, weight = np.arange(-60, 61), np.ones(20)
+    curves = local_curves(pair, lags, 0.01, weight)
+    best = int(curves.sum(0).argmax())
+    own = beside_returns(curves, like_itself(pair, lags, best, 0.01, weight), best)
+    np.testing.assert_array_equal(own[:, best], curves[:, best])
+    assert (own <= curves).all() and (own >= np.minimum(curves, curves[:, [best]])).all()
+    gain, left = (float((x - curves[:, [best]]).max()) for x in (curves, own))
+    assert left < 0.3 * gain if period else left == pytest.approx(gain, rel=0.05)
 
 
 def test_of_likely_offsets_no_two_are_near():
