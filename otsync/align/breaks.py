@@ -102,7 +102,7 @@ def local_curves(
     begin = np.zeros(len(lags), np.int64)
     for some in blocks(len(pair.a), max(pair.a.shape[1], pair.b.shape[1])):  # of long clips few matches at a time
         a, b = Signal.of(pair.a[some]), Signal.of(pair.b[some])
-        arrays = *a.arrays, *b.arrays, lags, begin, step, frames(LEAST_WINDOW), floor, weight[some], out
+        arrays = *a.for_kernels, *b.for_kernels, lags, begin, step, frames(LEAST_WINDOW), floor, weight[some], out
         kernels.windowed_evidence(*arrays)
     out /= max(len(pair.a), 1)
     return out

@@ -94,31 +94,14 @@ def variances(s):
     return max((both - own) / c, 0.0), max(rest / c, 0.0)
 
 
-@kernel()
-def lives(weight):
-    """The frames from which on, and before which, each match of ``weight`` (M,T) is seen: (M,2), 0 where never.
-
-    Of long clips a track lives in a small part: loops over lags and frames read nothing beside it.
-    """
-    M, T = weight.shape
-    out = np.zeros((M, 2), np.int64)
-    for m in range(M):
-        for t in range(T):
-            if weight[m, t] > 0:
-                if out[m, 1] == 0:
-                    out[m, 0] = t
-                out[m, 1] = t + 1
-    return out
-
-
 @kernel(fastmath={"contract", "reassoc", "nsz"})
-def lag_statistics(a, wa, qa, b, wb, qb, lags, least, count, power, residual):
+def lag_statistics(a, wa, qa, lives_a, b, wb, qb, lives_b, lags, least, count, power, residual):
     """Variances of every match over its common frames at every lag; the mean over exactly these frames is removed.
 
-    a (M,3,Ta), b (M,3,Tb): 0 where unseen; wa (M,Ta), wb: 1 seen, 0 not; qa = |a|^2, qb. Frame i of a meets i - lag of
-    b. Fills (M,K): frames in common; Var(a) + Var(b); Var(a - b). All 0 below ``least`` frames in common.
+    a (M,3,Ta), b (M,3,Tb): 0 where unseen; wa (M,Ta), wb: 1 seen, 0 not; qa = |a|^2, qb; lives_a (M,2), lives_b: from
+    and before which frame. Frame i of a meets i - lag of b. Fills (M,K): frames in common; Var(a) + Var(b); Var(a - b).
+    All 0 below ``least`` frames in common.
     """
-    lives_a, lives_b = lives(wa), lives(wb)
     s = np.empty(10)
     for m in range(len(a)):
         for n in range(len(lags)):
@@ -133,7 +116,7 @@ def lag_statistics(a, wa, qa, b, wb, qb, lags, least, count, power, residual):
             power[m, n], residual[m, n] = variances(s)
 
 
-def windowed_evidence(a, wa, qa, b, wb, qb, lags, begin, block, least, floor, weight, out):
+def windowed_evidence(a, wa, qa, lives_a, b, wb, qb, lives_b, lags, begin, block, least, floor, weight, out):
     """Sum over matches and windows of n/2 log((Var a + Var b + floor) / (Var(a - b) + floor)) at every lag.
 
     Matches count by their ``weight``. Arrays as for :func:`lag_statistics`. Windows are two blocks of ``block`` frames
@@ -142,7 +125,7 @@ def windowed_evidence(a, wa, qa, b, wb, qb, lags, begin, block, least, floor, we
     every sample is in two. The lags are spread over threads.
     """
     at_once = max(1, SAMPLES_AT_ONCE // max(a.shape[0] * a.shape[2], 1))
-    arrays = a, wa, qa, lives(wa), b, wb, qb, lives(wb), lags, begin, block, least, floor, weight, out
+    arrays = a, wa, qa, lives_a, b, wb, qb, lives_b, lags, begin, block, least, floor, weight, out
     for_each(add_evidence, ranges(len(lags), at_once), *arrays)
 
 

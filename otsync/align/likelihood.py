@@ -228,7 +228,7 @@ def window_score(
         block, few = frames(BLOCK), frames(MIN_WINDOW)
         for part in blocks(len(pair.a), max(pair.a.shape[1], pair.b.shape[1])):  # of long clips few matches at a time
             a, b = Signal.of(pair.a[part]), Signal.of(pair.b[part])
-            arrays = *a.arrays, *b.arrays, some, begin, block, few, floor, weight[part], total
+            arrays = *a.for_kernels, *b.for_kernels, some, begin, block, few, floor, weight[part], total
             kernels.windowed_evidence(*arrays)
         return total[0] / len(pair.a)
 
@@ -265,7 +265,7 @@ def statistics(
     if not direct(a.arrays[1].shape, b.arrays[1].shape[1], lags):
         return lag_statistics(a, b, lags, least)
     out = tuple(np.zeros((len(a.arrays[0]), len(lags))) for _ in range(3))
-    kernels.lag_statistics(*a.arrays, *b.arrays, lags, least, *out)
+    kernels.lag_statistics(*a.for_kernels, *b.for_kernels, lags, least, *out)
     return out  # type: ignore[return-value]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
 
 def evenly(count: int, most: int) -> Int[np.ndarray, " n"]:
@@ -33,3 +33,17 @@ def blocks(rows: int, columns: int, at_once: int = 2**20) -> Iterator[slice]:
     many = rows if rows * columns <= at_once else max(1, at_once // 4 // max(columns, 1))
     for first in range(0, rows, max(many, 1)):
         yield slice(first, min(first + many, rows))
+
+
+def lives(seen: Bool[np.ndarray, "N T"]) -> Int[np.ndarray, "N 2"]:
+    """The frames from which on, and before which, every track is seen; 0 and 0 of one that never is.
+
+    Of a long clip a track lives in a small part: loops over lags and frames read nothing beside it.
+
+    Example:
+        >>> lives(np.array([[False, True, False, True, False], [False] * 5])).tolist()
+        [[1, 4], [0, 0]]
+    """
+    ends = np.stack([seen.argmax(1), seen.shape[1] - seen[:, ::-1].argmax(1)], 1)
+    ends[~seen.any(1)] = 0
+    return ends

@@ -16,6 +16,7 @@ from ..align.likelihood import APART, MIN_OVERLAP
 from ..align.peaks import peak, separate_peaks
 from ..align.slot import Aligner
 from ..clocks.common import nominal_fps, on_clock
+from ..compute.indices import lives
 from ..geometry import fundamentals, seen_pixels
 from ..types import Alignment, Matches, Status, TrackSet, in_order
 from .residuals import MAD, Residuals, broken
@@ -266,7 +267,7 @@ def residuals_by_lag(
     """
     from .kernels import epipolar_evidence
 
-    lives_a, lives_b = (_lives(x) for x in (xa, xb))
+    lives_a, lives_b = (lives(np.isfinite(x[..., 0])) for x in (xa, xb))
     (begin_a, end_a), (begin_b, end_b) = lives_a[pairs[:, 0]].T, lives_b[pairs[:, 1]].T
     low = np.maximum(lags[0], begin_a + least - end_b)
     high = np.minimum(lags[-1], end_a - least - begin_b)
@@ -278,13 +279,6 @@ def residuals_by_lag(
     candidate = np.repeat(np.arange(len(pairs)), many)
     lag = np.arange(edge[-1]) - edge[candidate] + low[candidate] - lags[0]
     return Told(candidate, lag, mean, count, np.full(mean.shape, np.nan))
-
-
-def _lives(x: Float[np.ndarray, "N T 2"]) -> Int[np.ndarray, "N 2"]:
-    """The frames from which on, and before which, every track is seen; 0 and 0 of those that never are."""
-    seen = np.isfinite(x[..., 0])
-    ends = np.stack([seen.argmax(1), x.shape[1] - seen[:, ::-1].argmax(1)], 1)
-    return np.where(seen.any(1)[:, None], ends, 0)
 
 
 def mixture(
