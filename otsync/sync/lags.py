@@ -40,9 +40,11 @@ LEAST_SEEN = 20 / 30
 TYPICAL = 2.0
 """Pairs whose residual is beyond this many typical ones count for less: neighbours that part."""
 
-TOGETHER = 0.4
+TOGETHER = 0.31
 """Correlation of the detrended positions of neighbours, the median, from which on they move together. Forty things that
-each go their own way have .30 at most, tracks that lag .76 and more (mid) and .42 (hard, seeds 41000-41011)."""
+each go their own way have .30 at most, tracks that lag .76 and more (mid) and .31 (hard, 92 videos, seeds 41000-41039,
+55000-55019 and 56000-56019). Tracks that do not lag, with .3 to .45, seem late by .38 frame at most (42 videos, hard,
+brutal and few tracks, same seeds and 55020-55039), but for one with .31 (.69)."""
 
 FINE, DEPENDENT = 0.3 / 30, 0.3
 """A pair that knows its delay to FINE seconds counts half as much as one that knows it exactly; and seconds within

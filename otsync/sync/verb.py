@@ -32,7 +32,7 @@ from .pairs import Job, Refit, run, run_refit, with_rate
 from .parts import broken_part, unvouched
 from .rematching import contested, rematching
 from .verdict import Answer, Verdict, judge
-from .witnesses import elsewhere, left_over, once_more, parted, scan_only
+from .witnesses import ROUNDS, elsewhere, left_over, once_more, parted, scan_only
 
 
 def synchronize(
@@ -175,18 +175,24 @@ def with_witnesses_heard(
     """The verdict, with pairs doubted of which a part of the scene tells another time.
 
     Args:
-        rest: whether the tracks that an answer does not explain are matched once more, and asked, too.
+        rest: whether the tracks that an answer does not explain are matched once more, and asked, too; and those that
+            these leave.
     """
     answers = {a.pair: a for a in verdict.answers if a.refined.status.ok and a.finite}
     asked = [job for job in jobs if job.pair in answers and job.a.xyz is not None and job.b.xyz is not None]
     doubted = {job.pair for job in asked if parted(answers[job.pair], job.a, job.b) > limit}
-    unexplained = [left_over(answers[job.pair], job) for job in asked if rest and job.pair not in doubted]
-    others = [job for job in unexplained if job is not None]
-    first = list(map(run, [scan_only(job) for job in others]))
-    again = [job for other, answer in zip(others, first, strict=True) for job in once_more(other, answer)]
     shared = {job.pair: Seen.by(answers[job.pair], job.a, job.b)[1] for job in asked}
     middle = {pair: (seen.begin + seen.end) / 2 for pair, seen in shared.items()}
-    doubted |= {a.pair for a in map(run, again) if elsewhere(a, answers[a.pair], middle[a.pair])}
+    explained = [(answers[job.pair], job) for job in asked if rest]
+    for _ in range(ROUNDS):
+        unexplained = [left_over(answer, job) for answer, job in explained if job.pair not in doubted]
+        others = [job for job in unexplained if job is not None]
+        first = list(map(run, [scan_only(job) for job in others]))
+        again = [job for other, answer in zip(others, first, strict=True) for job in once_more(other, answer)]
+        found = list(map(run, again))
+        doubted |= {a.pair for a in found if elsewhere(a, answers[a.pair], middle[a.pair])}
+        # what the rest has at the answer's own time leaves a rest, too
+        explained = [(a, job) for a, job in zip(found, again, strict=True) if a.finite and a.refined.status.ok]
     if not doubted:
         return verdict
     return judged([lagging(a) if a.pair in doubted else a for a in verdict.answers])
