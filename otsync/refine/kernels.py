@@ -25,16 +25,22 @@ def shift_residuals(x, coefficients, mean, first, value, slope, clock, ok, lo, h
     seen = np.zeros(T + 1)
     part = np.zeros(D)
     for m in range(M):
+        begin, end, count = T, 0, 0
         for t in range(T):
-            seen[t + 1] = seen[t] + ok[m, t]
-        if seen[T] < least:
-            rr[m] = 0.0
-            for p in range(P):
-                g[p, m] = 0.0
-                for q in range(P):
-                    h[p, q, m] = 0.0
+            if ok[m, t]:
+                begin, end, count = min(begin, t), t + 1, count + 1
+        rr[m] = 0.0
+        for p in range(P):
+            g[p, m] = 0.0
+            for q in range(P):
+                h[p, q, m] = 0.0
+        if count < least:
             continue
-        for t in range(T):
+        # of long clips a match lives in a small part: nothing beside it is read
+        seen[begin] = 0.0
+        total[begin] = 0.0
+        for t in range(begin, end):
+            seen[t + 1] = seen[t] + ok[m, t]
             if ok[m, t]:
                 f = first[t]
                 for d in range(3):
@@ -52,17 +58,13 @@ def shift_residuals(x, coefficients, mean, first, value, slope, clock, ok, lo, h
             else:
                 for d in range(D):
                     total[t + 1, d] = total[t, d]
-        for t in range(T):
+        for t in range(begin, end):
             if not ok[m, t]:
-                rr[m, t] = 0.0
-                for p in range(P):
-                    g[p, m, t] = 0.0
-                    for q in range(P):
-                        h[p, q, m, t] = 0.0
                 continue
-            around = seen[hi[t]] - seen[lo[t]]
+            low, high = max(lo[t], begin), min(hi[t], end)
+            around = seen[high] - seen[low]
             for d in range(D):
-                part[d] = raw[t, d] - (total[hi[t], d] - total[lo[t], d]) / around
+                part[d] = raw[t, d] - (total[high, d] - total[low, d]) / around
             rr[m, t] = part[0] * part[0] + part[1] * part[1] + part[2] * part[2]
             for p in range(P):
                 i = 3 + 3 * p

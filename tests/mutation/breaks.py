@@ -799,7 +799,7 @@ BREAKS = (
     Break(
         "refine-mean-kept",
         "otsync/refine/kernels.py",
-        "raw[t, d] - (total[hi[t], d] - total[lo[t], d]) / around",
+        "raw[t, d] - (total[high, d] - total[low, d]) / around",
         "raw[t, d]",
         REFINE,
         "residuals are not detrended",
