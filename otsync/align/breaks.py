@@ -115,9 +115,10 @@ def like_itself(
     so much later as each lag is beside the ``best`` one, or of b, the larger.
     """
     lag = int(lags[best])
-    a_later = dataclasses.replace(pair, b=_later(pair.a, lag, pair.b.shape[1]))
+    # all that a shows: of what only the overlap shows, more would be in common at lags that reach beyond it
+    a_later = local_curves(dataclasses.replace(pair, b=pair.a), lags - lag, floor, weight)
     b_later = dataclasses.replace(pair, a=_later(pair.b, -lag, pair.a.shape[1]))
-    return np.maximum(*(local_curves(p, lags, floor, weight) for p in (a_later, b_later)))
+    return np.maximum(a_later, local_curves(b_later, lags, floor, weight))
 
 
 def beside_returns(
@@ -208,7 +209,7 @@ def _told(
     straight = float(curves[:, best].sum())
     rate_gain, even = _as_a_rate(curves, straight)
     line = even if rate_gain > AS_A_RATE else np.full(windows, best)
-    doubtful = prefers_another(own, line, seen_share(pair, int(lags[best]), step))
+    doubtful = prefers_another(curves, own, line, seen_share(pair, int(lags[best]), step))
     curves = without_chance(own, best, pair, int(lags[best]), step)
     least, ratio = explained(pair, int(lags[best]), floor, step)
     doubtful |= ratio > UNUSUAL
@@ -371,15 +372,20 @@ def seen_share(pair: CommonClock, lag: int, step: int) -> Float[np.ndarray, " W"
 
 
 def prefers_another(
-    curves: Float[np.ndarray, "W K"], line: Int[np.ndarray, " W"], seen: Float[np.ndarray, " W"]
+    curves: Float[np.ndarray, "W K"],
+    own: Float[np.ndarray, "W K"],
+    line: Int[np.ndarray, " W"],
+    seen: Float[np.ndarray, " W"],
 ) -> bool:
-    """Whether two windows in a row, in which enough is seen, clearly suit an offset beside ``line``, that of each."""
+    """Whether two windows in a row, in which enough is seen, clearly suit an offset of their ``own`` better than
+    ``line``, the index of that of each in ``curves``.
+    """
     usual = float(np.median(seen[seen > 0])) if (seen > 0).any() else 0.0
     told = np.flatnonzero(np.minimum(seen[:-1], seen[1:]) >= SEEN * usual)
     if usual == 0 or not len(told):
         return False
     here = curves[told, line[told]] + curves[told + 1, line[told + 1]]
-    gain = float(((curves[told] + curves[told + 1]).max(1) - here).max())
+    gain = float(((own[told] + own[told + 1]).max(1) - here).max())
     return gain > PREFERS + OF_USUAL * max(float(np.median(here)), 0.0)
 
 

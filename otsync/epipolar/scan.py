@@ -158,7 +158,9 @@ class EpipolarScan(Aligner):
         fps: float,
         unit: float,
     ) -> Told:
-        """Log-likelihood of every candidate and lag against the typical one, by motion and by position; -inf unseen."""
+        """Log-likelihood of candidates at the lags at which their tracks live, against the typical one: by motion and
+        by position, -inf where too little is seen; 0 of a kind that is known nowhere.
+        """
         least, window = max(2, round(self.min_seen * fps)), max(4, round(self.window * fps))
         told = residuals_by_lag(xa, xb, F, pairs, lags, least, window, max(LEAST_SAMPLES, round(MIN_WINDOW * fps)))
         mean, count, nats = told.mean, told.count, np.full(told.mean.shape, -np.inf)
@@ -271,7 +273,8 @@ def residuals_by_lag(
     (begin_a, end_a), (begin_b, end_b) = lives_a[pairs[:, 0]].T, lives_b[pairs[:, 1]].T
     low = np.maximum(lags[0], begin_a + least - end_b)
     high = np.minimum(lags[-1], end_a - least - begin_b)
-    many = np.maximum(0, high - low + 1)
+    long = np.minimum(end_a - begin_a, end_b - begin_b) >= least
+    many = np.where(long, np.maximum(0, high - low + 1), 0)
     edge = np.concatenate([[0], np.cumsum(many)])
     mean, count = np.full((2, edge[-1]), np.nan), np.zeros((2, edge[-1]))
     arrays = np.ascontiguousarray(xa), np.ascontiguousarray(xb), F, pairs, lives_a, lives_b, low, edge

@@ -42,6 +42,10 @@ class Job:
     refiner: Refiner
     matches: Matches | None
 
+    def on(self, other: Job) -> Job:
+        """The same algorithms on the tracks of another one."""
+        return dataclasses.replace(self, a=other.a, b=other.b)
+
 
 def run(job: Job) -> Answer:
     """Match, align and refine one pair. An exception becomes the status FAILED, told in the log."""

@@ -183,16 +183,20 @@ def with_witnesses_heard(
     doubted = {job.pair for job in asked if parted(answers[job.pair], job.a, job.b) > limit}
     shared = {job.pair: Seen.by(answers[job.pair], job.a, job.b)[1] for job in asked}
     middle = {pair: (seen.begin + seen.end) / 2 for pair, seen in shared.items()}
+    slots = {job.pair: job for job in asked}
     explained = [(answers[job.pair], job) for job in asked if rest]
     for _ in range(ROUNDS):
         unexplained = [left_over(answer, job) for answer, job in explained if job.pair not in doubted]
         others = [job for job in unexplained if job is not None]
+        if not others:
+            break
         first = list(map(run, [scan_only(job) for job in others]))
         again = [job for other, answer in zip(others, first, strict=True) for job in once_more(other, answer)]
-        found = list(map(run, again))
+        found = list(map(run, again)) if again else []
         doubted |= {a.pair for a in found if elsewhere(a, answers[a.pair], middle[a.pair])}
-        # what the rest has at the answer's own time leaves a rest, too
-        explained = [(a, job) for a, job in zip(found, again, strict=True) if a.finite and a.refined.status.ok]
+        # what the rest has at the answer's own time leaves a rest, too, which is matched without a time once more
+        told = zip(found, again, strict=True)
+        explained = list({a.pair: (a, slots[a.pair].on(job)) for a, job in told if a.refined.status.ok}.values())
     if not doubted:
         return verdict
     return judged([lagging(a) if a.pair in doubted else a for a in verdict.answers])

@@ -59,7 +59,8 @@ contradicted so, and of 72 pairs of real cameras none. Of 20 pairs in which one 
 of one of these no neighbourhood told (seeds 51000-51019)."""
 
 PARTLY = frozenset({Status.BROKEN_CLOCK})
-"""Doubts that the rest may leave: its tracks may tell two times, and then some seconds suit the other one better."""
+"""Doubts that the rest may leave: its tracks may tell two times, and then some seconds suit the other one better, by
+the scan or by the fit (2.8 units unsteady: seed 56014)."""
 
 COMPETES = 0.5
 """Share of the best time's evidence from which another one of the rest competes."""
@@ -151,7 +152,7 @@ def competing(scan: Alignment) -> list[float]:
 
 
 def elsewhere(rest: Answer, answer: Answer, middle: float) -> bool:
-    """Whether the rest has a sound answer that is another one.
+    """Whether the rest has an answer that is another one, without doubts but :data:`PARTLY`.
 
     Args:
         middle: s of the second video's clock at which they are compared: their rates may differ.

@@ -165,7 +165,7 @@ class Arap(MotionLoss):
     Compares two moments apart by one of `shifts` (seconds), drawn. Zero for rigid motions of all nodes together.
     """
 
-    weight: float = 0.036
+    weight: float = 0.03
     every: int = 2
     shifts: tuple[float, ...] = SHIFTS
     neighbours: int = 6
@@ -178,7 +178,7 @@ class Arap(MotionLoss):
 class Length(MotionLoss):
     """Distances to neighbours are kept (MoSca's L_len), between two moments as for :class:`Arap`."""
 
-    weight: float = 0.036
+    weight: float = 0.03
     every: int = 2
     shifts: tuple[float, ...] = SHIFTS
     neighbours: int = 6

@@ -895,6 +895,14 @@ BREAKS = (
         "of two strides the one that suits a second better breaks a clock",
     ),
     Break(
+        "breaks-slow-motion-returns",
+        "otsync/align/breaks.py",
+        "returns = alike - np.concatenate([below, above[:, 1:]], 1)",
+        "returns = alike",
+        ("tests/otsync/sync/test_breaks.py",),
+        "slow motion, which is like itself a little later, hides breaks",
+    ),
+    Break(
         "epipolar-lags-of-long-lives",
         "otsync/epipolar/scan.py",
         "high = np.minimum(lags[-1], end_a - least - begin_b)",

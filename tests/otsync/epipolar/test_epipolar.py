@@ -324,6 +324,9 @@ def test_only_lags_at_which_both_tracks_live_are_asked_and_none_is_forgotten(see
     F, pairs = rng.normal(size=(1, 1, 3, 3)), np.argwhere(np.ones((3, 3)))
     lags = np.arange(-frames[1] + 5, frames[0] - 4)
     told = residuals_by_lag(A, B, F, pairs, lags, least, window, within)
+    for m, k in zip(told.candidate, told.lag, strict=True):
+        i, j = (np.flatnonzero(np.isfinite(x[n, :, 0])) for x, n in ((A, pairs[m, 0]), (B, pairs[m, 1])))
+        assert min(i[-1], j[-1] + lags[k]) - max(i[0], j[0] + lags[k]) + 1 >= least
     where = zip(told.candidate, told.lag, strict=True)
     found = {at: (told.mean[:, e], told.count[:, e]) for e, at in enumerate(where)}
     for m, (i, j) in enumerate(pairs):
