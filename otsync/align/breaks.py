@@ -42,8 +42,8 @@ to brutal, few tracks, like people) have .91 at most but for one of 1.25; truste
 COMES_BACK = 0.75
 """Share of what a window has at another offset that a video must have in common with itself then, for motion that comes
 back to explain it: a video is like itself, point by point, at least as much as it is like another. Where bodies swing
-and walk (films, seeds 430-436) it is .8 to 2 in nine of ten pairs; behind a missing second, in motion that nearly comes
-back, .9 at most and .5 usually."""
+and walk (films, seeds 430 and 433) it is .8 to 2 in most pairs; behind a missing second (mid, seeds 41000-41005), in
+motion that nearly comes back, .9 at most and .5 usually."""
 
 ODD, UNUSUAL, LEAST_MISSING = 3.0, 4.5, 0.15
 """How many times more than usual may be missing in two windows in a row: clean pairs 1.5 (mid), 4.3 (hard), 4.2

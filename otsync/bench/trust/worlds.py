@@ -230,6 +230,7 @@ CLASSES: dict[str, Callable[[int], World]] = {
     "strides": partial(plain, motion="strides"),
     "strides, hard": partial(plain, motion="strides", preset="hard"),
     "strides, one frozen": partial(plain, motion="strides", first=(In(1, Freeze(30)),)),
+    "strides, one missing": partial(plain, motion="strides", first=(In(1, Drop(1.0)),), within=15),
     "carousel": partial(plain, motion="carousel", alike=True),
     "belt": partial(plain, motion="belt", alike=True),
     "flock": partial(plain, motion="flock", alike=True),
