@@ -197,7 +197,7 @@ class Run:
         for (_, radii), g in zip(probes, gradients[len(names) :], strict=True):
             if pull is not None and g is not None:
                 seen_here = (radii[:, : len(scene)] > 0).any(-1)
-                length = g.reshape(radii.shape)[:, : len(scene)].norm(dim=-1)
+                length = g.reshape(len(radii), -1, 2)[:, : len(scene)].norm(dim=-1)
                 pull += torch.stack([(length * seen_here).sum(0), seen_here.float().sum(0)])
         psnrs = [-10 * math.log10(float(e) + 1e-12) for e in errors]
         return JobDone([float(x.detach()) for x in losses], psnrs, list(gradients[: len(names)]), pull)

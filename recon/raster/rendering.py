@@ -85,13 +85,13 @@ class Rendering:
     `means2d` takes part in the graph: call `rendering.means2d.retain_grad()` before `backward()`, or pass it to
     `torch.autograd.grad`, to read the gradient of the loss with respect to the 2-D means (per pixel); `radii > 0` are
     the Gaussians that were drawn. It is the very tensor that was rasterized: a view of it would not be in the graph and
-    would have no gradient. So it keeps gsplat's own shape, which is [C,1,N,2] where means are [C,N,3], one set per
-    camera; bring gradients to one shape with `grad.reshape(rendering.radii.shape)`, which is [C,N,2] everywhere.
+    would have no gradient. So it keeps gsplat's own shape, which is [C,1,M,2] where means are [C,N,3], one set per
+    camera, and M may exceed N by rows that are not drawn; `grad.reshape(C, -1, 2)[:, :N]` is [C,N,2] everywhere.
     """
 
     colors: Tensor  # [C,H,W,D]
     alphas: Tensor  # [C,H,W,1] 1 - transmittance
     depths: Tensor | None  # [C,H,W,1] z in the camera frame, expected or accumulated; None when not asked for
-    means2d: Tensor  # [C,N,2] pixels; by gsplat [C,1,N,2] where means are per camera
+    means2d: Tensor  # [C,N,2] pixels; by gsplat [C,1,M,2], M >= N, where means are per camera
     radii: Tensor  # [C,N,2] int32 pixels
     backend: str  # "torch", "cpu" or "gsplat"
