@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from ..clocks.common import CommonClock
-from ..compute.indices import blocks
-from .peaks import vertex
-from .signal import Signal
-
-STEP = 10 / 30
-"""Half the length, s, of the windows that are compared, and how far they are apart."""
-
-LEAST_WINDOW = 8 / 30
-"""Seconds that a match must be seen in both videos within a window."""
+from .peaks import likely, vertex
+from .returns import beside_returns, like_itself, return_is_liked
+from .windows import LEAST_WINDOW, STEP, agreement, explained, local_curves, seen_share
 
 PRICE, SHARE = 7.0, 0.08
 """Nats a match, and share of the whole evidence, that a jump must gain to be told. Clean pairs (mid to brutal) gain up
@@ -39,23 +32,12 @@ unexplained at every offset, a break does so at one alone. In units of this limi
 to brutal, few tracks, like people) have .91 at most but for one of 1.25; trusted answers that were wrong at one end
 (frames lost, frozen pictures under hard and brutal noise, two takes) .5 to 1.8, five of seven more than 1."""
 
-COMES_BACK = 0.75
-"""Share of what a window has at another offset that a video must have in common with itself then, for motion that comes
-back to explain it: a video is like itself, point by point, at least as much as it is like another. Where bodies swing
-and walk (films, seeds 430 and 433) it is .8 to 2 in most pairs; behind a missing second (mid, seeds 41000-41005), in
-motion that nearly comes back, .9 at most and .5 usually."""
-
-ODD, UNUSUAL, LEAST_MISSING = 3.0, 4.5, 0.15
+ODD, UNUSUAL = 3.0, 4.5
 """How many times more than usual may be missing in two windows in a row: clean pairs 1.5 (mid), 4.3 (hard), 4.2
-(brutal) at most, of ten lost frames half have 4.6 to 7; and what counts as missing at all."""
+(brutal) at most, of ten lost frames half have 4.6 to 7."""
 
 AGREES = 0.5
 """Share of its motion that the median match must have in common over a part, at the part's own offset."""
-
-MOVES = 6.0
-"""Variance of a match within a window, in units of the noise floor, above which it moves there."""
-
-BEST_QUARTER, LEAST_MOVING = 0.75, 5
 
 BEYOND = 0.5
 """Share of a usual window's evidence that windows must have which lie beyond the overlap at the best offset: some
@@ -69,9 +51,6 @@ SLOPES = 0.05
 
 LEAST_JUMP = 3 / 30
 """Seconds; smaller steps are a rate, or noise."""
-
-OTHERS = 8
-"""Offsets of a part that are tried where most matches do not agree at its best one."""
 
 SHORT = 1.0
 """Seconds at either end of the clip in which some offset may suit by chance."""
@@ -87,65 +66,21 @@ REACH = 5.0
 NONE = np.zeros((0, 2))
 
 
-def local_curves(
-    pair: CommonClock, lags: Int[np.ndarray, " K"], floor: float, weight: Float[np.ndarray, " M"]
-) -> Float[np.ndarray, "W K"]:
-    """Evidence of every window of a's frames (two steps long) at every lag, nats a match."""
-    from . import kernels
+@dataclass(frozen=True, eq=False)
+class Breaks:
+    """What a pair tells of breaks.
 
-    def frames(seconds: float) -> int:
-        return max(1, round(seconds * pair.fps))
-
-    step = frames(STEP)
-    count = -(-pair.a.shape[1] // step) + 1
-    out = np.zeros((count, len(lags)))
-    begin = np.zeros(len(lags), np.int64)
-    for some in blocks(len(pair.a), max(pair.a.shape[1], pair.b.shape[1])):  # of long clips few matches at a time
-        a, b = Signal.of(pair.a[some]), Signal.of(pair.b[some])
-        arrays = *a.for_kernels, *b.for_kernels, lags, begin, step, frames(LEAST_WINDOW), floor, weight[some], out
-        kernels.windowed_evidence(*arrays)
-    out /= max(len(pair.a), 1)
-    return out
-
-
-def like_itself(
-    pair: CommonClock, lags: Int[np.ndarray, " K"], best: int, floor: float, weight: Float[np.ndarray, " M"]
-) -> Float[np.ndarray, "W K"]:
-    """What either video has in common with itself, in place of the other: :func:`local_curves` of a with what it shows
-    so much later as each lag is beside the ``best`` one, or of b, the larger.
+    Args:
+        parts: rows (seconds of a's clock from which on, offset in seconds); none where one offset suits the whole.
+        gain: evidence that the parts add, nats a match.
+        doubtful: there may be parts that the evidence is too weak to tell.
+        returns: that is so because motion comes back, and some stretch suits another return as well.
     """
-    lag = int(lags[best])
-    # all that a shows: of what only the overlap shows, more would be in common at lags that reach beyond it
-    a_later = local_curves(dataclasses.replace(pair, b=pair.a), lags - lag, floor, weight)
-    b_later = dataclasses.replace(pair, a=_later(pair.b, -lag, pair.a.shape[1]))
-    return np.maximum(a_later, local_curves(b_later, lags, floor, weight))
 
-
-def beside_returns(
-    curves: Float[np.ndarray, "W K"], alike: Float[np.ndarray, "W K"], best: int
-) -> Float[np.ndarray, "W K"]:
-    """What windows have at every offset; where that is more than at the ``best`` one of all, less what motion that
-    comes back makes of it.
-
-    People who walk do nearly the same a stride later, and of two strides either may suit a window better, by chance or
-    by wrong matches. What a video has in common with itself so much later, ``alike``, tells nothing of clocks. Slow
-    motion is like itself a little later, too, and hides no break: only what rises again behind the least counts.
-    """
-    below = np.minimum.accumulate(alike[:, best::-1], 1)[:, ::-1]
-    above = np.minimum.accumulate(alike[:, best:], 1)
-    returns = alike - np.concatenate([below, above[:, 1:]], 1)
-    here = curves[:, [best]]
-    told = (curves > here) & (alike >= COMES_BACK * curves)
-    return np.where(told, np.maximum(here, curves - returns), curves)
-
-
-def _later(x: Float[np.ndarray, "M T 3"], begin: int, length: int) -> Float[np.ndarray, "M L 3"]:
-    """``length`` frames from ``begin`` on, nan where there are none."""
-    out = np.full((len(x), length, x.shape[2]), np.nan)
-    low, high = max(0, -begin), min(length, x.shape[1] - begin)
-    if high > low:
-        out[:, low:high] = x[:, low + begin : high + begin]
-    return out
+    parts: Float[np.ndarray, "P 2"] = field(default_factory=lambda: NONE)
+    gain: float = 0.0
+    doubtful: bool = False
+    returns: bool = False
 
 
 def path_of(curves: Float[np.ndarray, "W K"], price: float) -> Int[np.ndarray, " W"]:
@@ -173,11 +108,13 @@ def find_breaks(
     score: Float[np.ndarray, " K"],
     floor: float,
     weight: Float[np.ndarray, " M"],
-) -> tuple[Float[np.ndarray, "P 2"], float, bool]:
+    *,
+    ambiguous: bool = False,
+) -> Breaks:
     """The parts of the overlap that have offsets of their own.
 
-    Returns rows (seconds of a's clock from which on, offset in seconds), none where one offset suits the whole; how
-    much evidence the parts add, nats a match; and whether there may be parts that the evidence is too weak to tell.
+    Args:
+        ambiguous: another offset is known to suit the whole as well: then it need not be told of a part, too.
     """
     step = max(1, round(STEP * pair.fps))
     windows = -(-pair.a.shape[1] // step) + 1
@@ -185,14 +122,17 @@ def find_breaks(
         near = np.abs(lags - lags[int(np.argmax(score))]) <= REACH * pair.fps
         lags = lags[near]
     if windows < 4 or not len(lags):
-        return NONE, 0.0, False
+        return Breaks()
     curves = local_curves(pair, lags, floor, weight)
     found = _told(pair, lags, curves, curves, floor, step)
-    if len(found[0]) or found[2]:
-        best = int(np.argmax(curves.sum(0)))
+    best = int(np.argmax(curves.sum(0)))
+    if found.doubtful or len(found.parts):
         own = beside_returns(curves, like_itself(pair, lags, best, floor, weight), best)
         found = _told(pair, lags, curves, own, floor, step)
-    return found
+    if found.doubtful or len(found.parts) or ambiguous:
+        return found
+    returns = return_is_liked(pair, lags, curves, best, step, round(LEAST_JUMP * pair.fps))
+    return replace(found, doubtful=returns, returns=returns)
 
 
 def _told(
@@ -202,7 +142,7 @@ def _told(
     own: Float[np.ndarray, "W K"],
     floor: float,
     step: int,
-) -> tuple[Float[np.ndarray, "P 2"], float, bool]:
+) -> Breaks:
     """What :func:`find_breaks` returns. The one offset is that of ``curves``; others are sought in ``own``."""
     windows = len(curves)
     best = int(np.argmax(curves.sum(0)))
@@ -222,9 +162,9 @@ def _told(
         if len(edges) and gain >= price * len(edges):
             break
     else:
-        return NONE, max(gain, 0.0), doubtful
+        return Breaks(gain=max(gain, 0.0), doubtful=doubtful)
     if gain <= _as_a_rate(curves, straight)[0] + AS_A_RATE:
-        return NONE, gain, doubtful  # a rate explains it as well, with one number
+        return Breaks(gain=gain, doubtful=doubtful)  # a rate explains it as well, with one number
     look = Look(pair, lags, curves, best, floor, step)
     spans = np.split(np.arange(windows), edges)
     tops = [int(np.argmax(curves[p].sum(0))) for p in spans]
@@ -234,15 +174,15 @@ def _told(
         # the windows of what is left out belong to nothing; the next part begins where it did
         spans, tops = [spans[k] for k in kept], [tops[k] for k in kept]
         if len(kept) < 2 or gain < price * (len(kept) - 1):
-            return NONE, max(gain, 0.0), True
+            return Breaks(gain=max(gain, 0.0), doubtful=True)
     tops, change, sound = look.settled(spans, tops)
     gain += change
     if not sound or (change and gain < price * (len(tops) - 1)):
-        return NONE, max(gain, 0.0), doubtful
+        return Breaks(gain=max(gain, 0.0), doubtful=doubtful)
     offsets = [float(pair.seconds(vertex(lags, curves[p].sum(0), top))) for p, top in zip(spans, tops, strict=True)]
     begin = pair.start + (np.array([p[0] for p in spans]) - 0.5) * step / pair.fps
     begin[0] = pair.start
-    return np.stack([begin, offsets], 1), gain, False
+    return Breaks(np.stack([begin, offsets], 1), gain)
 
 
 @dataclass(frozen=True, eq=False)
@@ -292,18 +232,6 @@ class Look:
             change += float(evidence[other] - evidence[top])
             tops = [*tops[:k], other, *tops[k + 1 :]]
         return tops, change, True
-
-
-def likely(evidence: Float[np.ndarray, " K"], least: int) -> list[int]:
-    """The best local maxima but the first, at least ``least`` lags apart, best first."""
-    inner = np.flatnonzero((evidence[1:-1] >= evidence[:-2]) & (evidence[1:-1] > evidence[2:])) + 1
-    found = [int(np.argmax(evidence))]
-    for k in inner[np.argsort(-evidence[inner], kind="stable")]:
-        if all(abs(int(k) - j) >= least for j in found):
-            found.append(int(k))
-        if len(found) > OTHERS:
-            break
-    return found[1:]
 
 
 def frames(span: Int[np.ndarray, " P"], step: int) -> tuple[int, int]:
@@ -358,19 +286,6 @@ def by_chance(
     return kept
 
 
-def seen_share(pair: CommonClock, lag: int, step: int) -> Float[np.ndarray, " W"]:
-    """Of the samples in every window of :func:`local_curves`, the share that both videos see at a lag."""
-    T = pair.a.shape[1]
-    share = np.zeros(-(-T // step) + 1)
-    first, end = max(0, lag), min(T, pair.b.shape[1] + lag)
-    if end > first:
-        both = np.isfinite(pair.a[:, first:end, 0]) & np.isfinite(pair.b[:, first - lag : end - lag, 0])
-        total = np.concatenate([[0.0], np.cumsum(both.mean(0))])
-        low, high = (np.clip((np.arange(len(share)) + k) * step - first, 0, end - first) for k in (-1, 1))
-        share = (total[high] - total[low]) / (2 * step)
-    return share
-
-
 def prefers_another(
     curves: Float[np.ndarray, "W K"],
     own: Float[np.ndarray, "W K"],
@@ -387,62 +302,6 @@ def prefers_another(
     here = curves[told, line[told]] + curves[told + 1, line[told + 1]]
     gain = float(((own[told] + own[told + 1]).max(1) - here).max())
     return gain > PREFERS + OF_USUAL * max(float(np.median(here)), 0.0)
-
-
-def explained(pair: CommonClock, lag: int, floor: float, step: int) -> tuple[float, float]:
-    """How much of the motion within a window both videos have in common at a lag, in the least window: 1 - Var(a - b) /
-    (Var a + Var b) of the best quarter of the matches that move there; 1 where none does. And what is missing to 1 in
-    the least two in a row, as a multiple of what is usually missing.
-    """
-    first, end = max(0, lag), min(pair.a.shape[1], pair.b.shape[1] + lag)
-    shares = []
-    for begin in range(first, end - 2 * step + 1, step):
-        x, y = pair.a[:, begin : begin + 2 * step], pair.b[:, begin - lag : begin - lag + 2 * step]
-        seen = np.isfinite(x[..., 0]) & np.isfinite(y[..., 0])
-        use = seen.sum(1) >= LEAST_WINDOW * pair.fps
-        if use.sum() < LEAST_MOVING:
-            continue
-        x, y, seen = x[use], y[use], seen[use]
-        power = _variance(x, seen) + _variance(y, seen)
-        moves = power > MOVES * floor
-        if moves.sum() >= LEAST_MOVING:
-            common = 1 - _variance(x - y, seen)[moves] / power[moves]
-            shares.append(float(np.quantile(common, BEST_QUARTER)))
-        else:
-            shares.append(1.0)
-    if not shares:
-        return 1.0, 1.0
-    pairs = np.maximum(shares[:-1], shares[1:]) if len(shares) > 1 else np.array(shares)
-    missing = 1 - float(pairs.min())
-    ratio = missing / max(1 - float(np.median(shares)), 1e-3) if missing > LEAST_MISSING else 1.0
-    return min(shares), ratio
-
-
-def agreement(pair: CommonClock, begin: int, end: int, lag: int, floor: float) -> float:
-    """The share of its motion that the median match has in common with its partner, over a's frames from ``begin`` to
-    ``end`` at a lag."""
-    begin = max(0, lag, begin)
-    end = min(pair.a.shape[1], pair.b.shape[1] + lag, end)
-    if end - begin < LEAST_WINDOW * pair.fps:
-        return 0.0
-    x, y = pair.a[:, begin:end], pair.b[:, begin - lag : end - lag]
-    seen = np.isfinite(x[..., 0]) & np.isfinite(y[..., 0])
-    use = seen.sum(1) >= LEAST_WINDOW * pair.fps
-    if use.sum() < LEAST_MOVING:
-        return 0.0
-    x, y, seen = x[use], y[use], seen[use]
-    power = _variance(x, seen) + _variance(y, seen)
-    moves = power > MOVES * floor
-    if moves.sum() < LEAST_MOVING:
-        return 0.0
-    return float(np.median(1 - _variance(x - y, seen)[moves] / power[moves]))
-
-
-def _variance(x: Float[np.ndarray, "M T 3"], seen: np.ndarray) -> Float[np.ndarray, " M"]:
-    """Over the samples that are seen, all three coordinates together."""
-    filled, count = np.where(seen[..., None], x, 0.0), seen.sum(1)
-    mean = filled.sum(1) / count[:, None]
-    return np.asarray((np.where(seen[..., None], x - mean[:, None], 0.0) ** 2).sum((1, 2)) / count)
 
 
 def without_chance(

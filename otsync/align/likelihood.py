@@ -109,8 +109,10 @@ class LikelihoodScan(Aligner):
         offset = float(pair.seconds(vertex(lags, score, tops[0])))
         stats = self._stats(pair, lags, curves, tops) | {"matches": float(len(matches))}
         stats["other_rate"], stats["other_rate_gain"] = other_rate(a, b, pair, matches, scale, self.max_lag)
-        parts, stats["parts_gain"], doubtful = find_breaks(pair, lags, score, curves.floor, matches.shares)
-        flags = (*self._flags(stats), *((Status.BROKEN_CLOCK,) if len(parts) or doubtful else ()))
+        flags = self._flags(stats)
+        found = find_breaks(pair, lags, score, curves.floor, matches.shares, ambiguous=Status.AMBIGUOUS in flags)
+        parts, stats["parts_gain"], stats["returns"] = found.parts, found.gain, float(found.returns)
+        flags = (*flags, *((Status.BROKEN_CLOCK,) if len(parts) or found.doubtful else ()))
         return Alignment(
             offset,
             hypotheses=np.array([[pair.seconds(vertex(lags, score, i)), score[i]] for i in tops]),

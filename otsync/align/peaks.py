@@ -5,6 +5,9 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Int
 
+OTHERS = 8
+"""Local maxima of a curve that are looked at besides the highest."""
+
 
 def is_constant(values: np.ndarray) -> bool:
     """Whether values differ by no more than rounding: costs of things at rest, which tell no time."""
@@ -53,3 +56,15 @@ def vertex(lags: Int[np.ndarray, " K"], score: Float[np.ndarray, " K"], i: int) 
         if bend < 0:
             return float(lags[i] + np.clip(0.5 * (score[i - 1] - score[i + 1]) / bend, -0.5, 0.5))
     return float(lags[i])
+
+
+def likely(evidence: Float[np.ndarray, " K"], least: int) -> list[int]:
+    """The best local maxima but the first, at least ``least`` lags apart, best first, up to :data:`OTHERS` of them."""
+    inner = np.flatnonzero((evidence[1:-1] >= evidence[:-2]) & (evidence[1:-1] > evidence[2:])) + 1
+    found = [int(np.argmax(evidence))]
+    for k in inner[np.argsort(-evidence[inner], kind="stable")]:
+        if all(abs(int(k) - j) >= least for j in found):
+            found.append(int(k))
+        if len(found) > OTHERS:
+            break
+    return found[1:]

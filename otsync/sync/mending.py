@@ -234,7 +234,7 @@ def _by(windows: Windows, answer: Answer, job: Job) -> list[Answer]:
     """The answer, freed of the scan's doubt whether its clock breaks where no window has it; else with the doubt, and
     with the parts that they tell of, as often as there are readings.
     """
-    if windows.steady:
+    if windows.steady and not answer.scanned.stats.get("returns"):
         return [freed(answer, job)]
     return [_with_split(windows, split, answer, job) for split in windows.breaks()] or [doubted(answer)]
 

@@ -896,11 +896,27 @@ BREAKS = (
     ),
     Break(
         "breaks-slow-motion-returns",
-        "otsync/align/breaks.py",
+        "otsync/align/returns.py",
         "returns = alike - np.concatenate([below, above[:, 1:]], 1)",
         "returns = alike",
         ("tests/otsync/sync/test_breaks.py",),
         "slow motion, which is like itself a little later, hides breaks",
+    ),
+    Break(
+        "breaks-return-unheard",
+        "otsync/align/returns.py",
+        "if len(votes) >= fewest and votes.mean() >= LIKED:",
+        "if len(votes) >= fewest and votes.mean() >= 1:",
+        ("tests/otsync/sync/test_breaks.py",),
+        "a lost stride is told nowhere: another one suits nearly as well",
+    ),
+    Break(
+        "breaks-return-freed",
+        "otsync/sync/mending.py",
+        'if windows.steady and not answer.scanned.stats.get("returns"):',
+        "if windows.steady:",
+        ("tests/otsync/sync/test_breaks.py",),
+        "windows that see nothing of what is behind a gap lift the doubt about it",
     ),
     Break(
         "epipolar-lags-of-long-lives",

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from otsync import LikelihoodScan, Matches, Refused, Status, TrackSet, align
-from otsync.align.breaks import local_curves
 from otsync.align.likelihood import Curves, Signal, evidence, noise_floor, statistics, velocity_score
 from otsync.align.peaks import separate_peaks, vertex
+from otsync.align.windows import local_curves
 from otsync.clocks.common import common_clock
 from otsync.simulate import simulate
 from tests.conftest import wiggle
@@ -260,8 +260,8 @@ def test_a_few_matches_at_a_time_say_what_all_of_them_say(monkeypatch):
         return [slice(k, k + 3) for k in range(0, rows, 3)]
 
     # ``otsync.align`` is a function, too, which hides the package from a path in words
-    scan, breaks = (sys.modules[f"otsync.align.{name}"] for name in ("likelihood", "breaks"))
-    for module in (scan, breaks):
+    scan, windows = (sys.modules[f"otsync.align.{name}"] for name in ("likelihood", "windows"))
+    for module in (scan, windows):
         monkeypatch.setattr(module, "blocks", three_at_a_time)
     monkeypatch.setattr(scan, "DIRECT", 0)  # windows at the peaks alone
     long = evidence(pair, lags, matches.shares).total

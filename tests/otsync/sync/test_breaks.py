@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 
 from otsync import synchronize
-from otsync.align.breaks import beside_returns, by_chance, like_itself, likely, local_curves, partners
+from otsync.align.breaks import by_chance, partners
+from otsync.align.peaks import likely
+from otsync.align.returns import beside_returns, like_itself, return_is_liked
+from otsync.align.windows import local_curves
 from otsync.bench.trust.worlds import CLASSES
 from otsync.clocks.common import CommonClock
 from otsync.clocks.splines import TrackSplines
@@ -110,6 +113,37 @@ def test_motion_that_does_not_come_back_hides_no_break(seed, width, lost):
     curves, own, best = told(smooth(width, seed), lost, seed=seed)
     gain, left = (float((x - curves[:, [best]]).max()) for x in (curves, own))
     assert gain > 1 and left > 0.8 * gain
+
+
+def strides(lost: int, seed: int) -> tuple[CommonClock, np.ndarray]:
+    """A pair of 40 points that swing every 30 frames, each time a little otherwise; b loses frames behind its 90th."""
+    rng, k = np.random.default_rng([seed, 9]), np.arange(150)
+    t = np.arange(300)
+    size = 1 + 0.25 * np.stack([np.interp(t, np.arange(0, 331, 30), w) for w in rng.normal(size=(40, 12))])
+    phase = rng.uniform(0, 6.3, (40, 3, 1))
+    shown = (size[:, None] * np.sin(2 * np.pi * t / 30 + phase)).transpose(0, 2, 1)
+    a, b = shown[:, 20 + k], shown[:, 25 + k + lost * (k >= 90)]
+    noisy = [x + 0.1 * rng.normal(size=x.shape) for x in (a, b)]
+    return CommonClock(*noisy, 30.0, 0.0), np.arange(-100, 101)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_lost_stride_is_liked_at_another_return(seed):
+    """Behind it neither offset suits all; where nothing is lost, few matches suit another stride better anywhere."""
+    for lost in (0, 30):
+        pair, lags = strides(lost, seed)
+        curves = local_curves(pair, lags, 0.015, np.ones(len(pair.a)))
+        best = int(curves.sum(0).argmax())
+        assert lags[best] == 5
+        assert return_is_liked(pair, lags, curves, best, 10, 3) == (lost > 0)
+
+
+def test_strides_of_which_one_is_missing_are_mended_or_doubtful():
+    """The windows behind the gap are too short to lift this doubt."""
+    for seed in (57013, 58012):
+        world = CLASSES["strides, one missing"](seed)
+        offsets = synchronize(list(world.tracks))
+        assert not offsets.ok or world.errors(offsets)[0].max() < 0.3, seed
 
 
 def test_of_likely_offsets_no_two_are_near():
