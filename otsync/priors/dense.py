@@ -68,16 +68,14 @@ class DenseStereo:
             s, views = item
             return store.arrays("dense", (*key, s, tuple(views)), lambda: self._moment_maps(rig, space, s, views))
 
-        made: dict[tuple[int, int], np.ndarray] = {}
+        out = [np.zeros((len(f), *self.size(rig.frames[v])[::-1]), np.float32) for v, f in enumerate(frames)]
         for (_, views), maps in zip(wanted.items(), map(moment, wanted.items()), strict=True):
-            made |= {(v, k): maps[f"depth{v}_{k}"] for v, k in views}
-        out = []
-        for v, chosen in enumerate(frames):
-            w, h = self.size(rig.frames[v])
-            empty = np.zeros((h, w), np.float32)
-            out.append(
-                np.stack([made.get((v, k), empty) for k in chosen]) if len(chosen) else np.zeros((0, h, w), np.float32)
-            )
+            for v, k in views:
+                made = maps[f"depth{v}_{k}"]
+                known = made > 0
+                for place in np.flatnonzero(np.asarray(frames[v]) == k):
+                    # zeros are not written: pages of a map that nobody wrote to take no memory
+                    np.copyto(out[v][place], made, where=known)
         return out
 
     def size(self, frames: WorkingFrames) -> tuple[int, int]:

@@ -77,6 +77,8 @@ class FitOptions:
         _check_kinds("effects", self.effects, (Effect,), "recon.observe.Effect")
         for loss in self.losses:
             check_number(f"losses: weight of {type(loss).__name__}", loss.weight, above=-math.inf)
+            if isinstance(loss, MotionLoss):
+                positive(f"losses: begin of {type(loss).__name__}", loss.begin, zero=True)
         check_length(self.steps, self.budget)
         check_whole("batch", self.batch, 1)
         positive("save_every", self.save_every, zero=True)

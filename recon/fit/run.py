@@ -85,6 +85,11 @@ class Run:
         """Every group's current value; those that are fitted require gradients."""
         return {**self.groups, **self.adam.groups}
 
+    @property
+    def done(self) -> float:
+        """The share 0..1 of the steps that is done; 0 until a budget has shown their number."""
+        return self.step / self.total if self.total else 0.0
+
     def world_time(self, values: Mapping[str, Tensor], video: int, frame: int) -> Tensor:
         """World seconds at which a frame was taken, differentiable in its video's clock."""
         return values["clock_rates"][video] * self.problem.times[video][frame] + values["offsets"][video]
@@ -122,10 +127,9 @@ class Run:
                 if gradient is not None:
                     total[name] = gradient * share if name not in total else total[name].add_(gradient, alpha=share)
         self._guard(total, done, keys)
-        fraction = self.step / self.total if self.total else 0.0
         if "clock_rates" in total:  # the reference's clock is the world's
             total["clock_rates"][p.reference] = 0
-        self.adam.step(total, self.decay(fraction))
+        self.adam.step(total, self.decay(self.done))
         self.step += 1
         for r in done[: len(groups)]:
             self._since += zip(r.losses, r.psnrs, strict=True)
@@ -242,7 +246,7 @@ class Run:
         rng = np.random.default_rng([p.seed, 2, self.step])
         draw = Draw(rng, scene.span, scene.frame_step, scene.footprint, values["offsets"])
         parts = [
-            loss.weight * value
+            loss.weight_at(self.done) * value
             for loss in p.motion_losses
             if self.step % loss.every == 0
             if (value := loss(scene.motion, scene.dynamic.means, scene.dynamic.quats, draw)) is not None

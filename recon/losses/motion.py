@@ -49,10 +49,17 @@ class MotionLoss(ABC):
     """A loss on a motion: a frozen dataclass with a ``weight`` that inherits from this."""
 
     weight: float
-    """Its share in the sum of losses, in the steps in which it is evaluated."""
+    """Its share in the sum of losses, in the steps in which it is evaluated, at the end of a fit."""
+
+    begin: float = 1.0
+    """Share of its weight that a fit begins with; from there it grows evenly."""
 
     every: int = 1
     """It is evaluated in every ``every``-th step."""
+
+    def weight_at(self, done: float) -> float:
+        """The weight when a share 0..1 of a fit's steps is done."""
+        return self.weight * (self.begin + (1 - self.begin) * done)
 
     @abstractmethod
     def __call__(self, motion: Motion, means: Tensor, quats: Tensor, draw: Draw) -> Tensor | None:
@@ -162,10 +169,12 @@ def _over_a_shift(loss: Arap | Length, change: Callable[..., Tensor], motion: Mo
 class Arap(MotionLoss):
     """As rigid as possible: a node keeps its place in the frames of its neighbours (MoSca's L_coord).
 
-    Compares two moments apart by one of `shifts` (seconds), drawn. Zero for rigid motions of all nodes together.
+    Compares two moments apart by one of `shifts` (seconds), drawn. Zero for rigid motions of all nodes together. The
+    weight grows: the fit first finds where things are, and then what they have in common.
     """
 
-    weight: float = 0.03
+    weight: float = 0.1
+    begin: float = 0.1
     every: int = 2
     shifts: tuple[float, ...] = SHIFTS
     neighbours: int = 6
@@ -178,7 +187,8 @@ class Arap(MotionLoss):
 class Length(MotionLoss):
     """Distances to neighbours are kept (MoSca's L_len), between two moments as for :class:`Arap`."""
 
-    weight: float = 0.03
+    weight: float = 0.1
+    begin: float = 0.1
     every: int = 2
     shifts: tuple[float, ...] = SHIFTS
     neighbours: int = 6
