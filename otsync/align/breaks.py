@@ -74,7 +74,7 @@ class Breaks:
         parts: rows (seconds of a's clock from which on, offset in seconds); none where one offset suits the whole.
         gain: evidence that the parts add, nats a match.
         doubtful: there may be parts that the evidence is too weak to tell.
-        returns: that is so because motion comes back, and some stretch suits another return as well.
+        returns: motion comes back, and some stretch suits another return as well.
     """
 
     parts: Float[np.ndarray, "P 2"] = field(default_factory=lambda: NONE)
@@ -114,7 +114,7 @@ def find_breaks(
     """The parts of the overlap that have offsets of their own.
 
     Args:
-        ambiguous: another offset is known to suit the whole as well: then it need not be told of a part, too.
+        ambiguous: another offset is known to suit the whole as well: that it suits a part is no doubt more.
     """
     step = max(1, round(STEP * pair.fps))
     windows = -(-pair.a.shape[1] // step) + 1
@@ -129,10 +129,10 @@ def find_breaks(
     if found.doubtful or len(found.parts):
         own = beside_returns(curves, like_itself(pair, lags, best, floor, weight), best)
         found = _told(pair, lags, curves, own, floor, step)
-    if found.doubtful or len(found.parts) or ambiguous:
+    if found.doubtful or len(found.parts):
         return found
     returns = return_is_liked(pair, lags, curves, best, step, round(LEAST_JUMP * pair.fps))
-    return replace(found, doubtful=returns, returns=returns)
+    return replace(found, doubtful=returns and not ambiguous, returns=returns)
 
 
 def _told(

@@ -63,7 +63,7 @@ class ByMotion:
         return [a for a in told if len(a.scanned.parts) and not NOTHING_COMMON & set(a.scanned.flags)]
 
     def anew(self, jobs: Sequence[Job], map: MapLike) -> dict[Pair, Answer]:
-        return {a.pair: a for a in map(run, jobs)}
+        return _on_mended_clocks(jobs, map)
 
     def kept(self, fresh: Iterable[Answer]) -> None:
         pass
@@ -100,7 +100,7 @@ class ByWindows:
         others = [job for job in jobs if job.pair not in self.told]
         read = list(map(_at_time, [(job, self._time(job)) for job in own]))
         self.tried += read
-        return {readings[0].pair: readings[0] for readings in read} | {a.pair: a for a in map(run, others)}
+        return {readings[0].pair: readings[0] for readings in read} | _on_mended_clocks(others, map)
 
     def kept(self, fresh: Iterable[Answer]) -> None:
         stands = {id(answer) for answer in fresh}
@@ -178,7 +178,7 @@ def mend_by_windows(
     answers = {a.pair: a for a in verdict.answers}
     asked = [job for job in jobs if asks(job, answers[job.pair], verdict) and _may_break(answers[job.pair])]
     several = at_peaks(asked, answers, map)
-    tasks = [(job, several[job.pair]) for job in asked if job.pair in several]
+    tasks = [(job, several[job.pair], answers[job.pair]) for job in asked if job.pair in several]
     told = {readings[0].pair: readings for readings in map(_told, tasks) if readings}
     told = {pair: readings for pair, readings in told.items() if _even(readings[0], tracks, broken)}
     if not told:
@@ -204,9 +204,11 @@ def _may_break(answer: Answer) -> bool:
     return Status.BROKEN_CLOCK in flags and flags <= NOISY | {Status.BROKEN_CLOCK, Status.RATE_MISMATCH}
 
 
-def _told(task: tuple[Job, list[Answer]]) -> list[Answer]:
-    """What windows tell of a pair, around the best of its answers: readings, best first; none where it is not clear."""
-    job, several = task
+def _told(task: tuple[Job, list[Answer], Answer]) -> list[Answer]:
+    """What windows tell of a pair, around the best of its answers at known times: readings, best first; none where it
+    is not clear. The last of the task is the pair's answer by matches that were made without a time.
+    """
+    job, several, untimed = task
     best = max(several, key=evidence_of)
     try:
         windows = Windows.of(job, Clock(best.refined.offset, best.refined.rate))
@@ -217,7 +219,7 @@ def _told(task: tuple[Job, list[Answer]]) -> list[Answer]:
     explained = [best.refined.offset + split.late for split in breaks]
     if winner(several, explained) is None or not (breaks or windows.steady):
         return []
-    return _by(windows, best, job)
+    return _by(windows, best, job, *(a.scanned.stats for a in (untimed, best)))
 
 
 def _at_time(task: tuple[Job, float]) -> list[Answer]:
@@ -230,11 +232,14 @@ def _at_time(task: tuple[Job, float]) -> list[Answer]:
     return _by(Windows.of(job, Clock(answer.refined.offset, answer.refined.rate)), answer, job)
 
 
-def _by(windows: Windows, answer: Answer, job: Job) -> list[Answer]:
+def _by(windows: Windows, answer: Answer, job: Job, *scans: Mapping[str, float]) -> list[Answer]:
     """The answer, freed of the scan's doubt whether its clock breaks where no window has it; else with the doubt, and
     with the parts that they tell of, as often as there are readings.
+
+    Where motion comes back, the windows behind a gap suit two offsets: they lift no doubt that any of the ``scans``
+    (their stats) has for this reason. A clock that was mended already is asked by its windows alone.
     """
-    if windows.steady and not answer.scanned.stats.get("returns"):
+    if windows.steady and not any(stats.get("returns") for stats in scans):
         return [freed(answer, job)]
     return [_with_split(windows, split, answer, job) for split in windows.breaks()] or [doubted(answer)]
 
@@ -245,6 +250,17 @@ def _with_split(windows: Windows, split: Split, answer: Answer, job: Job) -> Ans
     return doubted(
         dataclasses.replace(answer, matches=matches_of_parts(job, parts, answer.refined.rate), scanned=scanned)
     )
+
+
+def _on_mended_clocks(jobs: Sequence[Job], map: MapLike) -> dict[Pair, Answer]:
+    """Pairs' answers once more. That motion comes back is no doubt of a clock in which a break was found already."""
+    out = {}
+    for job, answer in zip(jobs, map(run, jobs), strict=True):
+        if answer.finite and answer.scanned.stats.get("returns"):
+            stats = dict(answer.scanned.stats) | {"returns": 0.0}
+            answer = freed(dataclasses.replace(answer, scanned=dataclasses.replace(answer.scanned, stats=stats)), job)
+        out[answer.pair] = answer
+    return out
 
 
 def freed(answer: Answer, job: Job) -> Answer:

@@ -386,7 +386,10 @@ def _flags(
     vouching = [ok for a, ok in own if a.refined.status.ok]
     contradicted = len(vouching) > 0 and sum(vouching) <= len(vouching) / 2
     mismatch = sum(Status.RATE_MISMATCH in a.refined.flags for a, _ in own) > len(own) / 2
-    broken = sum(Status.BROKEN_CLOCK in a.refined.flags for a, _ in own) >= max(len(own) / 2, 1)
+    # where others settle which of two returns is right, a lost one may still hide in what an ambiguous pair sees
+    hidden = [trusted and a.scanned.stats.get("returns", 0.0) > 0 for a, _ in own]
+    doubts = [Status.BROKEN_CLOCK in a.refined.flags or more for (a, _), more in zip(own, hidden, strict=True)]
+    broken = sum(doubts) >= max(len(own) / 2, 1)
     # however well pairs agree: what is wrong with the tracks of a video is in all of them
     lagging = len(own) > 0 and all(Status.LAGGING in a.refined.flags for a, _ in own)
     flags: list[Status] = []

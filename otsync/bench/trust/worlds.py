@@ -231,6 +231,10 @@ CLASSES: dict[str, Callable[[int], World]] = {
     "strides, hard": partial(plain, motion="strides", preset="hard"),
     "strides, one frozen": partial(plain, motion="strides", first=(In(1, Freeze(30)),)),
     "strides, one missing": partial(plain, motion="strides", first=(In(1, Drop(1.0)),), within=15),
+    "strides, one missing late": partial(plain, motion="strides", first=(In(1, Drop(1.0, at=0.75)),), within=15),
+    "strides, one missing, four videos": partial(
+        plain, motion="strides", videos=4, first=(In(1, Drop(1.0)),), within=15
+    ),
     "carousel": partial(plain, motion="carousel", alike=True),
     "belt": partial(plain, motion="belt", alike=True),
     "flock": partial(plain, motion="flock", alike=True),
