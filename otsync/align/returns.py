@@ -25,7 +25,7 @@ STRETCH, VOTERS, ENOUGH = 4, 8, 0.3
 
 LIKED = 0.3
 """Share of the matches that suit a return better over a stretch, from which on one may hide a break. Looked at: strides
-of which the file misses one (57000-58019, and early, late and of four videos, 59100-59111: 23 trusted and 30 frames off
+of which the file misses one (57000-58019, and early, late and of four videos, 59100-59111: 18 trusted and 30 frames off
 at one end) .3 to .7; that miss none .05 to .2 mostly, .38 at most where 50 matches and more decide: two of nine right
 answers are withheld. Of mid, hard and brutal worlds one of 60 is."""
 
