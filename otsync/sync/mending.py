@@ -241,6 +241,9 @@ def _by(windows: Windows, answer: Answer, job: Job, *scans: Mapping[str, float])
     """
     if windows.steady and not any(stats.get("returns") for stats in scans):
         return [freed(answer, job)]
+    if windows.steady:
+        stats = dict(answer.scanned.stats) | {"returns": 1.0}
+        return [doubted(dataclasses.replace(answer, scanned=dataclasses.replace(answer.scanned, stats=stats)))]
     return [_with_split(windows, split, answer, job) for split in windows.breaks()] or [doubted(answer)]
 
 

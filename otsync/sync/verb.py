@@ -178,7 +178,7 @@ def with_witnesses_heard(
         rest: whether the tracks that an answer does not explain are matched once more, and asked, too; and those that
             these leave.
     """
-    answers = {a.pair: a for a in verdict.answers if a.refined.status.ok and a.finite}
+    answers = {a.pair: a for a in verdict.answers if a.finite and (a.refined.status.ok or _only_returns(a))}
     asked = [job for job in jobs if job.pair in answers and job.a.xyz is not None and job.b.xyz is not None]
     doubted = {job.pair for job in asked if parted(answers[job.pair], job.a, job.b) > limit}
     shared = {job.pair: Seen.by(answers[job.pair], job.a, job.b)[1] for job in asked}
@@ -200,6 +200,11 @@ def with_witnesses_heard(
     if not doubted:
         return verdict
     return judged([lagging(a) if a.pair in doubted else a for a in verdict.answers])
+
+
+def _only_returns(answer: Answer) -> bool:
+    """Whether a pair's only doubt is that its clock may break where motion comes back: a late performer looks so."""
+    return answer.refined.flags == (Status.BROKEN_CLOCK,) and bool(answer.scanned.stats.get("returns"))
 
 
 def _still_broken(fresh: Answer, first: Answer) -> Answer:

@@ -131,7 +131,7 @@ def test_a_time_that_is_hardly_ahead_of_another_is_told_nothing_of():
     asked = job()
     (best,) = (run(once) for once in at_each(asked, (1.0,)))
     later = replace(best, refined=replace(best.refined, offset=best.refined.offset + 1.0))
-    assert _told((asked, [best])) and not _told((asked, [best, later]))
+    assert _told((asked, [best], best)) and not _told((asked, [best, later], best))
 
 
 def test_a_doubt_that_wrong_matches_make_is_lifted():
