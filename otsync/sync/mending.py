@@ -241,7 +241,7 @@ def _by(windows: Windows, answer: Answer, job: Job, *scans: Mapping[str, float])
     """
     if windows.steady and not any(stats.get("returns") for stats in scans):
         return [freed(answer, job)]
-    if windows.steady:
+    if windows.steady:  # the doubt stays, and why: witnesses ask about it
         stats = dict(answer.scanned.stats) | {"returns": 1.0}
         return [doubted(dataclasses.replace(answer, scanned=dataclasses.replace(answer.scanned, stats=stats)))]
     return [_with_split(windows, split, answer, job) for split in windows.breaks()] or [doubted(answer)]
@@ -260,8 +260,7 @@ def _on_mended_clocks(jobs: Sequence[Job], map: MapLike) -> dict[Pair, Answer]:
     out = {}
     for job, answer in zip(jobs, map(run, jobs), strict=True):
         if answer.finite and answer.scanned.stats.get("returns"):
-            stats = dict(answer.scanned.stats) | {"returns": 0.0}
-            answer = freed(dataclasses.replace(answer, scanned=dataclasses.replace(answer.scanned, stats=stats)), job)
+            answer = freed(answer, job)
         out[answer.pair] = answer
     return out
 
@@ -269,7 +268,8 @@ def _on_mended_clocks(jobs: Sequence[Job], map: MapLike) -> dict[Pair, Answer]:
 def freed(answer: Answer, job: Job) -> Answer:
     """The answer without the scan's doubt whether its clock breaks; the fit's own stays."""
     flags = tuple(f for f in answer.scanned.flags if f is not Status.BROKEN_CLOCK)
-    scanned = dataclasses.replace(answer.scanned, flags=flags, parts=NONE)
+    stats = dict(answer.scanned.stats) | {"returns": 0.0}
+    scanned = dataclasses.replace(answer.scanned, flags=flags, parts=NONE, stats=stats)
     refined = refine(job.a, job.b, answer.matches, scanned, job.refiner, throw=False)
     return dataclasses.replace(answer, scanned=scanned, refined=without_answered_doubt(refined))
 
