@@ -110,6 +110,7 @@ class Fit:
         wander: rms over blocks of a second, by their information, of what each says the offset is off by, s.
         information: Σ w v·v of the weighted samples: how much moves there.
         witnesses: neighbourhoods of matches that hold the information, of equal shares of it.
+        seconds: blocks of a second that hold it, of equal shares.
     """
 
     clock: Clock
@@ -121,6 +122,15 @@ class Fit:
     settled: bool = True
     information: float = 0.0
     witnesses: float = 1.0
+    seconds: float = 1.0
+
+    def off_by(self, information: float) -> float:
+        """One sigma, s, of a second that holds so much information, by what the seconds of this fit differ by; 0 where
+        there are too few of them to tell.
+        """
+        if self.seconds < 2 or not information > 0:
+            return 0.0
+        return float(self.wander * np.sqrt(self.information / ((self.seconds - 1) * information)))
 
     @property
     def effective_matches(self) -> float:
@@ -178,8 +188,8 @@ def fit_clock(
         move = np.array([[1.0, -centre], [0.0, 1.0]])
         covariance = move @ covariance @ move.T
     moving = float(system.H[0, 0])
-    wander, witnesses = system.wander(), system.witnesses()
-    return Fit(clock, covariance, system.match_weights, n, system.blur, wander, settled, moving, witnesses)
+    shares = [equal_shares(by[0][:, 0, 0]) for by in (system.by_match, system.by_time)]
+    return Fit(clock, covariance, system.match_weights, n, system.blur, system.wander(), settled, moving, *shares)
 
 
 def _centre(a: TrackSplines, b: TrackSplines, clock: Clock) -> float:
@@ -224,10 +234,10 @@ class System:
         told = 1e-9 * max(float(H.sum()), 1e-300) < H
         return float(np.sqrt((g[told] ** 2 / H[told]).sum() / max(float(H[told].sum()), 1e-300)))
 
-    def witnesses(self) -> float:
-        """See :class:`Fit`."""
-        H = self.by_match[0][:, 0, 0]
-        return float(H.sum() ** 2 / max(float((H**2).sum()), 1e-300))
+
+def equal_shares(information: Float[np.ndarray, " C"]) -> float:
+    """Of how many clusters with equal shares the sum of squared shares would be the same."""
+    return float(information.sum() ** 2 / max(float((information**2).sum()), 1e-300))
 
 
 def jackknife(H: Float[np.ndarray, "C P P"], g: Float[np.ndarray, "C P"]) -> Float[np.ndarray, "P P"]:
@@ -247,8 +257,7 @@ def jackknife(H: Float[np.ndarray, "C P P"], g: Float[np.ndarray, "C P"]) -> Flo
 
 def wider(information: Float[np.ndarray, " C"]) -> float:
     """One sigma of Student's distribution over that of a normal one, for clusters that hold so much information."""
-    freedom = float(information.sum() ** 2 / max((information**2).sum(), 1e-300)) - 1
-    return float(stdtrit(max(1.0, freedom), ONE_SIGMA))
+    return float(stdtrit(max(1.0, equal_shares(information) - 1), ONE_SIGMA))
 
 
 def _regular(H: np.ndarray) -> np.ndarray:

@@ -17,7 +17,7 @@ from ..clocks.common import nominal_fps
 from ..compute.threads import MapLike
 from ..refine.verb import refine
 from ..types import Break, Clock, Status, TrackSet, in_order
-from .breaks import AROUND, MOST, Seen, Suspect, counted, culprit, lasting, mended, remeasured, runs_on, suspects
+from .breaks import AROUND, MOST, Seen, Suspect, culprit, lasting, mended, remeasured, runs_on, suspects
 from .graph import Pair
 from .pairs import Job, run, without_answered_doubt
 from .places import NONE, parts_by_place
@@ -351,8 +351,6 @@ def with_break(
         if _broken(fresh.values()) < doubts:
             best = again, better, fresh, found
         frame = 1 / nominal_fps(tracks[v])
-        if counted(found, frame):
-            break
         left = remeasured_jump(fresh, sets, v, found)
         if left is None:
             break
