@@ -69,10 +69,11 @@ class Calibration:
 
     Args:
         cameras: one a video, in the videos' order.
-        method: how they were found: "incremental" or "global": whose model it is.
-        unit: "metres", or "arbitrary": then the median distance from a camera to where all look is 3.
+        method: how they were found: "incremental" or "global": whose model it is; "motion": by what moves, with depth.
+        unit: "metres", or "arbitrary": then the median distance from a camera to where all look is 3, or, by motion,
+            lengths are in the unit of the first video's depth.
         helpers: cameras of clips that only helped (walk.mp4), which belong to no scene.
-        points: (M,3) of the background, in the world (z up).
+        points: (M,3) of the background, in the world (z up); none by motion.
         seconds: wall time per stage.
     """
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -18,6 +18,8 @@ from ..progress import tell
 if TYPE_CHECKING:
     from ..calibrate import Calibration
 
+Way = Literal["auto", "background", "motion"]
+
 
 @dataclass
 class Calibrate:
@@ -26,8 +28,9 @@ class Calibrate:
     Example: otsync calibrate holiday/
 
     Beside the videos may lie walk.mp4, a clip for which one phone was carried past all cameras: where cameras stand far
-    apart, nothing else links them. A camera that is not to be trusted is named with the reason and what to film; what
-    was found is written all the same, and the exit code is 1.
+    apart, nothing else links them. Videos with depth of their own need no background: what moves tells. A camera that
+    is not to be trusted is named with the reason and what to film; what was found is written all the same, and the exit
+    code is 1.
     """
 
     folder: tyro.conf.Positional[Path]
@@ -36,6 +39,9 @@ class Calibrate:
     """Folder for calibration.html and the stages, from which a killed run continues; default: FOLDER/calibration."""
     force: bool = False
     """Replace cameras that scene.json has from elsewhere. Those that otsync calibrate found are always found anew."""
+    way: Way = "auto"
+    """background: by what stands still. motion: by what moves, where scene.json gives every video depth and intrinsics.
+    auto: by motion where it does so, and no option below asks for anything of the background."""
     options: Annotated[CalibrateOptions, tyro.conf.arg(name="")] = field(default_factory=CalibrateOptions)
 
     json: bool = False
@@ -54,7 +60,7 @@ class Calibrate:
             return self._run(out)
 
     def _run(self, out: Path) -> int:
-        found = calibrate_folder(self.folder, out, self.options, force=self.force)
+        found = calibrate_folder(self.folder, out, self.options, force=self.force, way=self.way)
         if self.json:
             from ..calibrate.document import told_of
             from .tables import print_json
@@ -66,26 +72,50 @@ class Calibrate:
         return told_doubts(found, self.folder)
 
 
-def calibrate_folder(folder: Path, out: Path, options: CalibrateOptions, *, force: bool = False) -> Calibration:
+def calibrate_folder(
+    folder: Path, out: Path, options: CalibrateOptions, *, force: bool = False, way: Way = "auto"
+) -> Calibration:
     """Calibrate a folder and write its scene.json; stages and pages go to ``out``."""
     from ..calibrate import calibrate
     from ..calibrate.clips import uncalibrated
     from ..calibrate.document import calibrated_document
     from ..files.arrays import write_json
     from ..files.cache import Cache
+    from ..io.scene import read_document
+    from ..recordings.by_motion import calibrate_by_motion, has_depth
     from ..report.cameras import write_cameras
+    from .tables import refuse_unused
 
-    document = uncalibrated(folder)
+    document, cache = uncalibrated(folder), Cache(out / "stages")
     if has_poses(document) and not force:
         raise ValueError(
             f"{folder / 'scene.json'}: has cameras that otsync calibrate did not find. Use them as they are, or pass "
             "--force to replace them."
         )
-    found = calibrate(folder, options, cache=Cache(out / "stages"), tell=tell)
+    as_it_was, _ = read_document(folder)
+    if way == "motion" or (way == "auto" and options == CalibrateOptions() and has_depth(as_it_was)):
+        refuse_unused(options, [f.name for f in fields(options)], "--way motion")
+        if way == "auto":
+            tell("every video has depth: cameras by what moves (--way motion)")
+        found, made = calibrate_by_motion(folder, cache=cache, tell=tell)
+        _keep_what_is_lost(folder, as_it_was, found)
+    else:
+        found = calibrate(folder, options, cache=cache, tell=tell)
+        made = calibrated_document(document, found)
     if found.found:
-        write_json(folder / "scene.json", calibrated_document(document, found))
+        write_json(folder / "scene.json", made)
     write_cameras(out / "calibration.html", found)
     return found
+
+
+def _keep_what_is_lost(folder: Path, before: dict[str, Any], found: Calibration) -> None:
+    """Where a video without a camera leaves scene.json, what that file said of its depth stays beside it."""
+    from ..files.arrays import write_json
+
+    kept = folder / "scene.before.json"
+    if found.found and len(found.found) < len(found.cameras) and not kept.exists():
+        write_json(kept, before)
+        tell(f"scene.json leaves out what was not found; as it was before: {kept}")
 
 
 def prepared(

@@ -97,7 +97,7 @@ class CalibratedFile(Document, frozen=True, kw_only=True):
 class CalibrationFile(Document, frozen=True, kw_only=True):
     """What was found out about cameras that nobody calibrated, by video; videos without a camera too.
 
-    method: how ``otsync calibrate`` mapped the scene, or the motion of ``otsync sync --frames own``.
+    method: how ``otsync calibrate`` mapped the scene; motion: by what moves, with depth, as ``sync --frames own`` does.
     """
 
     method: Literal["incremental", "global", "motion"]

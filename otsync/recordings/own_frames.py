@@ -36,14 +36,20 @@ def open_without_poses(path: str | os.PathLike[str], *, allow_outside: bool = Fa
     Poses that are there are kept: they turn the video's own frame, no more. ValueError for what else is missing.
     """
     document, root = read_document(path)
+    checked(document, SceneFile, file_of(path))
+    filled = at_origins(document)
+    return scene_from_document(filled, root, allow_outside=allow_outside, file=file_of(path)), document
+
+
+def at_origins(document: dict[str, Any]) -> dict[str, Any]:
+    """The document with each camera that has no pose at the origin of a frame of its own."""
     filled = copy.deepcopy(document)
     filled.pop("missing", None)  # what is missing besides poses is named by the field that lacks it
-    checked(document, SceneFile, file_of(path))
     for video in filled["videos"]:
         camera = video.get("camera") if isinstance(video, dict) else None
         if isinstance(camera, dict) and camera.get("w2c") is None:
             camera["w2c"] = np.eye(4).tolist()
-    return scene_from_document(filled, root, allow_outside=allow_outside, file=file_of(path)), document
+    return filled
 
 
 def synchronize_own_scene(

@@ -33,6 +33,7 @@ def write_cameras(path: str | os.PathLike[str], found: Calibration) -> None:
     good = sum(camera.ok for camera in found.cameras)
     cameras = [camera for camera in (*found.cameras, *found.helpers) if camera.w2c is not None]
     unit = "metres" if found.unit == "metres" else "units of a scale that is not known (a usual distance is 3)"
+    unit = "units of the first video's depth" if found.method == "motion" else unit
     parts = [
         "<p class=kind>Calibration of a recording</p>",
         f"<h1>{good} of {len(found.cameras)} cameras {'is' if len(found.cameras) == 1 else 'are'} to be trusted</h1>",

@@ -750,7 +750,7 @@ def rows() -> set[str]:
         "recording.depth recording.selection recording.width",
         "simulate": "out motion preset videos frames fps max_offset own_frames seed",
         "film": "out phones gap handheld walk frames fps width height max_offset contrast seed",
-        "calibrate": "folder out force options.intrinsics options.board options.distance options.key_frames "
+        "calibrate": "folder out force way options.intrinsics options.board options.distance options.key_frames "
         "options.width options.seed json",
         "init": "folder out reader fps order timestamps force",
         "audit": "scene out tolerance cameras allow_outside json",
