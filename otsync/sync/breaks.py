@@ -14,6 +14,7 @@ import numpy as np
 
 from ..clocks.common import readable, strongest
 from ..clocks.splines import TrackSplines
+from ..clocks.stillness import AROUND, pause, stood_still
 from ..refine.gauss_newton import Fit, fit_clock
 from ..refine.splines import SplineRefine
 from ..types import Break, Clock, TrackSet, mended_frames
@@ -23,15 +24,6 @@ from .verdict import Answer
 
 WINDOW = 14 / 30
 """Half window, s, of the detrending in the fits of the parts."""
-
-STILL = 0.35
-"""A video stands still where its speed is below this share of what it is around, and moves around."""
-
-FASTEST = 0.75
-"""Quantile of the speeds around from which on tracks are asked."""
-
-AROUND = 20 / 30
-"""Seconds on either side of a pause that tell the usual speed."""
 
 SAME_MOMENT, SAME_JUMP = 0.5, 0.1
 """Seconds within which two pairs tell of the same break."""
@@ -55,6 +47,9 @@ the next. A freeze near the end of a clip, known to a quarter of a frame, was ma
 
 ROUNDING = 1e-6
 """Frames."""
+
+SIGMAS = 3.0
+"""By which a pause that is counted may differ from what a pair measures, or by a frame and a half."""
 
 BESIDE, OFF, OTHERS = 0.45, 1.5 / 30, 10 / 30
 """Seconds on either side of a mended break in which no offset that differs by more than :data:`OFF` s, of those within
@@ -137,16 +132,28 @@ def _readings(
         return [Suspect(j, Break(_turn(*raw, second, first), -jump, 0.0, sigma), 1.0)]
     at_b = when - first
     if jump > 0:  # a's frames from `when` on for `jump` s have no partner: a stood still, or b lost them
-        froze, lost = (i, when, a), (j, at_b)
+        froze, lost = (i, when, a, raw[0]), (j, at_b)
     else:
-        froze, lost = (j, at_b, b), (i, when)
-    video, start, own = froze
+        froze, lost = (j, at_b, b, raw[1]), (i, when)
+    video, start, own, shown = froze
     stands = stood_still(own, start, abs(jump))
-    lasts = lasting(start, abs(jump), sigma, 1 / fps[video])
-    back = lasts if stands else Break(start, -abs(jump), 0.0, sigma)
+    back = Break(start, -abs(jump), 0.0, sigma)
+    if stands:
+        frame = 1 / fps[video]
+        back = _counted(shown, start, abs(jump), sigma, frame) or lasting(start, abs(jump), sigma, frame)
     gone = Break(lost[1], abs(jump), 0.0, sigma)
     votes = (1.0, 0.0) if stands else (RESTING, MOVING)
     return [Suspect(video, back, votes[0]), Suspect(lost[0], gone, votes[1])]
+
+
+def _counted(shown: Raw, start: float, length: float, sigma: float, frame: float) -> Break | None:
+    """A pause that the video itself shows, of about the length that the pair measured: its frames are counted."""
+    found = pause(shown.times, shown.x, start, length)
+    if found is None:
+        return None
+    lasts = round((found[1] - found[0]) / frame) * frame
+    near = max(1.5 * frame, SIGMAS * sigma if math.isfinite(sigma) else 0.0)
+    return Break(found[1], -lasts, lasts, 0.0) if abs(lasts - length) <= near else None
 
 
 def lasting(start: float, length: float, sigma: float, frame: float) -> Break:
@@ -183,14 +190,14 @@ def _offsets(
     fits = [fit_clock(a.within(p.begin, p.end), b, Clock(p.offset), WINDOW) for p in sides]
     near = [f is not None and abs(f.clock.offset - p.offset) < within for f, p in zip(fits, sides, strict=True)]
     found = [f.clock.offset if f is not None and ok else p.offset for f, p, ok in zip(fits, sides, near, strict=True)]
-    sigma = [_sigma(f, other) for f, other in zip(fits, fits[::-1], strict=True)]
+    sigma = [sigma_of_part(f, other) for f, other in zip(fits, fits[::-1], strict=True)]
     for k in (0, 1):
         if fits[k] is None and near[1 - k]:
             found[k], sigma[k] = measured(a, b, replace(sides[1 - k], offset=found[1 - k]), sides[k])
     return found, sigma
 
 
-def _sigma(fit: Fit | None, other: Fit | None) -> float:
+def sigma_of_part(fit: Fit | None, other: Fit | None) -> float:
     """One sigma, s, of a part's offset. In a second or two all matches err alike, and do not show it: there the seconds
     of the part beyond the break tell how far one is off that holds so much motion.
     """
@@ -256,37 +263,6 @@ def _agreement(apart: np.ndarray, inside: np.ndarray) -> np.ndarray:
     """(S,) how well positions agree, from the differences (M,S,3) of matched tracks: see :func:`_suits`."""
     level = Usual.of(apart, inside).levels(apart)
     return np.asarray(np.nansum(level, 0) / np.maximum(np.isfinite(level).sum(0), 1))
-
-
-def stood_still(curves: TrackSplines, start: float, length: float) -> bool:
-    """Whether tracks rest from ``start`` on for ``length`` s, and move before and behind: the fastest quarter of them,
-    since noise has a speed, too, and what hardly moves has no other.
-    """
-    inner = min(0.25 * length, MARGIN)
-    during = _speeds(curves, start + inner, start + length - inner)
-    around = np.stack(
-        [
-            _speeds(curves, start - AROUND, start - MARGIN),
-            _speeds(curves, start + length + MARGIN, start + length + AROUND),
-        ]
-    )
-    sides = np.isfinite(around)
-    usual = np.where(sides, around, 0.0).sum(0) / np.maximum(sides.sum(0), 1)
-    known = np.isfinite(during) & sides.any(0)
-    if not known.any():
-        return False
-    fast = known & (usual >= np.quantile(usual[known], FASTEST))
-    return float(np.median(during[fast])) < STILL * float(np.median(usual[fast]))
-
-
-def _speeds(curves: TrackSplines, begin: float, end: float) -> np.ndarray:
-    """(M,) rms speed of every track within a span; nan where it is not seen."""
-    t = curves.times[(curves.times >= begin) & (curves.times <= end)]
-    if len(t) == 0:
-        return np.full(len(curves.mean), np.nan)
-    seen = curves.support(t)
-    power = np.where(seen, (curves.velocity(t) ** 2).sum(2), 0.0).sum(1)
-    return np.where(seen.any(1), np.sqrt(power / np.maximum(seen.sum(1), 1)), np.nan)
 
 
 @dataclass(frozen=True)

@@ -350,6 +350,8 @@ def with_break(
             break
         if _broken(fresh.values()) < doubts:
             best = again, better, fresh, found
+        if found.sigma == 0:  # the video itself shows how many frames it stood still
+            break
         frame = 1 / nominal_fps(tracks[v])
         left = remeasured_jump(fresh, sets, v, found)
         if left is None:

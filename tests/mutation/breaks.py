@@ -944,11 +944,27 @@ BREAKS = (
     ),
     Break(
         "breaks-rest-of-all",
-        "otsync/sync/breaks.py",
+        "otsync/clocks/stillness.py",
         "fast = known & (usual >= np.quantile(usual[known], FASTEST))",
         "fast = known",
         ("tests/otsync/sync/test_breaks.py",),
         "what hardly moves is asked whether it rests: its noise says no",
+    ),
+    Break(
+        "pause-begins-slowly",
+        "otsync/clocks/stillness.py",
+        "clear &= all(steps[one] - usual >= SHARP * (steps[two] - usual) for one, two in ((i - 1, i - 2), (j, j + 1)))",
+        "pass",
+        ("tests/otsync/sync/test_breaks.py",),
+        "a pause beside which a swing turns is counted one frame too long",
+    ),
+    Break(
+        "few-seconds-do-not-differ",
+        "otsync/sync/breaks.py",
+        "return own if other is None or fit.seconds >= FEW else math.hypot(own, other.off_by(fit.information))",
+        "return own",
+        ("tests/otsync/sync/test_breaks.py",),
+        "a second behind a break says that it is known as well as its matches agree",
     ),
     Break(
         "breaks-chance-is-a-part",

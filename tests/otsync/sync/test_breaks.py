@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from otsync import synchronize
 from otsync.align.breaks import by_chance, partners
@@ -13,11 +15,13 @@ from otsync.align.windows import local_curves
 from otsync.bench.trust.worlds import CLASSES
 from otsync.clocks.common import CommonClock
 from otsync.clocks.splines import TrackSplines
+from otsync.clocks.stillness import pause, stood_still
+from otsync.refine.gauss_newton import Fit
 from otsync.simulate import simulate
 from otsync.simulate.effects import Drop, Freeze, In, SlowMotion
-from otsync.sync.breaks import mended, stood_still, whole
+from otsync.sync.breaks import mended, sigma_of_part, whole
 from otsync.sync.verb import jump_sigma
-from otsync.types import Break, Offsets, Status, TrackSet, mended_frames, mended_times
+from otsync.types import Break, Clock, Offsets, Status, TrackSet, mended_frames, mended_times
 
 
 def broken(effect, videos: int = 2, seed: int = 3, who: int = 1):
@@ -167,6 +171,35 @@ def test_what_rests_is_told_by_what_moves_otherwise(noise):
     assert not stood_still(TrackSplines(t, x), 1.0, 20 / 30)
 
 
+def swinging(frozen: range, noise: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Times, and tracks of which a third moves; all frames of ``frozen`` show what the one before them does."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(90) / 30
+    shown = t - np.clip(t - (frozen[0] - 1) / 30, 0, len(frozen) / 30)
+    x = np.zeros((60, 90, 3))
+    x[:20, :, 0] = np.sin(4 * shown)
+    return t, x + noise * rng.normal(size=x.shape)
+
+
+@given(st.integers(20, 40), st.integers(8, 30), st.sampled_from([0.0, 0.01, 0.02]), st.integers(-4, 4))
+@settings(max_examples=30, deadline=None)
+def test_the_frames_of_a_pause_are_counted(first, count, noise, off):
+    t, x = swinging(range(first, first + count), noise)
+    found = pause(t, x, t[first - 1] + off / 30, (count - off) / 30)
+    if found is not None:  # where a swing turns next to it, noise may hide its end
+        np.testing.assert_allclose(found, (t[first - 1], t[first + count - 1]), atol=1e-9)
+    assert noise > 0 or found is not None or np.abs(np.cos(4 * t[first - 1])) < 0.5
+
+
+def test_a_pause_that_noise_hides_is_not_counted():
+    t, x = swinging(range(30, 45), 0.3)
+    assert pause(t, x, 29 / 30, 0.5) is None
+    t, x = swinging(range(30, 45), 0.01)
+    assert pause(t, x, 29 / 30, 0.5) is not None
+    assert pause(t, x, 29 / 30, 1.0) is None  # the pair measured another length
+    assert pause(t, np.full_like(x, np.nan), 29 / 30, 0.5) is None
+
+
 def test_parts_by_chance_are_those_that_the_parts_beside_them_explain():
     """a has 150 frames and b too; windows every 10 frames."""
     nothing = np.zeros((1, 150, 3))
@@ -298,6 +331,35 @@ def test_pairs_speak_only_for_what_they_see_of_a_clock():
     assert ends.max() < 0.2
     (broken,) = found.breaks[2]
     assert broken.jump == pytest.approx(-1.0) and found.ok
+
+
+def fitted(seconds: float, information: float, wander: float = 0.0, sigma: float = 0.0) -> Fit:
+    return Fit(
+        Clock(0.0),
+        np.array([[sigma**2]]),
+        np.ones(9),
+        5,
+        blur=0.1,
+        wander=wander,
+        information=information,
+        seconds=seconds,
+    )
+
+
+def test_a_second_is_off_by_as_much_as_other_seconds_differ():
+    late = np.array([0.01, -0.02, 0.015, 0.03])
+    whole = fitted(4, information=4 * 7.0, wander=float(np.std(late)))
+    assert whole.off_by(7.0) == pytest.approx(float(np.std(late, ddof=1)))
+    assert whole.off_by(4 * 7.0) == pytest.approx(whole.off_by(7.0) / 2)
+    assert fitted(1, 7.0, wander=0.1).off_by(7.0) == 0.0  # a single second does not differ from itself
+
+
+def test_a_part_of_a_second_heeds_the_seconds_beyond_its_break():
+    short, long = fitted(1, 7.0, sigma=0.003), fitted(4, 28.0, wander=0.01, sigma=0.002)
+    assert sigma_of_part(short, long) == pytest.approx(np.hypot(0.003, long.off_by(7.0)))
+    assert sigma_of_part(long, short) == pytest.approx(0.002)
+    assert sigma_of_part(short, None) == pytest.approx(0.003)
+    assert np.isnan(sigma_of_part(None, long))
 
 
 def test_a_pause_lasts_whole_frames_where_it_is_measured():

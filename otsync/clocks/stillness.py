@@ -1,0 +1,123 @@
+"""Whether a video stood still, and for how many frames: what shows no motion where the other videos move.
+
+A pair measures by how much a clock jumps to some tenths of a frame. A video that froze tells itself: what it shows in
+each frame of the pause is one moment, so that steps from frame to frame are noise alone, and can be counted.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from .splines import TrackSplines
+
+STILL = 0.35
+"""A video stands still where its speed is below this share of what it is around, and moves around."""
+
+FASTEST = 0.75
+"""Quantile of the speeds around from which on tracks are asked."""
+
+AROUND = 20 / 30
+"""Seconds on either side of a pause that tell the usual speed."""
+
+MARGIN = 3 / 30
+"""Seconds at either end of a pause, at most, that are not asked: curves are smoothed across it."""
+
+OFF = 6
+"""Frames by which a pause may begin and end elsewhere than where the pair has it."""
+
+CORE = 4
+"""Fewest steps of a pause that tell how large steps are that show nothing but noise."""
+
+OUTLYING = 0.98
+"""Quantile of squared steps beyond which one counts for no more: a tracker that loses its point jumps."""
+
+ROUNDED = 1e-9
+"""Of the largest mean square: less is nothing."""
+
+ALIKE, DEVIATIONS = 0.25, 5.0
+"""A step is of the pause where its mean square is larger than theirs by this share, or by so many of the deviations
+among them."""
+
+MOVES, EDGE, CLEAR, SHARP = 1.8, 1.5, 7.0, 0.7
+"""Beside a pause that is counted the mean squares of three steps, and of the first one, are this many times as large;
+those of three also by so many deviations; and the first step has this share of what the second one has more."""
+
+
+def stood_still(curves: TrackSplines, start: float, length: float) -> bool:
+    """Whether tracks rest from ``start`` on for ``length`` s, and move before and behind: the fastest quarter of them,
+    since noise has a speed, too, and what hardly moves has no other.
+    """
+    inner = min(0.25 * length, MARGIN)
+    during = _speeds(curves, start + inner, start + length - inner)
+    around = np.stack(
+        [
+            _speeds(curves, start - AROUND, start - MARGIN),
+            _speeds(curves, start + length + MARGIN, start + length + AROUND),
+        ]
+    )
+    sides = np.isfinite(around)
+    usual = np.where(sides, around, 0.0).sum(0) / np.maximum(sides.sum(0), 1)
+    known = np.isfinite(during) & sides.any(0)
+    if not known.any():
+        return False
+    fast = known & (usual >= np.quantile(usual[known], FASTEST))
+    return float(np.median(during[fast])) < STILL * float(np.median(usual[fast]))
+
+
+def _speeds(curves: TrackSplines, begin: float, end: float) -> np.ndarray:
+    """(M,) rms speed of every track within a span; nan where it is not seen."""
+    t = curves.times[(curves.times >= begin) & (curves.times <= end)]
+    if len(t) == 0:
+        return np.full(len(curves.mean), np.nan)
+    seen = curves.support(t)
+    power = np.where(seen, (curves.velocity(t) ** 2).sum(2), 0.0).sum(1)
+    return np.where(seen.any(1), np.sqrt(power / np.maximum(seen.sum(1), 1)), np.nan)
+
+
+def pause(
+    times: Float[np.ndarray, " T"], x: Float[np.ndarray, "M T 3"], start: float, length: float
+) -> tuple[float, float] | None:
+    """The seconds between which a video shows one moment, near ``start`` and ``length`` s; None where noise hides it.
+
+    Args:
+        times: (T,) s. x: (M,T,3) where its tracks are seen, as they are; nan where not seen.
+    """
+    steps = mean_steps(x)
+    low, high = np.searchsorted(times, [start, start + length])
+    core = max(CORE, int(high - low) // 2)
+    begins = range(max(0, int(low) - OFF), min(len(steps) - core, int(high) + OFF - core) + 1)
+    if not len(begins) or not np.isfinite(steps).any():
+        return None
+    first = min(begins, key=lambda k: float(steps[k : k + core].mean()))
+    inside = steps[first : first + core]
+    usual = max(float(np.median(inside)), ROUNDED * float(np.nanmax(steps)))
+    if not usual >= 0:
+        return None
+    spread = 1.4826 * float(np.median(np.abs(inside - usual)))
+    still = steps <= usual + max(ALIKE * usual, DEVIATIONS * spread)
+    if not still[first : first + core].all():
+        return None
+    i, j = first, first + core
+    while i > 0 and still[i - 1]:
+        i -= 1
+    while j < len(steps) and still[j]:
+        j += 1
+    if i < 3 or j + 3 > len(steps) or max(abs(i - low), abs(j - high)) > OFF:
+        return None
+    beside = min(float(steps[i - 3 : i].mean()), float(steps[j : j + 3].mean()))
+    clear = beside >= max(MOVES * usual, usual + CLEAR * spread) and min(steps[i - 1], steps[j]) >= EDGE * usual
+    # what turns right there begins slowly, and may have begun before
+    clear &= all(steps[one] - usual >= SHARP * (steps[two] - usual) for one, two in ((i - 1, i - 2), (j, j + 1)))
+    return (float(times[i]), float(times[j])) if clear and beside > 0 else None
+
+
+def mean_steps(x: Float[np.ndarray, "M T 3"]) -> Float[np.ndarray, " T-1"]:
+    """Mean square of how far tracks go from frame to frame; nan where none is seen in both."""
+    square = ((x[:, 1:] - x[:, :-1]) ** 2).sum(2)
+    seen = np.isfinite(square)
+    if not seen.any():
+        return np.full(square.shape[1], np.nan)
+    most = np.quantile(square[seen], OUTLYING)
+    total = np.where(seen, np.minimum(square, most), 0.0).sum(0)
+    return np.where(seen.any(0), total / np.maximum(seen.sum(0), 1), np.nan)
