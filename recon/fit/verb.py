@@ -49,6 +49,10 @@ CALIBRATED = (0.15, 0.3)
 """Shares of the time between which the speed is taken for good. The first steps are slow: by them alone a fit was a
 fifth too short. No rate decays before (:class:`recon.fit.optimize.Decay`)."""
 
+AGAIN, CHANGED = (0.5, 0.7, 0.85, 0.95), 0.03
+"""Shares of the time at which the number of steps is set anew where the speed since the last one has changed it by more
+than this share: a laptop grows hot, and other work ends."""
+
 RELEASED = 100
 """Steps after which the memory of footage that lies in files is given back: what they read comes from the system's
 cache again."""
@@ -197,6 +201,7 @@ class Calibration:
         self.first, self.again = 0, False
         self.guess: int | None = None
         self.known: int | None = None
+        self.least, self.marks = 0, list(AGAIN)
 
     def __call__(self, step: int) -> tuple[int | None, int | None]:
         """After a step: the number of steps in all as it is guessed, and as it is known; None before."""
@@ -211,6 +216,13 @@ class Calibration:
             self.guess = self._total(step, now)
         if self.guess is not None and self.known is None and gone >= CALIBRATED[1] * self.seconds:
             self.guess = self.known = self._total(step, now)
+            self.since, self.first, self.least = now, self.done, 2 * step
+        elif self.known is not None and self.marks and gone >= self.marks[0] * self.seconds:
+            if self.done - self.first >= GUESSED[0]:  # fewer, as after a pause of the machine, tell no speed
+                total = max(self.least, self._total(step, now))
+                if abs(total - self.known) > CHANGED * self.known:
+                    self.guess = self.known = total
+            self.since, self.first, self.marks = now, self.done, self.marks[1:]
         return self.guess, self.known
 
     def _total(self, step: int, now: float) -> int:
@@ -219,7 +231,8 @@ class Calibration:
             return 2 * step
         each = (now - self.since) / steps
         left = self.seconds - (now - self.began) if self.deadline is None else FIT_SHARE * self.deadline.left
-        return max(2 * step, step + int(left / each) - self.after)  # rates must have time to decay
+        total = max(step + 1, step + int(left / each) - self.after)
+        return total if self.least else max(2 * step, total)  # rates must have time to decay
 
 
 def _moved(problem: Problem, seconds: np.ndarray) -> str:

@@ -491,6 +491,23 @@ def test_a_budget_is_used_though_the_first_steps_are_slow(monkeypatch, slow, aft
     assert None in guesses and len(guesses) <= 3  # none, a guess, what is known
 
 
+@pytest.mark.parametrize("share", [0.4, 0.6, 0.8])
+@pytest.mark.parametrize("slow", [0.5, 2.0])
+def test_a_budget_is_kept_though_the_machine_changes_its_speed(monkeypatch, slow, share):
+    """From ``share`` of the time on steps of 10 ms take longer, or less: a laptop grows hot, other work ends."""
+    now = 0.0
+    monkeypatch.setattr(time, "perf_counter", lambda: now)
+    calibrate, totals, total, step = Calibration(30.0), set(), None, 0
+    while total is None or step < total:
+        step += 1
+        now += 0.01 * (slow if now >= 30 * share else 1.0)
+        _, total = calibrate(step)
+        totals.add(total)
+        assert total is None or step <= total
+    assert now == pytest.approx(30.0, rel=0.08)
+    assert len(totals) > 2
+
+
 def test_other_rates_and_frame_times(capture, scene):
     """A video at another rate: t_world = rate * t_own + offset, so that slowed-down times with rate 2 are the same."""
     slow = [capture.footage[0], *(replace(f, times=f.times / 2) for f in capture.footage[1:])]
