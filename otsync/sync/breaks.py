@@ -57,10 +57,10 @@ BESIDE, OFF, OTHERS = 0.45, 1.5 / 30, 10 / 30
 of the answer is the best (46 worlds of mid noise); beside a slow motion that is taken for lost frames one that is 2 to
 7 frames off (10 of 10)."""
 
-FEW = 2.0
-"""Seconds, counted by what moves in them, below which a part does not show by how much its seconds differ. What its
-matches differ by alone covers 48 and 79 % of the errors of .65 s of mid worlds; with the other part's seconds 71 and 93
-(600 to 629)."""
+SHORT = 0.9
+"""Seconds below which what its matches differ by does not cover the error of a part: 48 and 79 % of .65 s of mid worlds
+lie within one and two such sigmas, 57 and 87 % of .8 s, 70 and 93 % of 1 s (600 to 629). With what the seconds of the
+other part differ by it is 71 and 93 % of .65 s and 63 and 97 % of .8 s."""
 
 MOST = 4
 """Breaks that are mended, at most."""
@@ -190,21 +190,27 @@ def _offsets(
     fits = [fit_clock(a.within(p.begin, p.end), b, Clock(p.offset), WINDOW) for p in sides]
     near = [f is not None and abs(f.clock.offset - p.offset) < within for f, p in zip(fits, sides, strict=True)]
     found = [f.clock.offset if f is not None and ok else p.offset for f, p, ok in zip(fits, sides, near, strict=True)]
-    sigma = [sigma_of_part(f, other) for f, other in zip(fits, fits[::-1], strict=True)]
+    sigma = [sigma_of_part(f, g, _length(a, b, p)) for f, g, p in zip(fits, fits[::-1], sides, strict=True)]
     for k in (0, 1):
         if fits[k] is None and near[1 - k]:
             found[k], sigma[k] = measured(a, b, replace(sides[1 - k], offset=found[1 - k]), sides[k])
     return found, sigma
 
 
-def sigma_of_part(fit: Fit | None, other: Fit | None) -> float:
-    """One sigma, s, of a part's offset. In a second or two all matches err alike, and do not show it: there the seconds
-    of the part beyond the break tell how far one is off that holds so much motion.
+def sigma_of_part(fit: Fit | None, other: Fit | None, length: float) -> float:
+    """One sigma, s, of the offset of a part that is ``length`` s long. In less than a second all matches err alike, and
+    do not show it: there the seconds of the part beyond the break tell how far one is off that holds so much motion.
     """
     if fit is None:
         return math.nan
     own = math.sqrt(float(fit.covariance[0, 0]))
-    return own if other is None or fit.seconds >= FEW else math.hypot(own, other.off_by(fit.information))
+    return own if other is None or length >= SHORT else math.hypot(own, other.off_by(fit.information))
+
+
+def _length(a: TrackSplines, b: TrackSplines, part: Part) -> float:
+    """Seconds of a part that both videos show."""
+    first, last = (float(t) + part.offset for t in b.times[[0, -1]])
+    return min(part.end, float(a.times[-1]), last) - max(part.begin, float(a.times[0]), first)
 
 
 def _moment(
