@@ -26,6 +26,9 @@ MARGIN = 3 / 30
 OFF = 6
 """Frames by which a pause may begin and end elsewhere than where the pair has it."""
 
+BESIDE = 3
+"""Steps on either side of a pause that tell whether things move there."""
+
 CORE = 4
 """Fewest steps of a pause that tell how large steps are that show nothing but noise."""
 
@@ -83,10 +86,12 @@ def pause(
     Args:
         times: (T,) s. x: (M,T,3) where its tracks are seen, as they are; nan where not seen.
     """
-    steps = mean_steps(x)
-    low, high = np.searchsorted(times, [start, start + length])
-    core = max(CORE, int(high - low) // 2)
-    begins = range(max(0, int(low) - OFF), min(len(steps) - core, int(high) + OFF - core) + 1)
+    # only what is asked about: of an hour all steps would take gigabytes
+    low, high = (int(k) for k in np.searchsorted(times, [start, start + length]))
+    begin, end = max(0, low - OFF - BESIDE), min(len(times), high + OFF + BESIDE + 1)
+    times, steps, low, high = times[begin:end], mean_steps(x[:, begin:end]), low - begin, high - begin
+    core = max(CORE, (high - low) // 2)
+    begins = range(max(0, low - OFF), min(len(steps) - core, high + OFF - core) + 1)
     if not len(begins) or not np.isfinite(steps).any():
         return None
     first = min(begins, key=lambda k: float(steps[k : k + core].mean()))
@@ -103,9 +108,9 @@ def pause(
         i -= 1
     while j < len(steps) and still[j]:
         j += 1
-    if i < 3 or j + 3 > len(steps) or max(abs(i - low), abs(j - high)) > OFF:
+    if i < BESIDE or j + BESIDE > len(steps) or max(abs(i - low), abs(j - high)) > OFF:
         return None
-    beside = min(float(steps[i - 3 : i].mean()), float(steps[j : j + 3].mean()))
+    beside = min(float(steps[i - BESIDE : i].mean()), float(steps[j : j + BESIDE].mean()))
     clear = beside >= max(MOVES * usual, usual + CLEAR * spread) and min(steps[i - 1], steps[j]) >= EDGE * usual
     # what turns right there begins slowly, and may have begun before
     clear &= all(steps[one] - usual >= SHARP * (steps[two] - usual) for one, two in ((i - 1, i - 2), (j, j + 1)))

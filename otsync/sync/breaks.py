@@ -312,12 +312,13 @@ def culprit(found: Sequence[Suspect], sound: Sequence[Seen]) -> Suspect | None:
         ]
         votes = sum(s.votes for s in same) - sum(seen.across(one) for seen in sound)
         if votes > most + 1e-9:
-            still = float(np.median([s.found.still for s in same]))
+            # a video that shows how long it stood still does so whichever pair asks: no measured length joins it
+            told = [s.found for s in same if s.found.still > 0 and s.found.sigma == 0] or [s.found for s in same]
             middle = Break(
-                float(np.median([s.found.at for s in same])),
-                float(np.median([s.found.jump for s in same])),
-                still,
-                float(np.median([s.found.sigma for s in same])) / math.sqrt(len(same)),
+                float(np.median([b.at for b in told])),
+                float(np.median([b.jump for b in told])),
+                float(np.median([b.still for b in told])),
+                float(np.median([b.sigma for b in told])) / math.sqrt(len(told)),
             )
             best, most = Suspect(one.video, middle, votes), votes
     return best

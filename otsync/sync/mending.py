@@ -17,7 +17,7 @@ from ..clocks.common import nominal_fps
 from ..compute.threads import MapLike
 from ..refine.verb import refine
 from ..types import Break, Clock, Status, TrackSet, in_order
-from .breaks import AROUND, MOST, Seen, Suspect, culprit, lasting, mended, remeasured, runs_on, suspects
+from .breaks import AROUND, MOST, SIGMAS, Seen, Suspect, culprit, lasting, mended, remeasured, runs_on, suspects
 from .graph import Pair
 from .pairs import Job, run, without_answered_doubt
 from .places import NONE, parts_by_place
@@ -350,18 +350,28 @@ def with_break(
             break
         if _broken(fresh.values()) < doubts:
             best = again, better, fresh, found
-        if found.sigma == 0:  # the video itself shows how many frames it stood still
-            break
-        frame = 1 / nominal_fps(tracks[v])
         left = remeasured_jump(fresh, sets, v, found)
+        if best is not None and found.sigma == 0:  # the video itself shows how many frames it stood still
+            best = (*best[:3], confirmed(found, left))
+            break
         if left is None:
             break
+        frame = 1 / nominal_fps(tracks[v])
         if left.still > 0:
             left = lasting(found.at - found.still, -left.jump, left.sigma, frame)
         if best is not None and abs(left.jump - found.jump) < SETTLED:
             break
         found = left
     return best
+
+
+def confirmed(found: Break, left: Break | None) -> Break:
+    """A pause that was counted, and what the pairs measure after it was mended: where they contradict, by how much is
+    its sigma. A performer who rests right beside a pause makes it look longer.
+    """
+    if left is None or abs(left.jump - found.jump) <= SIGMAS * left.sigma:
+        return found
+    return dataclasses.replace(found, sigma=float(np.hypot(left.sigma, left.jump - found.jump)))
 
 
 def remeasured_jump(fresh: Mapping[Pair, Answer], tracks: Sequence[TrackSet], v: int, found: Break) -> Break | None:

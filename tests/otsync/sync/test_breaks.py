@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -19,7 +21,8 @@ from otsync.clocks.stillness import pause, stood_still
 from otsync.refine.gauss_newton import Fit
 from otsync.simulate import simulate
 from otsync.simulate.effects import Drop, Freeze, In, SlowMotion
-from otsync.sync.breaks import mended, sigma_of_part, whole
+from otsync.sync.breaks import Suspect, culprit, mended, sigma_of_part, whole
+from otsync.sync.mending import confirmed
 from otsync.sync.verb import jump_sigma
 from otsync.types import Break, Clock, Offsets, Status, TrackSet, mended_frames, mended_times
 
@@ -361,6 +364,26 @@ def test_less_than_a_second_heeds_the_seconds_beyond_its_break():
     assert sigma_of_part(long, short, 4.0) == pytest.approx(0.002)
     assert sigma_of_part(short, None, 0.6) == pytest.approx(0.003)
     assert np.isnan(sigma_of_part(None, long, 0.6))
+
+
+def test_a_pause_that_one_pair_counted_is_not_averaged_with_measured_ones():
+    sure = Break(4.0, -0.5, 0.5, 0.0)
+    measured = [Break(3.95, -0.47, 0.47, 0.01), Break(4.02, -0.48, 0.48, 0.01)]
+    found = [Suspect(1, sure, 1.0), *(Suspect(1, b, 1.0) for b in measured)]
+    told = culprit(found, [])
+    assert told is not None and told.found == sure and told.votes == 3
+    told = culprit(found[1:], [])
+    assert told is not None and told.found.jump == pytest.approx(-0.475)
+
+
+def test_what_pairs_measure_against_a_counted_pause_is_its_sigma():
+    """A performer who rests right beside a pause makes it look longer."""
+    counted = Break(4.0, -17 / 30, 17 / 30, 0.0)
+    near, far = (replace(counted, jump=-jump / 30, sigma=0.2 / 30) for jump in (16.5, 15.2))
+    assert confirmed(counted, near) == counted and confirmed(counted, None) == counted
+    doubted = confirmed(counted, far)
+    assert doubted.jump == counted.jump and doubted.sigma * 30 == pytest.approx(np.hypot(0.2, 1.8))
+    assert jump_sigma(counted, 1 / 30) == 0 and jump_sigma(doubted, 1 / 30) == doubted.sigma
 
 
 def test_a_pause_lasts_whole_frames_where_it_is_measured():
