@@ -40,13 +40,16 @@ ENOUGH = 15
 BACK = 1.5
 """Seconds that a video must go back by to be taken for cut; less is lost frames."""
 
-SNAP, SURELY = 0.4, 5.0
-"""Frames within which the length of a freeze is a whole number of frames, and nats that must speak for that one against
-the next. A freeze near the end of a clip, known to a quarter of a frame, was made a frame too short, and trusted (seed
-53009); one known to .09 was left .38 frame off (41006)."""
+WHOLE, PAUSED_WHOLE = 0.8, 0.98
+"""How likely it is that lost frames are a whole number, and that repeated ones are. A camera whose clock runs on while
+frames are lost loses whole ones; a recorder that paused goes on anywhere."""
 
-ROUNDING = 1e-6
-"""Frames."""
+SLACK = 1.4
+"""By how much a jump may be off beyond its sigma, where it is asked which whole number it is: 56 to 67 and 84 to 86 %
+of short parts lie within one and two sigmas."""
+
+ROUNDING, MOST_FRAMES = 1e-6, 3.0
+"""Frames: a sigma below the first is that, and one above the second tells no whole number."""
 
 SIGMAS = 3.0
 """By which a pause that is counted may differ from what a pair measures, or by a frame and a half."""
@@ -130,7 +133,7 @@ def _readings(
     jump, sigma = second - first, math.hypot(*sigmas)
     i, j = answer.pair
     if jump > 0 and gap == 0:  # a's frames run on, b's go back: its parts are in the other order
-        return [Suspect(j, Break(_turn(*raw, second, first), -jump, 0.0, sigma), 1.0)]
+        return [Suspect(j, jumping(_turn(*raw, second, first), -jump, sigma, 1 / fps[j]), 1.0)]
     at_b = when - first
     if jump > 0:  # a's frames from `when` on for `jump` s have no partner: a stood still, or b lost them
         froze, lost = (i, when, a, raw[0]), (j, at_b)
@@ -138,11 +141,11 @@ def _readings(
         froze, lost = (j, at_b, b, raw[1]), (i, when)
     video, start, own, shown = froze
     stands = stood_still(own, start, abs(jump))
-    back = Break(start, -abs(jump), 0.0, sigma)
+    frame = 1 / fps[video]
+    back = jumping(start, -abs(jump), sigma, frame)
     if stands:
-        frame = 1 / fps[video]
         back = _counted(shown, start, abs(jump), sigma, frame) or lasting(start, abs(jump), sigma, frame)
-    gone = Break(lost[1], abs(jump), 0.0, sigma)
+    gone = jumping(lost[1], abs(jump), sigma, 1 / fps[lost[0]])
     votes = (1.0, 0.0) if stands else (RESTING, MOVING)
     return [Suspect(video, back, votes[0]), Suspect(lost[0], gone, votes[1])]
 
@@ -158,27 +161,41 @@ def _counted(shown: Raw, start: float, length: float, sigma: float, frame: float
 
 
 def lasting(start: float, length: float, sigma: float, frame: float) -> Break:
-    """A pause from ``start`` on, its length a whole number of frames where it is clear which: all in s."""
-    length = whole(length, sigma, frame)
+    """A pause from ``start`` on, of the likeliest length, in whole frames where nothing tells how well it is known: all
+    in s.
+    """
+    if not math.isfinite(sigma):
+        length = round(length / frame) * frame
+    length, sigma = in_frames(length, sigma, frame, PAUSED_WHOLE)
     return Break(start + length, -length, length, sigma)
 
 
-def counted(found: Break, frame: float) -> bool:
-    """Whether it is clear how many frames a pause has: :func:`whole` made it so many."""
-    frames = found.still / frame
-    clear = SURELY * (found.sigma / frame) ** 2 <= 1 / 2  # never of nan
-    return bool(found.still > 0 and clear and abs(frames - round(frames)) < ROUNDING)
+def jumping(at: float, jump: float, sigma: float, frame: float) -> Break:
+    """A clock that jumps as lost frames and cuts make it, by the likeliest length: all in s."""
+    jump, sigma = in_frames(jump, sigma, frame, WHOLE)
+    return Break(at, jump, 0.0, sigma)
 
 
-def whole(length: float, sigma: float, frame: float) -> float:
-    """A freeze's length in whole frames, where it is near that and it is clear how many: all in s.
+def in_frames(length: float, sigma: float, frame: float, whole: float) -> tuple[float, float]:
+    """The mean and one standard deviation, s, of a length that was measured, where it is a whole number of frames with
+    the probability ``whole``, each as likely as the next, and else any length.
 
-    A sigma of nan (its own parts cannot tell) is no doubt about a whole number.
+    A sigma of nan (its own parts cannot tell) stays.
     """
-    frames = round(length / frame)
-    off = abs(length / frame - frames)
-    unclear = (1 - 2 * off) / 2 < SURELY * (sigma / frame) ** 2
-    return length if off >= SNAP or unclear else frames * frame
+    if not math.isfinite(sigma):
+        return length, sigma
+    known = max(SLACK * sigma / frame, ROUNDING)
+    if known > MOST_FRAMES:
+        return length, sigma  # whole numbers are too dense to tell
+    told = length / frame
+    values = np.round(told) + np.arange(-np.ceil(6 * known), np.ceil(6 * known) + 1)
+    each = math.log(whole) - math.log(known * math.sqrt(2 * math.pi)) - (values - told) ** 2 / (2 * known**2)
+    each = np.append(each, math.log1p(-whole))
+    weight = np.exp(each - each.max())
+    weight /= weight.sum()
+    mean = float(weight @ np.append(values, told))
+    variance = float(weight @ (np.append(values, told) - mean) ** 2 + weight[-1] * known**2)
+    return mean * frame, math.sqrt(variance) * frame
 
 
 def _offsets(

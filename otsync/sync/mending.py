@@ -17,7 +17,20 @@ from ..clocks.common import nominal_fps
 from ..compute.threads import MapLike
 from ..refine.verb import refine
 from ..types import Break, Clock, Status, TrackSet, in_order
-from .breaks import AROUND, MOST, SIGMAS, Seen, Suspect, culprit, lasting, mended, remeasured, runs_on, suspects
+from .breaks import (
+    AROUND,
+    MOST,
+    SIGMAS,
+    Seen,
+    Suspect,
+    culprit,
+    jumping,
+    lasting,
+    mended,
+    remeasured,
+    runs_on,
+    suspects,
+)
 from .graph import Pair
 from .pairs import Job, run, without_answered_doubt
 from .places import NONE, parts_by_place
@@ -359,6 +372,8 @@ def with_break(
         frame = 1 / nominal_fps(tracks[v])
         if left.still > 0:
             left = lasting(found.at - found.still, -left.jump, left.sigma, frame)
+        else:
+            left = jumping(left.at, left.jump, left.sigma, frame)
         if best is not None and abs(left.jump - found.jump) < SETTLED:
             break
         found = left

@@ -22,7 +22,7 @@ from ..refine.slot import Rate, Refiner, RefinerLike
 from ..refine.splines import SplineRefine
 from ..types import Alignment, Break, Matches, Offsets, Status, TrackSet
 from ..types.checks import check_whole
-from .breaks import Seen, counted
+from .breaks import Seen
 from .graph import Graph, Pair
 from .lags import Lag, lag_of, lagging, with_lags
 from .mending import ByMotion, doubted, mend_by_windows, mend_clocks
@@ -251,11 +251,7 @@ UNMEASURED = 2.0
 
 
 def jump_sigma(found: Break, frame: float) -> float:
-    """One sigma, s, of how far a clock jumps: none of a pause of which it is clear how many frames it has; a jump that
-    could not be measured is known to a few frames at best.
-    """
-    if counted(found, frame):
-        return 0.0
+    """One sigma, s, of how far a clock jumps; one that could not be measured is known to a few frames at best."""
     return found.sigma if np.isfinite(found.sigma) else UNMEASURED * frame
 
 
