@@ -157,6 +157,11 @@ def rated(seed: int, *, rate: float, frames: int, preset: str = "mid") -> World:
     return plain(seed, rates=[1.0, float(up)], frames=frames, preset=preset)
 
 
+def paused(seed: int) -> World:
+    """A recorder that was paused for .25 to .5 s, and goes on between two frames of before."""
+    return plain(seed, first=(In(1, Drop(float(np.random.default_rng([seed, 903]).uniform(0.25, 0.5)))),))
+
+
 def performers(seed: int, *, motion: str, sees: Sequence[Sequence[int]]) -> World:
     """Like performers: video v sees those of ``sees[v]`` alone."""
     tracks, truth = drawn(seed, motion=motion, videos=len(sees), alike=True, within=15)
@@ -210,6 +215,7 @@ CLASSES: dict[str, Callable[[int], World]] = {
     "freeze of 15, hard": partial(plain, preset="hard", first=(In(1, Freeze(15)),)),
     "freeze of 15, brutal": partial(plain, preset="brutal", first=(In(1, Freeze(15)),)),
     "a second missing": partial(plain, first=(In(1, Drop(1.0)),), within=15),
+    "recorder paused": paused,
     "halves exchanged": partial(plain, first=(In(1, Cut()),), within=15),
     "24 as 30": partial(plain, first=(In(1, Repeats(24.0)),)),
     "looped file": partial(untrue, first=(In(1, Loop()),)),
