@@ -205,10 +205,20 @@ def test_the_frames_of_a_pause_are_counted(first, count, noise, off):
     assert noise > 0 or found is not None or np.abs(np.cos(4 * t[first - 1])) < 0.5
 
 
-@pytest.mark.parametrize("first, count, off", [(32, 26, 0), (34, 10, -2), (34, 14, -4), (38, 16, 0)])
-def test_a_pause_beside_which_a_swing_turns_is_not_counted_with_the_turn(first, count, off):
+@pytest.mark.parametrize(
+    "first, count, noise, off",
+    [
+        (32, 26, 0.02, 0),
+        (34, 10, 0.02, -2),
+        (34, 14, 0.02, -4),
+        (38, 16, 0.02, 0),
+        (34, 24, 0.01, -2),
+        (35, 8, 0.005, -2),
+    ],
+)
+def test_a_pause_beside_which_a_swing_turns_is_not_counted_with_the_turn(first, count, noise, off):
     """Noise hides up to six frames of a turn: they rest as much as the pause does."""
-    t, x = swinging(range(first, first + count), 0.02)
+    t, x = swinging(range(first, first + count), noise)
     assert pause(t, x, t[first - 1] + off / 30, (count - off) / 30) is None
 
 
