@@ -44,10 +44,6 @@ WHOLE, PAUSED_WHOLE = 0.8, 0.98
 """How likely it is that lost frames are a whole number, and that repeated ones are. A camera whose clock runs on while
 frames are lost loses whole ones; a recorder that paused goes on anywhere."""
 
-SLACK = 1.4
-"""By how much a jump may be off beyond its sigma, where it is asked which whole number it is: 56 to 67 and 84 to 86 %
-of short parts lie within one and two sigmas."""
-
 ROUNDING, MOST_FRAMES = 1e-6, 3.0
 """Frames: a sigma below the first is that, and one above the second tells no whole number."""
 
@@ -184,7 +180,7 @@ def in_frames(length: float, sigma: float, frame: float, whole: float) -> tuple[
     """
     if not math.isfinite(sigma):
         return length, sigma
-    known = max(SLACK * sigma / frame, ROUNDING)
+    known = max(sigma / frame, ROUNDING)
     if known > MOST_FRAMES:
         return length, sigma  # whole numbers are too dense to tell
     told = length / frame

@@ -23,7 +23,6 @@ from otsync.simulate import simulate
 from otsync.simulate.effects import Drop, Freeze, In, SlowMotion
 from otsync.sync.breaks import (
     PAUSED_WHOLE,
-    SLACK,
     WHOLE,
     Suspect,
     culprit,
@@ -56,7 +55,7 @@ def test_a_break_is_found_named_and_mended(effect, jump, still):
     offsets = synchronize(tracks)
     assert offsets.ok and offsets.breaks[0] == ()
     (found,) = offsets.breaks[1]
-    assert found.jump == pytest.approx(jump, abs=0.2 / 30) and found.still == pytest.approx(still, abs=1e-6)
+    assert found.jump == pytest.approx(jump, abs=0.2 / 30) and found.still == pytest.approx(still, abs=1e-5)
     told = offsets.times(1, tracks[1].times)
     error = np.abs(told - truth.shown[1]) * 30
     away = np.abs(tracks[1].times - found.at) > still + 0.2
@@ -424,10 +423,10 @@ def test_the_sigma_of_a_jump_is_its_own_and_large_where_nobody_knows_it():
 @pytest.mark.parametrize(
     "length, sigma, frames, off",
     [
-        (29.15, 0.05, 29, 0.02),  # surely 29
-        (29.38, 0.09, 29.15, 0.2),  # 29, or no whole number
+        (29.1, 0.05, 29, 0.02),  # surely 29
+        (29.38, 0.126, 29.15, 0.2),  # 29, or no whole number
         (29.45, 0.02, 29.45, 0.03),  # no whole number
-        (29.1, 0.25, 29.03, 0.2),  # it may be 30
+        (29.1, 0.35, 29.03, 0.2),  # it may be 30
         (29.5, 0.25, 29.5, 0.5),  # it is one of the two
         (29.2, 4.0, 29.2, 4.0),  # nobody knows
     ],
@@ -463,14 +462,14 @@ def test_a_likely_length_goes_with_what_is_measured(length, sigma, whole, more, 
 
 
 @pytest.mark.parametrize("whole", (WHOLE, PAUSED_WHOLE))
-@pytest.mark.parametrize("sigma, share", [(0.05, 0.8), (0.15, 0.8), (0.3, 1.02)])
+@pytest.mark.parametrize("sigma, share", [(0.05, 0.8), (0.15, 0.8), (0.3, 0.95)])
 def test_sigma_of_a_likely_length_is_what_it_is_off_by(whole, sigma, share):
-    """Drawn as it is said: whole numbers with that probability, else any; measured with SLACK times the error."""
+    """Drawn as it is said: whole numbers with that probability, else any; measured to within sigma."""
     rng = np.random.default_rng(5)
     true = rng.uniform(8, 20, 4000)
     true = np.where(rng.random(4000) < whole, np.round(true), true)
-    measured = true + SLACK * sigma * rng.standard_normal(4000)
+    measured = true + sigma * rng.standard_normal(4000)
     told, known = np.transpose([in_frames(m / 30, sigma / 30, 1 / 30, whole) for m in measured]) * 30
     off = float(np.sqrt(np.mean((told - true) ** 2)))
     assert off == pytest.approx(float(np.sqrt(np.mean(known**2))), rel=0.1)
-    assert off < share * SLACK * sigma
+    assert off < share * sigma
