@@ -370,7 +370,7 @@ def with_break(
         if left is None:
             break
         frame = 1 / nominal_fps(tracks[v])
-        if left.still > 0:
+        if left.still > 0 > left.jump:
             left = lasting(found.at - found.still, -left.jump, left.sigma, frame)
         else:
             left = jumping(left.at, left.jump, left.sigma, frame)

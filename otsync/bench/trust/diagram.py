@@ -13,23 +13,43 @@ from ..record import Row
 BINS = 8
 
 
+def at_both_ends(rows: Sequence[Row]) -> tuple[np.ndarray, np.ndarray]:
+    """(N,2) errors of answers at the beginning and at the end of what two videos share, and the sigmas that they say
+    for these, frames. Each end is a claim of its own: the larger error of two is more often beyond one sigma.
+    """
+    error, sigma = (
+        np.array([[r[a], r[b]] for r in rows], float).reshape(-1, 2)
+        for a, b in (("begin", "end"), ("sigma_begin", "sigma_end"))
+    )
+    return error, sigma
+
+
+def in_sigmas(rows: Sequence[Row]) -> np.ndarray:
+    """(N,2) errors at both ends in units of the sigma that is said for each."""
+    error, sigma = at_both_ends(rows)
+    return error / sigma
+
+
 def reliability(rows: Sequence[Row]) -> list[Row]:
-    """Trusted answers with a true answer, in bins of as many by sigma: claimed and found rms, and coverage."""
+    """Trusted answers with a true answer, in bins of as many by sigma: claimed and found rms, and coverage, of both
+    ends.
+    """
     ok = [r for r in rows if r["trusted"] and np.isfinite(r["error"]) and np.isfinite(r["sigma"])]
     if len(ok) < BINS:
         return []
-    e, s = (np.array([r[k] for r in ok]) for k in ("error", "sigma"))
+    error, sigma = at_both_ends(ok)
     out: list[Row] = []
-    for part in np.array_split(np.argsort(s), BINS):
+    for part in np.array_split(np.argsort([r["sigma"] for r in ok]), BINS):
+        e, s = error[part], sigma[part]
         out.append(
             {
-                "sigma from": float(s[part].min()),
-                "to": float(s[part].max()),
+                "sigma from": float(s.min()),
+                "to": float(s.max()),
                 "answers": len(part),
-                "claimed rms": float(np.sqrt((s[part] ** 2).mean())),
-                "found rms": float(np.sqrt((e[part] ** 2).mean())),
-                "within 1 sigma": float((e[part] <= s[part]).mean()),
-                "within 2 sigmas": float((e[part] <= 2 * s[part]).mean()),
+                "claimed rms": float(np.sqrt((s**2).mean())),
+                "found rms": float(np.sqrt((e**2).mean())),
+                "within 1 sigma": float((e <= s).mean()),
+                "within 2 sigmas": float((e <= 2 * s).mean()),
             }
         )
     return out
@@ -48,7 +68,8 @@ def draw(rows: Sequence[Row], path: Path) -> None:
     if told:
         claimed, found = (np.array([r[k] for r in told]) for k in ("claimed rms", "found rms"))
         ok = [r for r in ours if r["trusted"] and np.isfinite(r["error"])]
-        left.scatter([r["sigma"] for r in ok], [r["error"] for r in ok], s=6, color="#9db7c9", label="answers")
+        error, sigma = at_both_ends(ok)
+        left.scatter(sigma.ravel(), error.ravel(), s=6, color="#9db7c9", label="answers, at either end")
         left.plot(claimed, found, "o-", color="#00527a", label="rms in eighths")
         ends = np.array([0.5 * min(claimed), 2 * max(claimed)])
         left.plot(ends, ends, color="#777", lw=0.8, ls="--", label="claimed = found")

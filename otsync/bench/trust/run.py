@@ -21,7 +21,7 @@ from ...sync.verb import synchronize
 from ..record import Row, table, write_rows
 from ..sync_acceptance import WRONG, Check, at_least, at_most
 from ..sync_worlds import FPS
-from .diagram import draw, reliability
+from .diagram import draw, in_sigmas, reliability
 from .kept import Kept
 from .worlds import CLASSES
 
@@ -123,6 +123,7 @@ def one(job: tuple[str, str, int], changed: Method | None = None) -> list[dict[s
     world = CLASSES[name](seed)
     offsets = synchronize(list(world.tracks), method=changed or METHODS[method], **world.options)
     ends, worst = world.errors(offsets)
+    both, sigmas = world.at_ends(offsets), offsets.sigma_ends * FPS
     rows = []
     for v in range(1, len(world.tracks)):
         sigma = float(offsets.sigma[v]) * FPS
@@ -135,6 +136,10 @@ def one(job: tuple[str, str, int], changed: Method | None = None) -> list[dict[s
                 "error": float(ends[v - 1]),
                 "anywhere": float(worst[v - 1]),
                 "sigma": sigma,
+                "begin": float(both[v - 1, 0]),
+                "end": float(both[v - 1, 1]),
+                "sigma_begin": float(sigmas[v, 0]),
+                "sigma_end": float(sigmas[v, 1]),
                 "trusted": bool(offsets.status[v].ok and np.isfinite(offsets.seconds[v])),
                 "rate": float(offsets.rates[v]),
                 "breaks": "; ".join(f"video {u}: {b}" for u, bs in enumerate(offsets.breaks) for b in bs),
@@ -166,7 +171,8 @@ def summarise(rows: Sequence[Row]) -> list[Row]:
     for key in dict.fromkeys((r["class"], r["method"]) for r in rows):
         own = [r for r in rows if (r["class"], r["method"]) == key]
         ok = [r for r in own if r["trusted"]]
-        e, s = (np.array([r[k] for r in ok]) for k in ("error", "sigma"))
+        e = np.array([r["error"] for r in ok])
+        units = in_sigmas(ok)
         refused = np.array([r["error"] for r in own if not r["trusted"]])
         refused = refused[np.isfinite(refused)]
         summary.append(
@@ -179,8 +185,8 @@ def summarise(rows: Sequence[Row]) -> list[Row]:
                 "median": float(np.median(e)) if len(e) else None,
                 "p90": float(np.quantile(e, 0.9)) if len(e) else None,
                 "worst": float(e.max()) if len(e) else None,
-                "1 sigma": float((e <= s).mean()) if len(e) else None,
-                "2 sigma": float((e <= 2 * s).mean()) if len(e) else None,
+                "1 sigma": float((units <= 1).mean()) if len(e) else None,
+                "2 sigma": float((units <= 2).mean()) if len(e) else None,
                 "median refused": float(np.median(refused)) if len(refused) else None,
             }
         )
@@ -204,10 +210,10 @@ def acceptance(rows: Sequence[Row]) -> Iterator[Check]:
     for preset in ("mid", "hard"):
         own = [r for r in ok if r["class"].startswith(preset)]
         if own:
-            e, s = (np.array([r[k] for r in own]) for k in ("error", "sigma"))
-            one_sigma = float((e <= s).mean())
+            units = in_sigmas(own)
+            one_sigma = float((units <= 1).mean())
             yield Check(f"{preset}: within one sigma", one_sigma, "0.63 - 0.75", 0.63 <= one_sigma <= 0.75)
-            yield at_least(f"{preset}: within two sigmas", float((e <= 2 * s).mean()), 0.93)
+            yield at_least(f"{preset}: within two sigmas", float((units <= 2).mean()), 0.93)
     for name in MENDED:
         own = [r for r in ours if r["class"] == name]
         if own:

@@ -28,6 +28,7 @@ from ...refine.splines import SplineRefine
 from ...sync.method import Method
 from ...types.trust import Trust
 from ..record import Row, table, write_rows
+from .diagram import in_sigmas
 from .kept import Kept
 from .run import FIRST_SEED, interval, measured, one, written, wrong
 from .worlds import CLASSES
@@ -152,7 +153,7 @@ def summary(name: str, value: float, now: float, answers: Sequence[Row]) -> Row:
     """What a value does: answers that it trusts, those of them that are wrong, and how well sigma covers the others."""
     ok = [r for r in answers if r["trusted"]]
     bad = sum(wrong(r) for r in ok)
-    error, sigma = (np.array([r[k] for r in ok if not wrong(r)]) for k in ("error", "sigma"))
+    units = in_sigmas([r for r in ok if not wrong(r)])
     return {
         "limit": name,
         "value": value,
@@ -162,8 +163,8 @@ def summary(name: str, value: float, now: float, answers: Sequence[Row]) -> Row:
         "wrong": bad,
         "wrong at most": interval(bad, len(ok))[1],
         "wrong classes": ", ".join(dict.fromkeys(r["class"] for r in ok if wrong(r))),
-        "1 sigma": float((error <= sigma).mean()) if len(error) else None,
-        "2 sigma": float((error <= 2 * sigma).mean()) if len(error) else None,
+        "1 sigma": float((units <= 1).mean()) if len(units) else None,
+        "2 sigma": float((units <= 2).mean()) if len(units) else None,
     }
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ import pytest
 from otsync.bench.trust import thresholds
 from otsync.bench.trust.diagram import reliability
 from otsync.bench.trust.run import acceptance, interval, run, summarise, wrong
-from otsync.bench.trust.worlds import CLASSES, FPS, World
+from otsync.bench.trust.worlds import CLASSES, FPS, World, levelled
 from otsync.simulate import simulate
 from otsync.simulate.effects import In, Repeats
 from otsync.types import Break, Offsets
@@ -33,9 +34,7 @@ def test_a_break_that_is_not_told_is_an_error_behind_it():
     assert world.errors(plain)[0][0] == pytest.approx(30, abs=0.01)
     step = np.flatnonzero(np.diff(world.shown[1]) < 1e-9)
     at = float(world.tracks[1].times[step[-1] + 2])
-    import dataclasses
-
-    told = dataclasses.replace(plain, breaks=((), (Break(at, -1.0, 1.0),)))
+    told = replace(plain, breaks=((), (Break(at, -1.0, 1.0),)))
     assert world.errors(told)[0][0] < 0.01
 
 
@@ -51,6 +50,28 @@ def test_a_steep_staircase_is_asked_for_its_middle():
         assert ends[0] == pytest.approx(abs(off) * FPS, abs=0.7), off
 
 
+@pytest.mark.parametrize("frames", [40, 41, 42, 43, 44])
+def test_the_middle_of_a_file_that_repeats_frames_is_right_at_both_ends_and_anywhere(frames):
+    """Of 24 pictures a second in 30 each is late by 0, 1, 3/4, 1/2 and 1/4 of a frame in turns: by a half, whichever
+    of them the clip begins and ends with.
+    """
+    repeats = (In(1, Repeats(24.0)),)
+    tracks, truth = simulate("tennis", preset="clean", videos=2, frames=frames, tracks=20, effects=repeats, seed=0)
+    world = World(tuple(tracks), truth.shown)
+    middle = float(np.mean((truth.shown[1] - tracks[1].times)[:40]))
+    for off in (0.0, 0.1):
+        found = Offsets.known(("a", "b"), np.array([0.0, middle - truth.shown[0][0] + off]), FPS)
+        errors, worst = world.errors(found)
+        assert worst[0] == pytest.approx(off * FPS, abs=1e-6) and errors[0] == pytest.approx(off * FPS, abs=1e-6)
+        np.testing.assert_allclose(world.at_ends(found), off * FPS, atol=1e-6)
+
+
+def test_a_gap_parts_what_an_error_is_averaged_over():
+    times = np.concatenate([np.arange(20), np.arange(40, 60)]) / FPS
+    late = np.repeat([0.0, 1.0], 20)
+    np.testing.assert_array_equal(levelled(late, times), late)
+
+
 def test_where_there_is_no_truth_every_answer_is_wrong():
     world = CLASSES["two scenes"](3)
     ends, _ = world.errors(Offsets.known(("a", "b"), np.zeros(2), FPS))
@@ -62,14 +83,22 @@ def test_tables_of_made_up_answers():
     rng = np.random.default_rng(0)
     sigma = rng.uniform(0.02, 0.2, 400)
     base = {"method": "default", "trusted": True, "flags": ""}
-    rows = [
-        base | {"class": "mid", "error": abs(float(e)), "sigma": float(s)}
-        for e, s in zip(sigma * rng.normal(size=400), sigma, strict=True)
-    ]
+
+    def row(begin: float, end: float, s: float) -> dict[str, object]:
+        ends = {"begin": begin, "end": end, "sigma_begin": s, "sigma_end": s}
+        return base | {"class": "mid", "error": max(begin, end), "sigma": s} | ends
+
+    both = np.abs(sigma[:, None] * rng.normal(size=(400, 2)))
+    rows = [row(float(b), float(e), float(s)) for (b, e), s in zip(both, sigma, strict=True)]
     told = reliability(rows)
     assert len(told) == 8 and all(abs(r["claimed rms"] / r["found rms"] - 1) < 0.35 for r in told)
     assert summarise(rows)[0]["trusted"] == 1.0
-    checks = {c.name: c for c in acceptance([*rows, base | {"class": "mid", "error": 9.0, "sigma": 0.1}])}
+    # each end by itself: of two that are told apart the larger error is within one sigma in 47 of 100 only
+    assert summarise(rows)[0]["1 sigma"] == pytest.approx(0.68, abs=0.04)
+    assert np.mean([r["error"] <= r["sigma"] for r in rows]) < 0.55
+    known = [r | {"sigma_begin": r["begin"] / 0.9, "sigma_end": r["end"] / 1.1} for r in rows]
+    assert summarise(known)[0]["1 sigma"] == 0.5 and summarise(known)[0]["2 sigma"] == 1.0
+    checks = {c.name: c for c in acceptance([*rows, row(9.0, 9.0, 0.1)])}
     assert checks["confident and wrong, in 500 trusted"].measured == pytest.approx(500 / 401)
 
 
