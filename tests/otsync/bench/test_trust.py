@@ -26,6 +26,17 @@ def test_an_error_is_the_distance_from_what_a_frame_shows():
         assert ends[0] == pytest.approx(abs(off) * FPS, abs=1e-6) and worst[0] == pytest.approx(ends[0], abs=1e-6)
 
 
+def test_the_beginning_and_the_end_are_told_apart():
+    """A clock that is right where both begin, and 1 % fast, is off by a hundredth of what lies between."""
+    tracks, truth = simulate("tennis", preset="mid", videos=2, offsets=[0.0, 0.0], frames=90, tracks=20, seed=1)
+    world = World(tuple(tracks), truth.shown)
+    fast = replace(Offsets.known(("a", "b"), np.zeros(2), FPS), rates=np.array([1.0, 0.99]))
+    (begin, end), *_ = world.at_ends(fast)
+    assert begin < 0.1 and end == pytest.approx(0.82, abs=0.02)  # means of the first and the last fifteen of 90 frames
+    ends, worst = world.errors(fast)
+    assert ends[0] == worst[0] == end
+
+
 def test_a_break_that_is_not_told_is_an_error_behind_it():
     world = next(w for w in map(CLASSES["freeze of 30"], range(20)) if w.shown[1][0] < 0)  # most of it is common
     assert world.shown is not None
@@ -50,12 +61,14 @@ def test_a_steep_staircase_is_asked_for_its_middle():
         assert ends[0] == pytest.approx(abs(off) * FPS, abs=0.7), off
 
 
+@pytest.mark.parametrize("pictures", [24.0, 12.0])
 @pytest.mark.parametrize("frames", [40, 41, 42, 43, 44])
-def test_the_middle_of_a_file_that_repeats_frames_is_right_at_both_ends_and_anywhere(frames):
+def test_the_middle_of_a_file_that_repeats_frames_is_right_at_both_ends_and_anywhere(frames, pictures):
     """Of 24 pictures a second in 30 each is late by 0, 1, 3/4, 1/2 and 1/4 of a frame in turns: by a half, whichever
-    of them the clip begins and ends with.
+    of them the clip begins and ends with. Of 12 by 0, 1, 2, 1/2 and 3/2: too steep for any frame to be steady, but for
+    some at the ends.
     """
-    repeats = (In(1, Repeats(24.0)),)
+    repeats = (In(1, Repeats(pictures)),)
     tracks, truth = simulate("tennis", preset="clean", videos=2, frames=frames, tracks=20, effects=repeats, seed=0)
     world = World(tuple(tracks), truth.shown)
     middle = float(np.mean((truth.shown[1] - tracks[1].times)[:40]))
