@@ -12,9 +12,9 @@ import pytest
 from otsync.bench.trust import thresholds
 from otsync.bench.trust.diagram import reliability
 from otsync.bench.trust.run import acceptance, interval, run, summarise, wrong
-from otsync.bench.trust.worlds import CLASSES, FPS, World, levelled
+from otsync.bench.trust.worlds import CLASSES, FPS, World, levelled, plain, steady
 from otsync.simulate import simulate
-from otsync.simulate.effects import In, Repeats
+from otsync.simulate.effects import Drop, In, Repeats
 from otsync.types import Break, Offsets
 
 
@@ -65,8 +65,7 @@ def test_a_steep_staircase_is_asked_for_its_middle():
 @pytest.mark.parametrize("frames", [40, 41, 42, 43, 44])
 def test_the_middle_of_a_file_that_repeats_frames_is_right_at_both_ends_and_anywhere(frames, pictures):
     """Of 24 pictures a second in 30 each is late by 0, 1, 3/4, 1/2 and 1/4 of a frame in turns: by a half, whichever
-    of them the clip begins and ends with. Of 12 by 0, 1, 2, 1/2 and 3/2: too steep for any frame to be steady, but for
-    some at the ends.
+    of them the clip begins and ends with. Of 12 by 0, 1, 2, 1/2 and 3/2: too steep for any frame to be steady.
     """
     repeats = (In(1, Repeats(pictures)),)
     tracks, truth = simulate("tennis", preset="clean", videos=2, frames=frames, tracks=20, effects=repeats, seed=0)
@@ -77,6 +76,21 @@ def test_the_middle_of_a_file_that_repeats_frames_is_right_at_both_ends_and_anyw
         errors, worst = world.errors(found)
         assert worst[0] == pytest.approx(off * FPS, abs=1e-6) and errors[0] == pytest.approx(off * FPS, abs=1e-6)
         np.testing.assert_allclose(world.at_ends(found), off * FPS, atol=1e-6)
+
+
+def test_a_few_frames_that_seem_even_do_not_answer_for_a_steep_staircase():
+    """Twelve pictures a second in 30, of which ten frames are lost: only six frames, behind the last picture, seem steady;
+    they say nothing of the beginning.
+    """
+    lost = (In(1, Repeats(12.0)), In(1, Drop(10 / 30)))
+    world = plain(66100, first=lost)
+    assert world.shown is not None
+    own, times = world.shown[1], world.tracks[1].times
+    assert 0 < steady(own, times).sum() < 15
+    middle = float(np.mean((own - times)[:60])) - float(world.shown[0][0])
+    found = Offsets.known(("a", "b"), np.array([0.0, middle]), FPS)
+    told = replace(found, breaks=((), (Break(float(times[np.argmax(np.diff(own)) + 1]), 10 / 30),)))
+    assert world.at_ends(told)[0, 0] < 0.01
 
 
 def test_a_gap_parts_what_an_error_is_averaged_over():
