@@ -79,7 +79,7 @@ def test_the_middle_of_a_file_that_repeats_frames_is_right_at_both_ends_and_anyw
 
 
 def test_a_few_frames_that_seem_even_do_not_answer_for_a_steep_staircase():
-    """Twelve pictures a second in 30, of which ten frames are lost: only six frames, behind the last picture, seem steady;
+    """Twelve pictures a second in 30, of which ten frames are lost: only the six behind the last picture seem steady;
     they say nothing of the beginning.
     """
     lost = (In(1, Repeats(12.0)), In(1, Drop(10 / 30)))
