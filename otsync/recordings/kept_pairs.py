@@ -19,7 +19,7 @@ from ..types import Alignment, Matches, Similarity, Status, TrackSet
 
 log = logging.getLogger("otsync")
 
-MADE_BY = 7
+MADE_BY = 8
 """Raised when the same pair gets another answer, or more of one, than before: what was kept is then made anew."""
 
 

@@ -32,7 +32,7 @@ from .pairs import Job, Refit, run, run_refit, with_rate
 from .parts import broken_part, unvouched
 from .rematching import contested, rematching
 from .verdict import Answer, Verdict, judge
-from .witnesses import ROUNDS, elsewhere, left_over, once_more, parted, scan_only
+from .witnesses import ROUNDS, elsewhere, left_over, once_more, parted, scan_only, sides
 
 
 def synchronize(
@@ -139,7 +139,7 @@ def synchronize(
         else:
             verdict = with_parts_checked(verdict, tracks, judged)
             verdict = with_witnesses_heard(
-                verdict, jobs, bool(times) and matches is None, refining.trust.parted, judged, map
+                verdict, jobs, broken, bool(times) and matches is None, refining.trust.parted, judged, map
             )
         lags = list(map(lag_of, tracks))
         lagged = with_lags(verdict.answers, lags, refining.trust.lag)
@@ -167,6 +167,7 @@ def with_parts_checked(
 def with_witnesses_heard(
     verdict: Verdict,
     jobs: Sequence[Job],
+    broken: Mapping[int, tuple[Break, ...]],
     rest: bool,
     limit: float,
     judged: Callable[[Sequence[Answer]], Verdict],
@@ -175,6 +176,7 @@ def with_witnesses_heard(
     """The verdict, with pairs doubted of which a part of the scene tells another time.
 
     Args:
+        broken: the breaks that were mended, of which each side is asked for the time of the other one.
         rest: whether the tracks that an answer does not explain are matched once more, and asked, too; and those that
             these leave.
     """
@@ -184,19 +186,24 @@ def with_witnesses_heard(
     shared = {job.pair: Seen.by(answers[job.pair], job.a, job.b)[1] for job in asked}
     middle = {pair: (seen.begin + seen.end) / 2 for pair, seen in shared.items()}
     slots = {job.pair: job for job in asked}
-    explained = [(answers[job.pair], job) for job in asked if rest]
+    whole = [(answers[job.pair], job) for job in asked if rest]
+    explained = whole
     for _ in range(ROUNDS):
         unexplained = [left_over(answer, job) for answer, job in explained if job.pair not in doubted]
         others = [job for job in unexplained if job is not None]
         if not others:
             break
         first = list(map(run, [scan_only(job) for job in others]))
-        again = [job for other, answer in zip(others, first, strict=True) for job in once_more(other, answer)]
+        told = zip(others, first, strict=True)
+        again = [job for other, answer in told for job in once_more(other, answer, answers[other.pair])]
         found = list(map(run, again)) if again else []
         doubted |= {a.pair for a in found if elsewhere(a, answers[a.pair], middle[a.pair])}
         # what the rest has at the answer's own time leaves a rest, too, which is matched without a time once more
-        told = zip(found, again, strict=True)
-        explained = list({a.pair: (a, slots[a.pair].on(job)) for a, job in told if a.refined.status.ok}.values())
+        both = zip(found, again, strict=True)
+        explained = list({a.pair: (a, slots[a.pair].on(job)) for a, job in both if a.refined.status.ok}.values())
+    asked_sides = [(job.pair, side) for a, job in whole for side in sides(a, job, broken) if job.pair not in doubted]
+    told_sides = iter(list(map(run, [again for _, side in asked_sides for again in side.tries()])))
+    doubted |= {pair for pair, side in asked_sides if side.tells_both(next(told_sides), next(told_sides))}
     if not doubted:
         return verdict
     return judged([lagging(a) if a.pair in doubted else a for a in verdict.answers])

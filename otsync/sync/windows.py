@@ -19,6 +19,7 @@ from ..align.likelihood import evidence
 from ..clocks.common import CommonClock, nominal_fps
 from ..clocks.splines import sampled
 from ..costs.linear import Cosine
+from ..match.synchronous import MOMENTS as MOST_MOMENTS
 from ..match.synchronous import SynchronousMatching, apart, joined, longest_seen, mutual, placed, rms_extent
 from ..match.verb import match
 from ..types import Clock, Matches, TrackSet
@@ -36,6 +37,9 @@ EVERY, REACH = 3 / 30, 45 / 30
 
 MOMENTS = 12
 """Of a window, that tracks are compared at."""
+
+LONG_WINDOW = 900
+"""Frames of an overlap that are one window still, where it is asked for as a whole."""
 
 TRACKS = 300
 """Of each video, that take part: those that are seen longest."""
@@ -101,8 +105,12 @@ class Windows:
     whole: Bool[np.ndarray, " W"]
 
     @classmethod
-    def of(cls, job: Job, clock: Clock) -> Windows:
-        """Of a pair whose tracks have positions."""
+    def of(cls, job: Job, clock: Clock, whole: bool = False) -> Windows:
+        """Of a pair whose tracks have positions.
+
+        Args:
+            whole: all of the overlap as one window, unless it is long (:data:`LONG_WINDOW`).
+        """
         a, b = (t.take(longest_seen(t, TRACKS)) for t in (job.a, job.b))
         assert a.xyz is not None and b.xyz is not None
         fps = min(nominal_fps(a), nominal_fps(b))
@@ -112,6 +120,8 @@ class Windows:
         ends = [clock.world(float(t)) for t in b.times[[0, -1]]]
         start = max(float(a.times[0]), ends[0])
         frames = int((min(float(a.times[-1]), ends[1]) - start) * fps + 1e-6) + 1
+        if whole and frames <= LONG_WINDOW:
+            length = max(length, frames)
         if frames < length:
             return cls(clock, np.zeros(0), late / fps, np.zeros((0, len(late))), np.zeros(0, bool))
         count = min(MOST, -(-(frames - length) // max(1, round(STEP * fps))) + 1)
@@ -122,15 +132,16 @@ class Windows:
         if not look.extent(start, start + frames / fps) > 0:
             return cls(clock, start + first / fps, late / fps, np.zeros((count, len(late))), np.ones(count, bool))
         beside = around * every
-        found, whole = [], []
+        moments = MOMENTS if length < frames else MOST_MOMENTS
+        found, full = [], []
         # of a long clip the curves of one window at a time are held
         for some in [first] if frames <= LONG else first[:, None]:
             begin, end = int(some[0]) - beside, int(some[-1]) + length + beside
             part = look.at(start + np.arange(begin, end) / fps)
             for k in some - begin:
-                found.append([part.evidence(int(k), int(k - step), length) for step in late])
-                whole.append(part.there[k : k + length].mean() >= WHOLE)
-        return cls(clock, start + first / fps, late / fps, np.maximum(np.array(found), 0.0), np.array(whole))
+                found.append([part.evidence(int(k), int(k - step), length, moments) for step in late])
+                full.append(part.there[k : k + length].mean() >= WHOLE)
+        return cls(clock, start + first / fps, late / fps, np.maximum(np.array(found), 0.0), np.array(full))
 
     @property
     def usual(self) -> float:
@@ -149,6 +160,18 @@ class Windows:
     def split(self) -> Split | None:
         """The part that gains most by an offset of its own; None where none gains anything."""
         return max(self._splits(), key=lambda split: split.gain, default=None)
+
+    def rivals(self, share: float) -> list[float]:
+        """Other offsets, s beside the answer's, that have this share of its evidence, each better than those beside it,
+        best first.
+        """
+        total, middle = self.evidence.sum(0), len(self.late) // 2
+        least = share * float(self._near()[:, middle].sum())
+        around = np.pad(total, (NEAR, NEAR))
+        peak = total >= np.maximum.reduce([around[k : k + len(total)] for k in range(2 * NEAR + 1)])
+        there = peak & (total > 0) & (total >= least) & (np.abs(np.arange(len(total)) - middle) > NEAR)
+        order = np.flatnonzero(there)
+        return [float(self.late[k]) for k in order[np.argsort(-total[order], kind="stable")]][:TRIED]
 
     def breaks(self) -> list[Split]:
         """The parts that gain enough for a break, each by an offset that suits it better than those beside it, best
@@ -243,12 +266,12 @@ class _Part:
     both: bool
     fps: float
 
-    def evidence(self, at_a: int, at_b: int, length: int) -> float:
+    def evidence(self, at_a: int, at_b: int, length: int, moments: int) -> float:
         """Nats of the matches that are made where a's frames from ``at_a`` on show what b's from ``at_b`` on do."""
         if at_b < 0 or at_b + length > self.b.shape[1] or not self.extent > 0:
             return 0.0
         a, b = self.a[:, at_a : at_a + length], self.b[:, at_b : at_b + length]
-        some = np.unique(np.linspace(0, length - 1, MOMENTS).round().astype(int))
+        some = np.unique(np.linspace(0, length - 1, moments).round().astype(int))
         cost = joined(self.unlike, *apart(a[:, some], b[:, some], self.extent), self.both)
         i, j = mutual(cost)
         if len(i) < FEWEST:
@@ -269,7 +292,7 @@ def matches_of_parts(job: Job, parts: Float[np.ndarray, "P 2"], rate: float) -> 
     """Matches that are made in every part at its own offset: of both videos' frames there, put together."""
     ends = [*parts[1:, 0], np.inf]
     found = [
-        match(_within(job.a, begin, end), job.b, at_known_times(job.matcher, Clock(float(offset), rate)), throw=False)
+        match(within(job.a, begin, end), job.b, at_known_times(job.matcher, Clock(float(offset), rate)), throw=False)
         for (begin, offset), end in zip(parts, ends, strict=True)
     ]
     together = np.concatenate([m.pairs for m in found])
@@ -278,7 +301,7 @@ def matches_of_parts(job: Job, parts: Float[np.ndarray, "P 2"], rate: float) -> 
     return Matches(pairs, score[kept])
 
 
-def _within(tracks: TrackSet, begin: float, end: float) -> TrackSet:
+def within(tracks: TrackSet, begin: float, end: float) -> TrackSet:
     """The tracks, seen only from ``begin`` to ``end`` s of their clock."""
     inside = (tracks.times >= begin) & (tracks.times < end)
     return dataclasses.replace(tracks, visible=tracks.seen & inside)

@@ -90,6 +90,27 @@ def test_a_long_clip_is_read_window_by_window_with_the_same_answer(jump, monkeyp
     assert parts.steady == whole.steady == (jump == 0)
 
 
+def test_all_of_an_overlap_may_be_one_window(monkeypatch):
+    asked = job(noise=0.03)
+    (one,) = Windows.of(asked, Clock(1.0), whole=True).evidence
+    assert one.argmax() == len(one) // 2 and not Windows.of(asked, Clock(1.0), whole=True).rivals(0.7)
+    monkeypatch.setattr("otsync.sync.windows.LONG_WINDOW", 10)
+    many = Windows.of(asked, Clock(1.0), whole=True)
+    np.testing.assert_array_equal(many.evidence, Windows.of(asked, Clock(1.0)).evidence)
+
+
+@pytest.mark.parametrize("late", [-21, -9, 9, 21])
+def test_a_part_of_the_scene_at_another_time_is_a_rival(late):
+    """Tracks of two performers, of whom the second video shows one ``late`` frames later than the other."""
+    first, second = job(seed=1), job(seed=2, late=1.0 + late / FPS)
+    a, b = (
+        replace(x, xyz=np.concatenate([x.xyz, y.xyz + 50.0]), visible=None, features=np.ones((2 * N, 4)))
+        for x, y in ((first.a, second.a), (first.b, second.b))
+    )
+    best, *_ = Windows.of(replace(first, a=a, b=b), Clock(1.0), whole=True).rivals(0.5)
+    assert best == pytest.approx(late / FPS)
+
+
 def test_things_at_rest_are_not_steady():
     """Nothing tells their time, so that nothing frees their clock of a doubt."""
     x = np.repeat(np.random.default_rng(0).normal(size=(N, 1, 3)), 150, 1)

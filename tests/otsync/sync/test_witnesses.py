@@ -13,10 +13,22 @@ from otsync.bench.trust.worlds import plain
 from otsync.refine.slot import Refiner
 from otsync.refine.splines import SplineRefine
 from otsync.simulate.effects import In, PartLate
+from otsync.sync.breaks import mended
 from otsync.sync.pairs import Job, run
 from otsync.sync.verdict import Answer
-from otsync.sync.witnesses import FEWEST, REST, WhereSound, competing, elsewhere, left_over, once_more, parted
-from otsync.types import Alignment, Status
+from otsync.sync.witnesses import (
+    FEWEST,
+    REST,
+    Side,
+    WhereSound,
+    competing,
+    elsewhere,
+    left_over,
+    once_more,
+    parted,
+    sides,
+)
+from otsync.types import Alignment, Break, Status
 
 FPS = 30.0
 
@@ -31,6 +43,9 @@ FPS = 30.0
         ("hard", 41007),
         ("hard", 56014),  # the rest tells two times, and seems to break
         ("hard", 56017),  # of the rest, too, most is of the late ones
+        ("hard", 50005),  # the rest's matches without a time tell the late ones' time alone
+        ("hard", 59007),
+        ("hard", 66004),  # the late one was taken for frames that are lost
     ],
 )
 def test_one_of_two_performers_that_is_shown_late_is_flagged(preset, seed):
@@ -91,9 +106,50 @@ def test_the_rest_is_what_the_answer_does_not_explain():
     assert rest is not None
     places = [np.nanmean(t.xyz[..., 0], 1) > 4 for t in (rest.a, rest.b)]
     assert all(p.all() and len(p) == 40 for p in places)
-    (found,) = map(run, once_more(rest, run(rest)))
+    (found,) = map(run, once_more(rest, run(rest), answer))
     assert found.refined.status.ok and found.refined.offset == pytest.approx(-5 / FPS, abs=0.1 / FPS)
     assert elsewhere(found, answer, 2.0) and not elsewhere(answer, answer, 2.0)
+
+
+def test_of_the_rest_times_are_asked_that_its_scan_does_not_tell():
+    """Matches that are made at a time tell of it, whatever those that were made without one do."""
+    answer, a, b = two_groups(6 / FPS, 40, n=80)
+    rest = left_over(answer, Job((0, 1), a, b, None, LikelihoodScan(), SplineRefine(), None))
+    assert rest is not None
+    blind = replace(run(rest), scanned=Alignment(1.0, fps=FPS))
+    found = list(map(run, once_more(rest, blind, answer)))
+    assert any(f.refined.offset == pytest.approx(-6 / FPS, abs=0.2 / FPS) and elsewhere(f, answer, 2.0) for f in found)
+
+
+def told_of(answer: Answer, a: TrackSet, b: TrackSet, video: int, found: Break) -> tuple[list[Side], list[bool]]:
+    """What is left over beside a break of one of the videos, and whether it tells both times."""
+    sets = [mended(t, (found,)) if v == video else t for v, t in enumerate((a, b))]
+    job = Job((0, 1), *sets, None, LikelihoodScan(), SplineRefine(), None)
+    both = sides(answer, job, {video: (found,)})
+    return both, [side.tells_both(*map(run, side.tries())) for side in both]
+
+
+@pytest.mark.parametrize(("video", "late"), [(1, 8.3), (1, -8.3), (0, 8.3), (0, -8.3)])
+def test_a_late_performer_is_no_break(video, late):
+    """Before the break the first place's tracks are right, behind it the second place's: each side shows both."""
+    answer, a, b = two_groups(late / FPS, 40, n=80)
+    jump = (-late if video == 1 else late) / FPS
+    both, told = told_of(answer, a, b, video, Break(2.0, jump, still=max(-jump, 0.0)))
+    assert [side.other - side.own for side in both] == pytest.approx([-late / FPS, late / FPS])
+    assert told == [True, True]
+
+
+@pytest.mark.parametrize("lost", [7, 15])
+def test_beside_a_break_only_one_time_is_told(lost):
+    """Frames of all are lost; what is left over are strangers, who move otherwise in either video."""
+    answer, a, b = two_groups(0.0, 0, n=80)
+    _, other, _ = two_groups(1.3, 40, n=80)
+    strange = np.arange(80) >= 50
+    shown = np.where(strange[:, None, None], other.xyz[::-1] * [-1, 1, 1], b.xyz)
+    kept = np.delete(np.arange(120), np.arange(60, 60 + lost))
+    fewer = replace(b, xyz=shown[:, kept], visible=None)
+    both, told = told_of(answer, a, fewer, 1, Break(59.5 / FPS, lost / FPS))
+    assert both and not any(told)
 
 
 def test_few_tracks_that_are_left_over_are_not_asked():
