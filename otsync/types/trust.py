@@ -55,10 +55,10 @@ class Trust:
             seeds 41000-41019) none has more than 6.0; where one of two performers, or every second limb, is 8 frames
             late, wrong answers that were trusted have 9 and more.
         rate_gain: RATE_MISMATCH when another common ratio of frame rates raises the score's peak by this factor.
-        rate_sigmas: a fitted rate counts when it differs from the declared one by more than this many sigmas. Sigma is
-            careful where noise is small: clocks that run as declared differ by half a sigma, rms, and by 1.3 at most (mid
-            noise, 10 and 20 s), under hard noise by 1.1 and 2.0 (20 s; 12 each, seeds 66200-66211); those of .1 % over
-            20 s by 3.5 and more (22 worlds of mid noise).
+        rate_sigmas: a fitted rate counts when it differs from the declared one by more than this many sigmas. Clocks
+            that run as declared differ by half a sigma, rms, and by 1.3 at most (mid noise, 10 and 20 s), under hard
+            noise by 1.1 and 2.0 (20 s; 12 each, seeds 66200-66211); those of .1 % over 20 s by 3.5 and more (22 worlds
+            of mid noise).
     """
 
     evidence: float = 12.0
