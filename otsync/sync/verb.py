@@ -22,7 +22,6 @@ from ..refine.slot import Rate, Refiner, RefinerLike
 from ..refine.splines import SplineRefine
 from ..types import Alignment, Break, Matches, Offsets, Status, TrackSet
 from ..types.checks import check_whole
-from .breaks import Seen
 from .graph import Graph, Pair
 from .lags import Lag, lag_of, lagging, with_lags
 from .mending import ByMotion, doubted, mend_by_windows, mend_clocks
@@ -32,7 +31,7 @@ from .pairs import Job, Refit, run, run_refit, with_rate
 from .parts import broken_part, unvouched
 from .rematching import contested, rematching
 from .verdict import Answer, Verdict, judge
-from .witnesses import ROUNDS, elsewhere, left_over, once_more, parted, scan_only, sides
+from .witnesses import contradicted, surest
 
 
 def synchronize(
@@ -175,35 +174,20 @@ def with_witnesses_heard(
 ) -> Verdict:
     """The verdict, with pairs doubted of which a part of the scene tells another time.
 
+    What is wrong with a video is so in all its pairs: of many, those with the most evidence are asked first, and where
+    one of them is doubted the others of its videos, too.
+
     Args:
         broken: the breaks that were mended, of which each side is asked for the time of the other one.
-        rest: whether the tracks that an answer does not explain are matched once more, and asked, too; and those that
-            these leave.
+        rest: whether what an answer does not explain is asked, too.
     """
     answers = {a.pair: a for a in verdict.answers if a.finite and (a.refined.status.ok or _only_returns(a))}
     asked = [job for job in jobs if job.pair in answers and job.a.xyz is not None and job.b.xyz is not None]
-    doubted = {job.pair for job in asked if parted(answers[job.pair], job.a, job.b) > limit}
-    shared = {job.pair: Seen.by(answers[job.pair], job.a, job.b)[1] for job in asked}
-    middle = {pair: (seen.begin + seen.end) / 2 for pair, seen in shared.items()}
-    slots = {job.pair: job for job in asked}
-    whole = [(answers[job.pair], job) for job in asked if rest]
-    explained = whole
-    for _ in range(ROUNDS):
-        unexplained = [left_over(answer, job) for answer, job in explained if job.pair not in doubted]
-        others = [job for job in unexplained if job is not None]
-        if not others:
-            break
-        first = list(map(run, [scan_only(job) for job in others]))
-        told = zip(others, first, strict=True)
-        again = [job for other, answer in told for job in once_more(other, answer, answers[other.pair])]
-        found = list(map(run, again)) if again else []
-        doubted |= {a.pair for a in found if elsewhere(a, answers[a.pair], middle[a.pair])}
-        # what the rest has at the answer's own time leaves a rest, too, which is matched without a time once more
-        both = zip(found, again, strict=True)
-        explained = list({a.pair: (a, slots[a.pair].on(job)) for a, job in both if a.refined.status.ok}.values())
-    asked_sides = [(job.pair, side) for a, job in whole for side in sides(a, job, broken) if job.pair not in doubted]
-    told_sides = iter(list(map(run, [again for _, side in asked_sides for again in side.tries()])))
-    doubted |= {pair for pair, side in asked_sides if side.tells_both(next(told_sides), next(told_sides))}
+    first = surest(answers, asked)
+    doubted = contradicted(answers, first, broken, rest, limit, map)
+    videos = {v for pair in doubted for v in pair}
+    more = [job for job in asked if job not in first and videos & set(job.pair)]
+    doubted |= contradicted(answers, more, broken, rest, limit, map)
     if not doubted:
         return verdict
     return judged([lagging(a) if a.pair in doubted else a for a in verdict.answers])

@@ -14,25 +14,32 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from ..clocks.common import readable, strongest, thinned
+from ..compute.threads import MapLike
 from ..refine.common_motion import common_motion
 from ..refine.gauss_newton import fit_clock, neighbours
 from ..refine.slot import Refiner
 from ..refine.splines import SplineRefine
 from ..refine.unrefined import Unrefined
 from ..types import Alignment, Break, Clock, Matches, Status, TrackSet
-from .pairs import Job
+from .breaks import Seen
+from .graph import Pair
+from .pairs import Job, run
 from .rematching import at_each, evidence_of
 from .verdict import Answer
 from .windows import EVERY, NEAR, Windows, within
 
 GROUPS, FEWEST = 6, 5
 """Neighbourhoods that are asked, and matches of one at least."""
+
+OF_EACH = 3
+"""Pairs of every video that are asked first: all, of up to four videos. Of many, all would take as long as the rest."""
 
 TOLD_BY = 1.5
 """Neighbourhoods of equal information that one must fall into by itself: fewer matches agree with themselves."""
@@ -80,6 +87,58 @@ answer was the late performer's for all the clip (50005, 59007) the other's time
 
 BEARABLE = frozenset({Status.NO_MATCH, Status.AMBIGUOUS, Status.SPREAD, *PARTLY})
 """Doubts that a side's rest may leave: it is short."""
+
+
+def surest(answers: Mapping[Pair, Answer], jobs: Sequence[Job]) -> list[Job]:
+    """The work on the :data:`OF_EACH` pairs of every video that have the most evidence."""
+    best = sorted(jobs, key=lambda job: -evidence_of(answers[job.pair]))
+    left = Counter[int]()
+    chosen = set()
+    for job in best:
+        if any(left[v] < OF_EACH for v in job.pair):
+            chosen.add(job.pair)
+            left.update(job.pair)
+    return [job for job in jobs if job.pair in chosen]
+
+
+def contradicted(
+    answers: Mapping[Pair, Answer],
+    jobs: Sequence[Job],
+    broken: Mapping[int, tuple[Break, ...]],
+    rest: bool,
+    limit: float,
+    map: MapLike,
+) -> set[Pair]:
+    """The pairs of ``jobs`` of which a part of the scene tells another time than their answer.
+
+    Args:
+        broken: the breaks that were mended, of which each side is asked for the time of the other one.
+        rest: whether the tracks that an answer does not explain are matched once more, and asked, too; and those that
+            these leave. limit: of :func:`parted`.
+    """
+    doubted = {job.pair for job in jobs if parted(answers[job.pair], job.a, job.b) > limit}
+    if not rest:
+        return doubted
+    shared = {job.pair: Seen.by(answers[job.pair], job.a, job.b)[1] for job in jobs}
+    middle = {pair: (seen.begin + seen.end) / 2 for pair, seen in shared.items()}
+    slots = {job.pair: job for job in jobs}
+    explained = [(answers[job.pair], job) for job in jobs]
+    for _ in range(ROUNDS):
+        unexplained = [left_over(answer, job) for answer, job in explained if job.pair not in doubted]
+        others = [job for job in unexplained if job is not None]
+        if not others:
+            break
+        first = list(map(run, [scan_only(job) for job in others]))
+        told = zip(others, first, strict=True)
+        again = [job for other, answer in told for job in once_more(other, answer, answers[other.pair])]
+        found = list(map(run, again)) if again else []
+        doubted |= {a.pair for a in found if elsewhere(a, answers[a.pair], middle[a.pair])}
+        # what the rest has at the answer's own time leaves a rest, too, which is matched without a time once more
+        both = zip(found, again, strict=True)
+        explained = list({a.pair: (a, slots[a.pair].on(job)) for a, job in both if a.refined.status.ok}.values())
+    beside = [side for job in jobs if job.pair not in doubted for side in sides(answers[job.pair], job, broken)]
+    tried = iter(list(map(run, [again for side in beside for again in side.tries()])))
+    return doubted | {side.rest.pair for side in beside if side.tells_both(next(tried), next(tried))}
 
 
 def parted(answer: Answer, a: TrackSet, b: TrackSet) -> float:

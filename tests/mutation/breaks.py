@@ -200,6 +200,14 @@ BREAKS = (
         "what the answer explains is asked once more, instead of what it leaves over",
     ),
     Break(
+        "pairs-of-the-sure-alone",
+        "otsync/sync/witnesses.py",
+        "if any(left[v] < OF_EACH for v in job.pair):",
+        "if all(left[v] < OF_EACH for v in job.pair):",
+        ("tests/otsync/sync/test_witnesses.py",),
+        "of many videos some are asked in none of their surest pairs",
+    ),
+    Break(
         "sides-alike",
         "otsync/sync/witnesses.py",
         "((ends[k], at, jump), (at, ends[k + 2], -jump))",

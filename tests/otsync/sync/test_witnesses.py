@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from importlib import import_module
+from itertools import combinations
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,6 +21,7 @@ from otsync.sync.pairs import Job, run
 from otsync.sync.verdict import Answer
 from otsync.sync.witnesses import (
     FEWEST,
+    OF_EACH,
     REST,
     Side,
     WhereSound,
@@ -27,6 +31,7 @@ from otsync.sync.witnesses import (
     once_more,
     parted,
     sides,
+    surest,
 )
 from otsync.types import Alignment, Break, Status
 
@@ -150,6 +155,45 @@ def test_beside_a_break_only_one_time_is_told(lost):
     fewer = replace(b, xyz=shown[:, kept], visible=None)
     both, told = told_of(answer, a, fewer, 1, Break(59.5 / FPS, lost / FPS))
     assert both and not any(told)
+
+
+def network(n: int, seed: int = 0) -> tuple[dict[tuple[int, int], Answer], list[Job]]:
+    """Every pair of n videos, with evidence by chance."""
+    rng = np.random.default_rng(seed)
+    _, a, b = two_groups(0.0, 0, n=12)
+    answers, jobs = {}, []
+    for pair in combinations(range(n), 2):
+        found = Alignment(0.0, sigma=0.001, fps=FPS, stats={"evidence": float(rng.uniform(10, 90))})
+        answers[pair] = Answer(pair, Matches(np.zeros((10, 2), int), np.ones(10)), found, found)
+        jobs.append(Job(pair, a, b, None, LikelihoodScan(), SplineRefine(), None))
+    return answers, jobs
+
+
+@pytest.mark.parametrize("n", [2, 3, 4, 5, 9, 14])
+def test_of_many_videos_each_is_asked_in_its_surest_pairs(n):
+    answers, jobs = network(n)
+    chosen = [job.pair for job in surest(answers, jobs)]
+    for v in range(n):
+        own = sorted((p for p in answers if v in p), key=lambda p: -answers[p].refined.stats["evidence"])
+        assert set(own[:OF_EACH]) <= set(chosen)
+    assert len(chosen) <= OF_EACH * n and (n > OF_EACH + 1 or len(chosen) == len(jobs))
+
+
+def test_where_a_pair_is_doubted_all_pairs_of_its_videos_are_asked(monkeypatch):
+    answers, jobs = network(9)
+    asked: list[tuple[int, int]] = []
+
+    def contradicted(answers, jobs, *rest):
+        asked.extend(job.pair for job in jobs)
+        return {job.pair for job in jobs if 5 in job.pair}
+
+    verb = import_module("otsync.sync.verb")
+    monkeypatch.setattr(verb, "contradicted", contradicted)
+    verdict = SimpleNamespace(answers=tuple(answers.values()))
+    judged = verb.with_witnesses_heard(verdict, jobs, {}, True, 7.0, lambda told: told, map)
+    doubted = {a.pair for a in judged if Status.LAGGING in a.refined.flags}
+    assert doubted == {p for p in answers if 5 in p}
+    assert len(asked) == len(set(asked)) < len(answers)
 
 
 def test_few_tracks_that_are_left_over_are_not_asked():
