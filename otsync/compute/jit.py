@@ -46,6 +46,15 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     return compile_lazily
 
 
+def inlined(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """:func:`kernel` for what other kernels call, inlined by force.
+
+    Otherwise the process that compiles it calls the helper that stands alone, and later ones, which load their caller
+    from disk, the caller's own copy of it. The two may round otherwise, and a first run would not be like those after.
+    """
+    return kernel(forceinline=True, **options)
+
+
 def _untorn(dispatcher: Any) -> Any:
     """The kernel, whose compilation no interrupt tears: LLVM's lock would stay closed, and other threads wait for it
     without end.

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import math
 
-from .jit import kernel
+from .jit import inlined
 
 LEAST_NORM = 1e-12  # below it a quaternion is no direction any more: divided by this instead, it stays finite
 
-inline = kernel(fastmath={"contract", "nsz"})
+inline = inlined(fastmath={"contract", "nsz"})
 
 
 @inline

@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from ..compute import simd
-from ..compute.jit import kernel
+from ..compute.jit import inlined, kernel
 from ..compute.simd import LANES, counting_from, load, magnitude, maximum, select, square_root, store, total
 
 SIDE = 8
@@ -28,7 +28,7 @@ share the same few places of the fastest cache."""
 PLANES = 18
 """Planes that :func:`refine` works in."""
 
-inline = kernel(fastmath={"contract", "nsz"})
+inline = inlined(fastmath={"contract", "nsz"})
 
 ONE, ZERO, HALF = np.float32(1), np.float32(0), np.float32(0.5)
 PATCH = np.float32(SIDE * SIDE)

@@ -128,9 +128,8 @@ def contradicted(
         others = [job for job in unexplained if job is not None]
         if not others:
             break
-        first = list(map(run, [scan_only(job) for job in others]))
-        told = zip(others, first, strict=True)
-        again = [job for other, answer in told for job in once_more(other, answer, answers[other.pair])]
+        times = map(times_to_ask, [(job, answers[job.pair]) for job in others])
+        again = [job for other, t in zip(others, times, strict=True) for job in at_each(fitted_where_sound(other), t)]
         found = list(map(run, again)) if again else []
         doubted |= {a.pair for a in found if elsewhere(a, answers[a.pair], middle[a.pair])}
         # what the rest has at the answer's own time leaves a rest, too, which is matched without a time once more
@@ -188,24 +187,24 @@ def left_over(answer: Answer, job: Job) -> Job | None:
     return dataclasses.replace(job, a=thinned(a).take(rest[0]), b=thinned(b).take(rest[1]))
 
 
-def scan_only(job: Job) -> Job:
-    """The work without the fit: the times that compete are known before it."""
-    return dataclasses.replace(job, refiner=Unrefined())
+def times_to_ask(task: tuple[Job, Answer]) -> list[float]:
+    """Offsets, s, at which what is left over of a pair's answer may have been seen.
 
-
-def once_more(job: Job, first: Answer, answer: Answer) -> list[Job]:
-    """The work on a pair whose scan is known: matched once more, at each of the times that compete for it; fitted where
-    that may say something.
-
-    The scan's are of matches that were made without a time: of a performer who is few they tell nothing under noise.
-    So those are asked, too, at which matches that are made there have :data:`AS_MUCH` of the evidence that they have at
-    the ``answer``'s own time.
+    Those that compete in its scan, of matches that were made without a time; and since these tell nothing under noise
+    of a performer who is few, those at which matches that are made there have :data:`AS_MUCH` of the evidence that
+    they have at the answer's own time.
     """
+    job, answer = task
+    scan = run(dataclasses.replace(job, refiner=Unrefined()))
+    scanned = competing(scan.scanned) if scan.finite else []
     clock = Clock(answer.refined.offset, answer.refined.rate)
-    scanned = competing(first.scanned) if first.finite else []
     beside = [clock.offset + late for late in Windows.of(job, clock, whole=True).rivals(AS_MUCH)]
-    fresh = [t for t in beside if all(abs(t - other) > NEAR * EVERY for other in scanned)]
-    return at_each(dataclasses.replace(job, refiner=WhereSound(job.refiner)), [*scanned, *fresh])
+    return [*scanned, *(t for t in beside if all(abs(t - other) > NEAR * EVERY for other in scanned))]
+
+
+def fitted_where_sound(job: Job) -> Job:
+    """The work, without fits that can say nothing."""
+    return dataclasses.replace(job, refiner=WhereSound(job.refiner))
 
 
 @dataclass(frozen=True)

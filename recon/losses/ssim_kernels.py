@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from otsync.compute import simd
-from otsync.compute.jit import kernel
+from otsync.compute.jit import inlined, kernel
 from otsync.compute.simd import LANES
 from recon.losses.window import C1, C2
 
@@ -21,9 +21,7 @@ MOMENTS = 5  # blurred x, y, x^2, y^2, x y
 SLOPES = 3  # derivatives of SSIM with respect to the blurred x, x^2 and x y
 
 _fast = kernel(fastmath={"contract", "reassoc", "arcp", "nsz"})
-# inlined by force: a function of its own is bound to its lone twin in the process that compiles it and to the sweep's
-# copy in those that load it, and the two need not round alike
-_inline = kernel(fastmath={"contract", "reassoc", "arcp", "nsz"}, forceinline=True)
+_inline = inlined(fastmath={"contract", "reassoc", "arcp", "nsz"})
 
 
 @_inline

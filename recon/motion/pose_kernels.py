@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from otsync.compute.jit import kernel
+from otsync.compute.jit import inlined
 from otsync.compute.quaternions import unit, unit_backward
 
 F64 = np.float64
 WINDOW = 4
 
-inline = kernel(fastmath={"contract", "nsz"})
+inline = inlined(fastmath={"contract", "nsz"})
 
 
 @inline

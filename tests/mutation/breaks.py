@@ -226,8 +226,8 @@ BREAKS = (
     Break(
         "rest-of-its-scan-alone",
         "otsync/sync/witnesses.py",
-        "[*scanned, *fresh])",
-        "scanned)",
+        "return [*scanned, *(t for t",
+        "return scanned or [*scanned, *(t for t",
         ("tests/otsync/sync/test_witnesses.py",),
         "a performer who is few among what is left over is not heard under noise",
     ),

@@ -18,6 +18,7 @@ from otsync.refine.splines import SplineRefine
 from otsync.simulate.effects import In, PartLate
 from otsync.sync.breaks import mended
 from otsync.sync.pairs import Job, run
+from otsync.sync.rematching import at_each
 from otsync.sync.verdict import Answer
 from otsync.sync.witnesses import (
     FEWEST,
@@ -27,11 +28,12 @@ from otsync.sync.witnesses import (
     WhereSound,
     competing,
     elsewhere,
+    fitted_where_sound,
     left_over,
-    once_more,
     parted,
     sides,
     surest,
+    times_to_ask,
 )
 from otsync.types import Alignment, Break, Status
 
@@ -111,19 +113,22 @@ def test_the_rest_is_what_the_answer_does_not_explain():
     assert rest is not None
     places = [np.nanmean(t.xyz[..., 0], 1) > 4 for t in (rest.a, rest.b)]
     assert all(p.all() and len(p) == 40 for p in places)
-    (found,) = map(run, once_more(rest, run(rest), answer))
+    (time,) = times_to_ask((rest, answer))
+    (found,) = map(run, at_each(fitted_where_sound(rest), [time]))
     assert found.refined.status.ok and found.refined.offset == pytest.approx(-5 / FPS, abs=0.1 / FPS)
     assert elsewhere(found, answer, 2.0) and not elsewhere(answer, answer, 2.0)
 
 
-def test_of_the_rest_times_are_asked_that_its_scan_does_not_tell():
+def test_of_the_rest_times_are_asked_that_its_scan_does_not_tell(monkeypatch):
     """Matches that are made at a time tell of it, whatever those that were made without one do."""
     answer, a, b = two_groups(6 / FPS, 40, n=80)
     rest = left_over(answer, Job((0, 1), a, b, None, LikelihoodScan(), SplineRefine(), None))
     assert rest is not None
-    blind = replace(run(rest), scanned=Alignment(1.0, fps=FPS))
-    found = list(map(run, once_more(rest, blind, answer)))
-    assert any(f.refined.offset == pytest.approx(-6 / FPS, abs=0.2 / FPS) and elsewhere(f, answer, 2.0) for f in found)
+    monkeypatch.setattr("otsync.sync.witnesses.competing", lambda scan: [1.0])
+    first, second = times_to_ask((rest, answer))
+    assert first == 1.0 and second == pytest.approx(-6 / FPS)
+    (found,) = map(run, at_each(fitted_where_sound(rest), [second]))
+    assert found.refined.offset == pytest.approx(-6 / FPS, abs=0.2 / FPS) and elsewhere(found, answer, 2.0)
 
 
 def told_of(answer: Answer, a: TrackSet, b: TrackSet, video: int, found: Break) -> tuple[list[Side], list[bool]]:
