@@ -128,16 +128,24 @@ def contradicted(
         others = [job for job in unexplained if job is not None]
         if not others:
             break
-        times = map(times_to_ask, [(job, answers[job.pair]) for job in others])
-        again = [job for other, t in zip(others, times, strict=True) for job in at_each(fitted_where_sound(other), t)]
-        found = list(map(run, again)) if again else []
+        again, found = other_answers(others, answers, map)
         doubted |= {a.pair for a in found if elsewhere(a, answers[a.pair], middle[a.pair])}
         # what the rest has at the answer's own time leaves a rest, too, which is matched without a time once more
         both = zip(found, again, strict=True)
         explained = list({a.pair: (a, slots[a.pair].on(job)) for a, job in both if a.refined.status.ok}.values())
     beside = [side for job in jobs if job.pair not in doubted for side in sides(answers[job.pair], job, broken)]
     tried = iter(list(map(run, [again for side in beside for again in side.tries()])))
-    return doubted | {side.rest.pair for side in beside if side.tells_both(next(tried), next(tried))}
+    doubted |= {side.rest.pair for side in beside if side.tells_both(next(tried), next(tried))}
+    unsaid = [side.rest for side in beside if side.rest.pair not in doubted]
+    _, found = other_answers(unsaid, answers, map)
+    return doubted | {a.pair for a in found if elsewhere(a, answers[a.pair], middle[a.pair])}
+
+
+def other_answers(rests: Sequence[Job], answers: Mapping[Pair, Answer], map: MapLike) -> tuple[list[Job], list[Answer]]:
+    """The work on what is left over, at every time that may have been seen there, and its answers."""
+    times = map(times_to_ask, [(job, answers[job.pair]) for job in rests]) if rests else ()
+    again = [job for rest, t in zip(rests, times, strict=True) for job in at_each(fitted_where_sound(rest), t)]
+    return again, list(map(run, again)) if again else []
 
 
 def parted(answer: Answer, a: TrackSet, b: TrackSet) -> float:

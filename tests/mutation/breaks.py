@@ -216,6 +216,14 @@ BREAKS = (
         "behind a break the wrong one of two other times is asked",
     ),
     Break(
+        "sides-asked-one-time",
+        "otsync/sync/witnesses.py",
+        "unsaid = [side.rest for side in beside if side.rest.pair not in doubted]",
+        "unsaid = []",
+        ("tests/otsync/sync/test_witnesses.py",),
+        "beside a break only the time of its other side is asked",
+    ),
+    Break(
         "sides-of-strangers",
         "otsync/sync/witnesses.py",
         "stays and sure and placed and evidence_of(other) >= AS_MUCH * evidence_of(own)",

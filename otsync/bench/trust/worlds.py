@@ -245,6 +245,9 @@ CLASSES: dict[str, Callable[[int], World]] = {
     "one of two late, hard": partial(
         plain, preset="hard", classes=("basketball", "football"), first=(In(1, PartLate()),)
     ),
+    "one of two late, frames lost": partial(
+        plain, classes=("basketball", "football"), first=(In(1, PartLate()), In(1, Drop(8 / 30)))
+    ),
     "exact loop": partial(plain, motion="loop"),
     "strides": partial(plain, motion="strides"),
     "strides, hard": partial(plain, motion="strides", preset="hard"),

@@ -12,7 +12,7 @@ import pytest
 
 from otsync import Matches, TrackSet, synchronize
 from otsync.align.likelihood import LikelihoodScan
-from otsync.bench.trust.worlds import plain
+from otsync.bench.trust.worlds import CLASSES, plain
 from otsync.refine.slot import Refiner
 from otsync.refine.splines import SplineRefine
 from otsync.simulate.effects import In, PartLate
@@ -59,6 +59,13 @@ def test_one_of_two_performers_that_is_shown_late_is_flagged(preset, seed):
     """Trusted before, 8 frames off at sigma .03 to .2."""
     late = (In(1, PartLate(8 / FPS)),)
     found = synchronize(plain(seed, preset=preset, classes=("basketball", "football"), first=late).tracks)
+    assert Status.LAGGING in found.flags[1]
+
+
+@pytest.mark.parametrize("seed", [68105, 68107])
+def test_one_that_is_as_late_as_frames_are_lost_is_flagged(seed):
+    """Twice the frames seemed lost: before the break the late one was followed, behind it the other; 8 frames off."""
+    found = synchronize(CLASSES["one of two late, frames lost"](seed).tracks)
     assert Status.LAGGING in found.flags[1]
 
 
