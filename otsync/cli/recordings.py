@@ -162,7 +162,7 @@ class RecordingOptions(PriorOptions):
     """Which tracks are kept: count, min_life (frames at 30 fps), extent and apart (pixels at 640 of width), enough
     (tracks, below which the limits are lowered)."""
     workers: int = 0
-    """Threads; 0: one per core."""
+    """Threads, and processes that many pairs are spread over; 0: one per core."""
 
     def stages(self) -> Stages:
         """The objects of every stage. ValueError names a prior that there is not."""
@@ -236,6 +236,7 @@ def sync_recording(
             reference=chosen,
             cache=Cache(options.cache or out / "stages"),
             map=pool.map,
+            processes=threads,
             tell=tell,
         )
     if known is not None:

@@ -6,6 +6,7 @@ import json
 import logging
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,18 +23,30 @@ log = logging.getLogger("otsync")
 MADE_BY = 8
 """Raised when the same pair gets another answer, or more of one, than before: what was kept is then made anew."""
 
+MANY = 12
+"""Pairs of which processes are worth the seconds in which they begin: of six videos and more."""
+
 
 @dataclass(frozen=True)
 class KeptPairs:
     """``map`` for :func:`otsync.synchronize` that looks in ``cache`` before it computes a pair.
 
     The key is the content of both track sets and the algorithms with their parameters. Other work passes through.
+
+    Args:
+        map: any map-like callable, of threads. call: makes a call where it may take another process
+            (:class:`~otsync.compute.processes.Processes`), if there are :data:`MANY` items.
     """
 
     cache: Cache
     map: MapLike = map
+    call: Callable[[Callable[[Any], Any], Any], Any] | None = None
 
     def __call__(self, function: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
+        items = list(items)
+        if self.call is not None and len(items) >= MANY:
+            function = partial(self.call, function)
+
         def kept(item: Any) -> Any:
             given = isinstance(item, Job) and item.matches is not None
             if self.cache.root is None or not isinstance(item, Job | OwnJob) or given:

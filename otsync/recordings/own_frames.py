@@ -15,6 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ..clocks.shutter import check_within_a_frame
+from ..compute.processes import Processes
 from ..compute.threads import MapLike
 from ..files.cache import Cache
 from ..files.strict import checked
@@ -61,6 +62,7 @@ def synchronize_own_scene(
     solver: OwnFrames | None = None,
     cache: Cache | None = None,
     map: MapLike = map,
+    processes: int = 1,
     tell: Tell = lambda text: None,
 ) -> Synchronized:
     """Clocks and frames of the videos of a scene, from tracks that are lifted in each camera's own frame.
@@ -89,8 +91,8 @@ def synchronize_own_scene(
         raw = track_all(scene, stages, cache, map, tell)
     with progress.stage("lift"):
         lifted = [replace(t, frame=t.name) for t in lift_given(scene, raw, stages, cache, map)]
-    with progress.stage("synchronise"):
-        kept = KeptPairs(cache, map)
+    with progress.stage("synchronise"), Processes(processes) as call:
+        kept = KeptPairs(cache, map, call)
         offsets = synchronize(lifted, reference=reference, method=method, frames=solver or "own", map=kept)
     why = ["route own frames: as asked; depth is given, poses are not used across videos"]
     if method is not None and method.slots():

@@ -26,6 +26,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ..clocks.shutter import check_within_a_frame
+from ..compute.processes import Processes
 from ..compute.threads import MapLike
 from ..files.cache import Cache
 from ..files.digest import content_key, sequence_key
@@ -77,6 +78,7 @@ def synchronize_scene(
     stages: Stages | None = None,
     cache: Cache | None = None,
     map: MapLike = map,
+    processes: int = 1,
     tell: Tell = lambda text: None,
     deadline: Deadline | None = None,
 ) -> Synchronized:
@@ -92,6 +94,8 @@ def synchronize_scene(
             read it.
         cache: where stages are kept; a run that was killed continues from what is there, with the same result.
         map: any map-like callable; two threads use two cores.
+        processes: that many pairs are spread over (threads of it wait for each other); with 1 on the map's threads
+            alone. Programs that use more need Python's usual ``if __name__ == "__main__"``.
         tell: receives one line per stage.
         deadline: of the job that this is a part of: stereo is left out where it would take more than its share.
     """
@@ -115,12 +119,13 @@ def synchronize_scene(
         with progress.stage("lift"):
             lifted = lift_given(scene, raw, stages, cache, map)
         with progress.stage("synchronise"):
-            offsets = with_doubts(pairs_in_space(lifted, reference, stages, cache, map), scene.doubtful)
+            offsets = pairs_in_space(lifted, reference, stages, cache, map, processes)
+            offsets = with_doubts(offsets, scene.doubtful)
         return Synchronized(without_times(offsets), tuple(lifted), chosen, why, None, progress.seconds)
     with progress.stage("tracks"):
         flat = track_all(scene, stages, cache, map, tell, lambda video, one: select(video, one, stages, scene.frame))
     with progress.stage("epipolar"):
-        first = without_times(pairs_in_pixels(flat, reference, stages, cache, map))
+        first = without_times(pairs_in_pixels(flat, reference, stages, cache, map, processes))
         astray = misplaced(first) | set(scene.doubtful)
         first = with_doubts(first, astray)
     epipolar = Synchronized(first, tuple(flat), "epipolar", why, None, progress.seconds)
@@ -150,7 +155,8 @@ def synchronize_scene(
         tell(doubt)
         return replace(epipolar, why=(*why, doubt))
     with progress.stage("synchronise"):
-        offsets = with_doubts(without_times(pairs_in_space(lifted, reference, stages, cache, map)), astray)
+        offsets = pairs_in_space(lifted, reference, stages, cache, map, processes)
+        offsets = with_doubts(without_times(offsets), astray)
     if not named and (doubt := _less_sure(offsets, first)):
         tell(doubt)
         return replace(epipolar, why=(*why, doubt))
@@ -287,9 +293,11 @@ def pairs_in_pixels(
     stages: Stages,
     cache: Cache,
     map: MapLike = map,
+    processes: int = 1,
 ) -> Offsets:
     """The depth-free answer: transport on features, epipolar scan and fit of every pair, then the graph."""
-    return synchronize(tracks, reference=reference, method=stages.pixels, map=KeptPairs(cache, map))
+    with Processes(processes) as call:
+        return synchronize(tracks, reference=reference, method=stages.pixels, map=KeptPairs(cache, map, call))
 
 
 def pairs_in_space(
@@ -298,9 +306,11 @@ def pairs_in_space(
     stages: Stages,
     cache: Cache,
     map: MapLike = map,
+    processes: int = 1,
 ) -> Offsets:
     """The answer from lifted tracks: transport, likelihood scan, spline fit, matched again, then the graph."""
-    return synchronize(tracks, reference=reference, method=stages.space, map=KeptPairs(cache, map))
+    with Processes(processes) as call:
+        return synchronize(tracks, reference=reference, method=stages.space, map=KeptPairs(cache, map, call))
 
 
 def lift_given(

@@ -120,17 +120,18 @@ def contradicted(
     Args:
         broken: the breaks that were mended, of which each side is asked for the time of the other one.
         rest: whether the tracks that an answer does not explain are matched once more, and asked, too; and those that
-            these leave. limit: of :func:`parted`.
+            these leave. limit: of what :func:`parted` tells.
     """
-    doubted = {job.pair for job in jobs if parted(answers[job.pair], job.a, job.b) > limit}
+    own = [(answers[job.pair], job) for job in jobs]
+    doubted = {job.pair for job, off in zip(jobs, map(parted, own), strict=True) if off > limit}
     if not rest:
         return doubted
     shared = {job.pair: Seen.by(answers[job.pair], job.a, job.b)[1] for job in jobs}
     middle = {pair: (seen.begin + seen.end) / 2 for pair, seen in shared.items()}
     slots = {job.pair: job for job in jobs}
-    explained = [(answers[job.pair], job) for job in jobs]
+    explained = own
     for _ in range(ROUNDS):
-        unexplained = [left_over(answer, job) for answer, job in explained if job.pair not in doubted]
+        unexplained = map(left_over, [(answer, job) for answer, job in explained if job.pair not in doubted])
         others = [job for job in unexplained if job is not None]
         if not others:
             break
@@ -139,7 +140,8 @@ def contradicted(
         # what the rest has at the answer's own time leaves a rest, too, which is matched without a time once more
         both = zip(found, again, strict=True)
         explained = list({a.pair: (a, slots[a.pair].on(job)) for a, job in both if a.refined.status.ok}.values())
-    beside = [side for job in jobs if job.pair not in doubted for side in sides(answers[job.pair], job, broken)]
+    undoubted = [job for job in jobs if job.pair not in doubted]
+    beside = [side for job in undoubted for side in sides(answers[job.pair], job, broken)]
     tried = iter(list(map(run, [again for side in beside for again in side.tries()])))
     doubted |= {side.rest.pair for side in beside if side.tells_both(next(tried), next(tried))}
     unsaid = [side.rest for side in beside if side.rest.pair not in doubted]
@@ -155,8 +157,10 @@ def other_answers(rests: Sequence[Job], answers: Mapping[Pair, Answer], map: Map
     return again, list(map(run, again)) if again else []
 
 
-def parted(answer: Answer, a: TrackSet, b: TrackSet) -> float:
+def parted(task: tuple[Answer, Job]) -> float:
     """How far the neighbourhood that contradicts a pair's answer most is from it, in units of how well it is known."""
+    answer, job = task
+    a, b = job.a, job.b
     refiner = SplineRefine()
     matches = strongest(answer.matches, readable(refiner.limit, a, b))
     first, second = refiner.splines(a, b, matches)
@@ -182,8 +186,9 @@ def parted(answer: Answer, a: TrackSet, b: TrackSet) -> float:
     return worst
 
 
-def left_over(answer: Answer, job: Job) -> Job | None:
+def left_over(task: tuple[Answer, Job]) -> Job | None:
     """The work on the tracks that a pair's answer does not explain; None where these are few, or in no common frame."""
+    answer, job = task
     a, b = job.a, job.b
     if a.xyz is None or b.xyz is None or a.frame is None or a.frame != b.frame:
         return None
@@ -299,7 +304,7 @@ def sides(answer: Answer, job: Job, broken: Mapping[int, tuple[Break, ...]]) -> 
         for k, (at, jump) in enumerate(moments):
             for begin, end, more in ((ends[k], at, jump), (at, ends[k + 2], -jump)):
                 a, b = within(job.a, begin, end), within(job.b, clock.own(begin), clock.own(end))
-                rest = left_over(answer, dataclasses.replace(job, a=a, b=b))
+                rest = left_over((answer, dataclasses.replace(job, a=a, b=b)))
                 if rest is not None:
                     found.append(Side(rest, clock.offset, clock.offset + more))
     return found

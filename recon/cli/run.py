@@ -124,6 +124,7 @@ class Run:
                 reference=reference,
                 cache=cache,
                 map=pool.map,
+                processes=threads,
                 tell=tell,
                 deadline=deadline,
             )

@@ -96,27 +96,31 @@ def two_groups(late: float, share: int, n: int = 24) -> tuple[Answer, TrackSet, 
     return Answer((0, 1), matches, answer, answer), a, b
 
 
+def off(answer, a, b):
+    return parted((answer, Job(answer.pair, a, b, None, LikelihoodScan(), SplineRefine(), None)))
+
+
 def test_a_neighbourhood_is_measured_by_itself():
-    assert parted(*two_groups(0.0, 12)) < 1
-    assert parted(*two_groups(5 / FPS, 12)) > 7
+    assert off(*two_groups(0.0, 12)) < 1
+    assert off(*two_groups(5 / FPS, 12)) > 7
 
 
 def test_exchanging_the_videos_changes_nothing():
     answer, a, b = two_groups(5 / FPS, 12)
-    assert parted(answer, b, a) == pytest.approx(parted(answer, a, b), rel=0.02)
+    assert off(answer, b, a) == pytest.approx(off(answer, a, b), rel=0.02)
 
 
 def test_too_few_matches_are_no_witnesses():
     answer, a, b = two_groups(5 / FPS, 12)
     few = answer.matches.pairs[: 12 + FEWEST - 1]
     fewer = replace(answer, matches=Matches(few, np.ones(len(few))))
-    assert parted(fewer, a, b) < 1
+    assert off(fewer, a, b) < 1
 
 
 def test_the_rest_is_what_the_answer_does_not_explain():
     """The second place's tracks come late: the answer of the first place leaves them over, all and no others."""
     answer, a, b = two_groups(5 / FPS, 40, n=80)
-    rest = left_over(answer, Job((0, 1), a, b, None, LikelihoodScan(), SplineRefine(), None))
+    rest = left_over((answer, Job((0, 1), a, b, None, LikelihoodScan(), SplineRefine(), None)))
     assert rest is not None
     places = [np.nanmean(t.xyz[..., 0], 1) > 4 for t in (rest.a, rest.b)]
     assert all(p.all() and len(p) == 40 for p in places)
@@ -129,7 +133,7 @@ def test_the_rest_is_what_the_answer_does_not_explain():
 def test_of_the_rest_times_are_asked_that_its_scan_does_not_tell(monkeypatch):
     """Matches that are made at a time tell of it, whatever those that were made without one do."""
     answer, a, b = two_groups(6 / FPS, 40, n=80)
-    rest = left_over(answer, Job((0, 1), a, b, None, LikelihoodScan(), SplineRefine(), None))
+    rest = left_over((answer, Job((0, 1), a, b, None, LikelihoodScan(), SplineRefine(), None)))
     assert rest is not None
     monkeypatch.setattr("otsync.sync.witnesses.competing", lambda scan: [1.0])
     first, second = times_to_ask((rest, answer))
@@ -211,8 +215,8 @@ def test_where_a_pair_is_doubted_all_pairs_of_its_videos_are_asked(monkeypatch):
 def test_few_tracks_that_are_left_over_are_not_asked():
     answer, a, b = two_groups(5 / FPS, REST - 1)
     job = Job((0, 1), a, b, None, LikelihoodScan(), SplineRefine(), None)
-    assert left_over(answer, job) is None
-    assert left_over(two_groups(0.0, 12)[0], job) is None
+    assert left_over((answer, job)) is None
+    assert left_over((two_groups(0.0, 12)[0], job)) is None
 
 
 def test_an_answer_of_the_rest_counts_where_it_is_sound_and_another_one():

@@ -1,0 +1,123 @@
+"""Processes that work on Python objects is spread over, where threads would wait for each other's interpreter."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from types import TracebackType
+from typing import TypeVar
+
+from .threads import get_threads, set_threads
+
+log = logging.getLogger("otsync")
+
+Item = TypeVar("Item")
+Answer = TypeVar("Answer")
+
+
+class Processes:
+    """Calls of functions in other processes, from threads that wait for the answers.
+
+    They begin with the first call, which takes some seconds, and end with the block. Answers are those of this process,
+    to the last bit. Where the system gives no processes, or ends one, the work is done in this one.
+
+    Functions and items must be picklable, as those of ``synchronize`` are.
+
+    Args:
+        workers: processes; 1: calls are made in this one.
+    """
+
+    def __init__(self, workers: int) -> None:
+        if workers < 1:
+            raise ValueError(f"workers: expected at least one process; found {workers}.")
+        self.workers = workers
+        self._pool: ProcessPoolExecutor | None = None
+        self._lock = threading.Lock()
+
+    def __enter__(self) -> Processes:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with self._lock:
+            pool, self._pool, self.workers = self._pool, None, 1
+        if pool is not None:
+            pool.shutdown(cancel_futures=True)
+
+    def __call__(self, function: Callable[[Item], Answer], item: Item) -> Answer:
+        """``function(item)``, whose exceptions are raised here."""
+        pool = self._begun()
+        if pool is None:
+            return function(item)
+        try:
+            with _interrupts_kept_from_children():
+                asked = pool.submit(function, item)
+            return asked.result()
+        except BrokenProcessPool as error:
+            self._forget(pool, error)
+        except RuntimeError:
+            if self._pool is pool:
+                raise
+            # another thread saw first that a process has ended, and the pool takes nothing any more
+        return function(item)
+
+    def _begun(self) -> ProcessPoolExecutor | None:
+        with self._lock:
+            if self._pool is None and self.workers > 1:
+                from multiprocessing import get_context
+
+                own = max(1, get_threads() // self.workers)
+                try:
+                    context = get_context("spawn")  # forks of a process with threads may wait for ever
+                    self._pool = ProcessPoolExecutor(
+                        self.workers, mp_context=context, initializer=_begin, initargs=(own,)
+                    )
+                except (OSError, ImportError, NotImplementedError) as error:  # no semaphores, no memory
+                    self.workers = 1
+                    log.info("pairs are compared in one process: %s", error)
+            return self._pool
+
+    def _forget(self, pool: ProcessPoolExecutor, error: Exception) -> None:
+        with self._lock:
+            if self._pool is pool:
+                log.warning("a process that compares pairs has ended (%s); going on in one process", error)
+                self._pool, self.workers = None, 1
+                pool.shutdown(wait=False, cancel_futures=True)
+
+
+@contextmanager
+def _interrupts_kept_from_children() -> Iterator[None]:
+    """Processes that begin within never see Ctrl-C, which a terminal sends to all of a group; here it waits."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _begin(threads: int) -> None:
+    """In a new process: Ctrl-C is its parent's, and it ends where the parent is killed."""
+    from multiprocessing import parent_process
+    from multiprocessing.connection import wait
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    set_threads(threads)
+    parent = parent_process()
+    if parent is None:
+        return
+
+    def follow() -> None:
+        wait([parent.sentinel])
+        os._exit(1)
+
+    threading.Thread(target=follow, name="otsync.parent", daemon=True).start()
