@@ -1,9 +1,9 @@
 """``otsync bench scale``: what ``otsync run`` costs as recordings grow: seconds and memory by cameras and frames.
 
 One rig is filmed once, at its largest; a smaller size is every so many of its cameras and its first frames. Images and
-calibration alone are given. Each size is a process of its own, whose CPU time and largest memory the system tells. The
-fit is as long for all (``STEPS``), since its length is the user's choice: what grows is the way to it. The law is
-fitted to all sizes, seconds = a * cameras^c * frames^f.
+calibration alone are given. Each size is a run of its own; the system tells the CPU time of its processes and the
+largest memory that they have together. The fit is as long for all (``STEPS``), since its length is the user's choice:
+what grows is the way to it. The law is fitted to all sizes, seconds = a * cameras^c * frames^f.
 """
 
 from __future__ import annotations
@@ -171,26 +171,43 @@ def measured(whole: Path, cameras: int, frames: int, out: Path) -> Row:
 
 
 class MemoryOf:
-    """The largest memory and the CPU time of a process, looked at now and then.
+    """The largest memory and the CPU time of a process and of those that it began, looked at now and then.
 
-    own: MB that are the process's own. all: MB with the pages of files that it looks at, which the system may take
-    back. seconds: CPU time.
+    own: MB that are the processes' own. all: MB with the pages of files that they look at, which the system may take
+    back; what several look at counts for each. seconds: CPU time.
     """
 
     def __init__(self, pid: int):
         self.pid, self.own, self.all, self.seconds = pid, 0.0, 0.0, 0.0
 
     def look(self) -> None:
-        try:
-            status = Path(f"/proc/{self.pid}/status").read_text()
-            fields = Path(f"/proc/{self.pid}/stat").read_text().rpartition(")")[2].split()
-        except OSError:  # it has ended
-            return
-        told = dict(line.split(":", 1) for line in status.splitlines() if ":" in line)
-        if "RssAnon" in told:
-            self.own = max(self.own, int(told["RssAnon"].split()[0]) / 1000)
-            self.all = max(self.all, int(told["VmRSS"].split()[0]) / 1000)
-        self.seconds = max(self.seconds, (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK"))
+        own = everything = seconds = 0.0
+        for pid in family(self.pid):
+            try:
+                status = Path(f"/proc/{pid}/status").read_text()
+                fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+            except OSError:  # it has ended
+                continue
+            told = dict(line.split(":", 1) for line in status.splitlines() if ":" in line)
+            if "RssAnon" in told:
+                own += int(told["RssAnon"].split()[0]) / 1000
+                everything += int(told["VmRSS"].split()[0]) / 1000
+            # its own time, and that of processes it began that have ended
+            seconds += sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK")
+        self.own, self.all = max(self.own, own), max(self.all, everything)
+        self.seconds = max(self.seconds, seconds)
+
+
+def family(pid: int) -> list[int]:
+    """A process and all that it and these began."""
+    found = [pid]
+    for one in found:
+        for path in Path(f"/proc/{one}/task").glob("*/children"):
+            try:
+                found += [int(child) for child in path.read_text().split()]
+            except OSError:  # a thread that has ended
+                continue
+    return found
 
 
 def _error(found: Path, true: Path) -> float:

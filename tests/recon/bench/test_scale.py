@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -61,6 +62,33 @@ def test_memory_and_time_of_another_process():
     process.communicate("\n")
     used.look()  # one that has ended says nothing new
     assert 200 < used.own < 300 and used.all > used.own and used.seconds >= 0.2
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="memory by kind is told by Linux alone")
+def test_what_a_process_begins_counts_while_it_lives_and_after():
+    child = (
+        "import time; x = bytearray(200_000_000); t = time.process_time()\nwhile time.process_time() < t + .3: pass\n"
+        "print('there', flush=True); input()"
+    )
+    code = (
+        f"import subprocess, sys; p = subprocess.Popen([sys.executable, '-c', {child!r}], stdin=subprocess.PIPE)\n"
+        "input(); p.communicate(b'\\n'); print('ended', flush=True); input()"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1
+    )
+    assert process.stdin is not None and process.stdout is not None
+    assert process.stdout.readline() == "there\n"
+    living = scale.MemoryOf(process.pid)
+    living.look()
+    process.stdin.write("\n")
+    assert process.stdout.readline() == "ended\n"
+    after = scale.MemoryOf(process.pid)
+    after.look()
+    process.communicate("\n")
+    assert len(scale.family(os.getpid())) >= 1
+    assert 200 < living.own < 300 and after.own < 100
+    assert living.seconds >= 0.3 and after.seconds >= 0.3
 
 
 def test_a_size_that_there_is_not_is_refused(tmp_path, capsys):
