@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import shlex
+import shutil
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -263,15 +265,32 @@ class Film:
             return self._run()
 
     def _run(self) -> int:
+        # all of it is filmed beside the folder's own files, and moved there when it is complete, truth.json last
+        part, last = self.out / ".film", "truth.json"
+        if not (part / last).exists():
+            if any(self.out.glob("*.mp4")):
+                raise ValueError(f"{self.out}: expected a folder without videos; it holds some. Choose another.")
+            shutil.rmtree(part, ignore_errors=True)  # of one that was stopped
+            try:
+                self._film(part)
+            except BaseException:
+                shutil.rmtree(part, ignore_errors=True)
+                raise
+        files = sorted(path.name for path in part.iterdir() if path.name != last)
+        for name in (*files, last):
+            os.replace(part / name, self.out / name)
+        part.rmdir()
+        print(f"{self.out}: {', '.join(files)}, {last}")
+        return 0
+
+    def _film(self, folder: Path) -> None:
         from ..io.document import write_document
         from ..simulate.phones import Hand, Tripod, film
         from ..simulate.room import draw_room
         from ..types import Offsets
 
-        if any(self.out.glob("*.mp4")):
-            raise ValueError(f"{self.out}: expected a folder without videos; it holds some. Choose another.")
         truth = film(
-            self.out,
+            folder,
             self.seed,
             phones=self.phones,
             gap=self.gap,
@@ -282,6 +301,7 @@ class Film:
             size=(self.width, self.height),
             max_offset=self.max_offset,
             room=draw_room(self.seed, contrast=self.contrast),
+            tell=tell,
         )
         cameras = [(name, camera) for name, camera in zip(truth.names, truth.cameras, strict=True)]
         if truth.walk is not None:
@@ -294,7 +314,5 @@ class Film:
             }
             for name, c in cameras
         ]
-        write_document(self.out / "cameras.json", videos)
-        Offsets.known(truth.names, truth.offsets, truth.fps).save(self.out / "truth.json")
-        print(f"{self.out}: {', '.join(video['file'] for video in videos)}; truth.json, cameras.json")
-        return 0
+        write_document(folder / "cameras.json", videos)
+        Offsets.known(truth.names, truth.offsets, truth.fps).save(folder / "truth.json")

@@ -6,7 +6,7 @@ Nobody calibrated them and nobody pressed record at once: :func:`film` writes vi
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -116,6 +116,7 @@ def film(
     size: tuple[int, int] = (640, 360),
     max_offset: float = 20.0,
     room: Room | None = None,
+    tell: Callable[[str], None] = lambda text: None,
 ) -> PhoneTruth:
     """Write ``phone0.mp4``, ``phone1.mp4``, ... and ``walk.mp4`` into ``folder``; nothing else.
 
@@ -125,6 +126,7 @@ def film(
         walk: frames of the clip that walks past all phones; 0: there is none.
         frames: of every phone's video. max_offset: the largest offset, in frames.
         room: default: one drawn by ``seed``.
+        tell: receives a line for every clip that is written.
     """
     if phones < 2 or frames < 2 or walk < 0 or walk == 1:
         raise ValueError(
@@ -139,6 +141,7 @@ def film(
         times = np.arange(frames) / fps
         w2c = held(float(azimuths[v]), times, stream(seed, v, "hand"))
         cameras.append(_clip(folder / f"{name}.mp4", room, w2c, times + shift[v], size, fps, stream(seed, v, "phone")))
+        tell(f"filmed {name}.mp4, {frames} frames")
     carried = None
     if walk:
         times = np.arange(walk) / fps
@@ -147,6 +150,7 @@ def film(
         carried = _clip(
             folder / "walk.mp4", room, w2c, times + frames / fps + 3, size, fps, stream(seed, "walk", "phone")
         )
+        tell(f"filmed walk.mp4, {walk} frames")
     return PhoneTruth(names, tuple(cameras), shift, fps, carried)
 
 
