@@ -103,6 +103,9 @@ def calibrate_folder(
         _keep_what_is_lost(folder, as_it_was, found)
     else:
         found = calibrate(folder, options, cache=cache, tell=tell)
+        before = as_it_was.get("calibration")
+        if options.distance is None and isinstance(before, dict) and before.get("unit") == "metres":
+            tell("note: the cameras were in metres; without --distance A B METRES their unit is arbitrary")
         made = calibrated_document(document, found)
     if found.found:
         write_json(folder / "scene.json", made)

@@ -149,7 +149,12 @@ def test_from_videos_alone_to_offsets(handheld, tmp_path, capsys):
     assert "walk" not in json.loads((tmp_path / "w" / "scene.json").read_text())["calibration"]["cameras"]
     found, true = Offsets.load(tmp_path / "s" / "offsets.json"), Offsets.load(truth)
     assert np.abs(found.frames - true.frames)[1:].mean() < 0.15
-    assert main(["calibrate", str(tmp_path / "w")]) == 0  # once more, from what is kept
+    # once more, from what is kept, with a distance, and without it
+    capsys.readouterr()
+    assert main(["calibrate", str(tmp_path / "w"), "--distance", "phone0", "phone1", "4.2"]) == 0
+    assert "in metres" not in capsys.readouterr().err
+    assert main(["calibrate", str(tmp_path / "w")]) == 0
+    assert "the cameras were in metres" in capsys.readouterr().err
 
 
 def test_hands_shake_and_tripods_do_not():
