@@ -29,7 +29,7 @@ demo: $(VENV)/.demo  ## films a small moving world, and does the whole job on th
 	$(BIN)/otsync --quiet demo --out demo
 
 test: $(VENV)/.test lint  ## under ten minutes on two cores
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m "not slow"
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m "not slow" --durations=60 --durations-min=4
 
 test-all: $(VENV)/.test lint  ## every test, the slow ones too
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
