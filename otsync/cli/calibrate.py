@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from ..calibrate.verb import CalibrateOptions
+from ..compute.interrupts import uninterrupted
 from ..files.strict import nearest
 from ..progress import tell
 
@@ -104,7 +105,7 @@ def calibrate_folder(
     else:
         found = calibrate(folder, options, cache=cache, tell=tell)
         before = as_it_was.get("calibration")
-        if options.distance is None and isinstance(before, dict) and before.get("unit") == "metres":
+        if found.found and found.unit != "metres" and isinstance(before, dict) and before.get("unit") == "metres":
             tell("note: the cameras were in metres; without --distance A B METRES their unit is arbitrary")
         made = calibrated_document(document, found)
     if found.found:
@@ -268,22 +269,20 @@ class Film:
             return self._run()
 
     def _run(self) -> int:
-        # all of it is filmed beside the folder's own files, and moved there when it is complete, truth.json last
-        part, last = self.out / ".film", "truth.json"
-        if not (part / last).exists():
-            if any(self.out.glob("*.mp4")):
-                raise ValueError(f"{self.out}: expected a folder without videos; it holds some. Choose another.")
-            shutil.rmtree(part, ignore_errors=True)  # of one that was stopped
-            try:
-                self._film(part)
-            except BaseException:
-                shutil.rmtree(part, ignore_errors=True)
-                raise
-        files = sorted(path.name for path in part.iterdir() if path.name != last)
-        for name in (*files, last):
-            os.replace(part / name, self.out / name)
-        part.rmdir()
-        print(f"{self.out}: {', '.join(files)}, {last}")
+        if any(self.out.glob("*.mp4")):
+            raise ValueError(f"{self.out}: expected a folder without videos; it holds some. Choose another.")
+        # clips without their truth would be taken for a recording: all is moved to its place once it is complete
+        part = self.out / ".film"
+        shutil.rmtree(part, ignore_errors=True)  # of one that was killed
+        try:
+            self._film(part)
+            files = sorted(path.name for path in part.iterdir())
+            with uninterrupted():
+                for name in files:
+                    os.replace(part / name, self.out / name)
+        finally:
+            shutil.rmtree(part, ignore_errors=True)
+        print(f"{self.out}: {', '.join(files)}")
         return 0
 
     def _film(self, folder: Path) -> None:

@@ -9,9 +9,12 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ..compute.processes import Processes
+from ..compute.threads import pool_of
 from ..progress import counted
 from ..sync.verb import synchronize
 from ..types import Offsets, Status, TrackSet
@@ -34,9 +37,6 @@ def true_offsets(path: Path, names: tuple[str, ...]) -> np.ndarray:
 
 def with_progress(tracks: list[TrackSet], what: str, workers: int = 1, **options: Any) -> Offsets:
     """:func:`otsync.synchronize` on some processes, with a progress bar on a terminal."""
-    from concurrent.futures import ProcessPoolExecutor
-    from multiprocessing import get_context
-
     if workers < 1:
         raise ValueError(f"--workers: expected at least 1; found {workers}.")
 
@@ -49,8 +49,8 @@ def with_progress(tracks: list[TrackSet], what: str, workers: int = 1, **options
 
     if workers == 1:
         return synchronize(tracks, map=progress(map), **options)
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        return synchronize(tracks, map=progress(pool.map), **options)
+    with Processes(workers) as call, pool_of(workers) as pool:
+        return synchronize(tracks, map=progress(lambda f, items: pool.map(partial(call, f), items)), **options)
 
 
 @contextmanager

@@ -1,9 +1,10 @@
-"""Processes that work on Python objects is spread over, where threads would wait for each other's interpreter."""
+"""Work spread over processes, where threads would wait for each other's interpreter."""
 
 from __future__ import annotations
 
 import logging
 import os
+import pickle
 import signal
 import threading
 from collections.abc import Callable, Iterator
@@ -11,7 +12,7 @@ from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from types import TracebackType
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from .threads import get_threads, set_threads
 
@@ -25,9 +26,8 @@ class Processes:
     """Calls of functions in other processes, from threads that wait for the answers.
 
     They begin with the first call, which takes some seconds, and end with the block. Answers are those of this process,
-    to the last bit. Where the system gives no processes, or ends one, the work is done in this one.
-
-    Functions and items must be picklable, as those of ``synchronize`` are.
+    to the last bit. The work is done in this one where the system gives no processes, or ends one, and where the
+    function or the item cannot be sent (a matcher that holds a lambda).
 
     Args:
         workers: processes; 1: calls are made in this one.
@@ -53,13 +53,19 @@ class Processes:
 
     def __call__(self, function: Callable[[Item], Answer], item: Item) -> Answer:
         """``function(item)``, whose exceptions are raised here."""
+        try:
+            packed = pickle.dumps((function, item))
+        except Exception:  # what an object raises that cannot be pickled is its own affair
+            return function(item)
         pool = self._begun()
         if pool is None:
             return function(item)
         try:
             with _interrupts_kept_from_children():
-                asked = pool.submit(function, item)
-            return asked.result()
+                asked = pool.submit(_unpacked, packed)
+            read, answer = asked.result()
+            if read:
+                return answer
         except BrokenProcessPool as error:
             self._forget(pool, error)
         except RuntimeError:
@@ -90,6 +96,15 @@ class Processes:
                 log.warning("a process that compares pairs has ended (%s); going on in one process", error)
                 self._pool, self.workers = None, 1
                 pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _unpacked(packed: bytes) -> tuple[bool, Any]:
+    """In another process: whether it can read what it was sent, and the answer."""
+    try:
+        function, item = pickle.loads(packed)
+    except Exception:  # what is defined in a session alone is not found here
+        return False, None
+    return True, function(item)
 
 
 @contextmanager

@@ -26,6 +26,7 @@ from ..progress import Progress, Tell
 from ..sync.method import Method
 from ..sync.verb import synchronize
 from ..types import Offsets
+from ..types.checks import check_whole
 from .kept_pairs import KeptPairs
 from .routes import Synchronized, lift_given, track_all, without_times
 from .stages import Stages
@@ -68,8 +69,10 @@ def synchronize_own_scene(
     """Clocks and frames of the videos of a scene, from tracks that are lifted in each camera's own frame.
 
     ``method``: the matcher of first matches and the graph; ValueError names a slot that own frames have no use for. It
-    also names the videos without depth: pixels alone have no distances that could be compared.
+    also names the videos without depth: pixels alone have no distances that could be compared. ``processes``: as of
+    :func:`~otsync.recordings.routes.synchronize_scene`.
     """
+    check_whole("processes", processes, 1)
     if stages is not None and stages.depth is not None:
         raise ValueError(
             "stages.depth: expected no estimator, since without poses nothing ties its scale to the world; found "

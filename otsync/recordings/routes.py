@@ -39,6 +39,7 @@ from ..progress import Deadline, Progress, Tell
 from ..sync.method import Method
 from ..sync.verb import synchronize
 from ..types import Offsets, Status, TrackSet, Video
+from ..types.checks import check_whole
 from .given import names_of, tracks_of
 from .kept_pairs import KeptPairs
 from .learned_depth import remedy, with_depth
@@ -99,6 +100,7 @@ def synchronize_scene(
         tell: receives one line per stage.
         deadline: of the job that this is a part of: stereo is left out where it would take more than its share.
     """
+    check_whole("processes", processes, 1)
     for video in scene.videos:
         check_within_a_frame(video.camera.readout, video.times, f"camera.readout of {video.name!r}")
     stages, cache = with_labels(stages or Stages(), scene), cache or Cache()

@@ -630,32 +630,37 @@ def test_options_of_film(tmp_path):
     assert code == 2 and "holds some" in err
 
 
-@pytest.mark.parametrize("stopped", ["between clips", "before the last file", "killed"])
+@pytest.mark.parametrize("stopped", ["by Ctrl-C", "by a kill"])
 def test_a_film_that_was_stopped_is_filmed_by_the_same_command(tmp_path, monkeypatch, stopped):
     tiny = ["--phones", "2", "--frames", "3", "--walk", "3", "--width", "64", "--height", "36"]
     whole, out = tmp_path / "whole", tmp_path / "out"
     assert run(["film", str(whole), *tiny])[0] == 0
-    with monkeypatch.context() as patch:
-        if stopped == "between clips":
+    if stopped == "by a kill":
+        (out / ".film").mkdir(parents=True)
+        (out / ".film" / "phone0.mp4").write_bytes(b"half a clip")
+    else:
+        with monkeypatch.context() as patch:
             patch.setattr("otsync.cli.calibrate.tell", lambda text: signal.raise_signal(signal.SIGINT))
-        elif stopped == "before the last file":
-            move = os.replace
-
-            def replace(a, b):
-                if Path(b) == out / "truth.json":
-                    signal.raise_signal(signal.SIGINT)
-                move(a, b)
-
-            patch.setattr("otsync.cli.calibrate.os.replace", replace)
-        if stopped != "killed":
             assert run(["film", str(out), *tiny])[0] == 130
-        else:
-            (out / ".film").mkdir(parents=True)
-            (out / ".film" / "phone0.mp4").write_bytes(b"half a clip")
-    if stopped == "between clips":
         assert not list(out.rglob("*.mp4"))
     assert run(["film", str(out), *tiny])[0] == 0
     assert {p.name: p.read_bytes() for p in out.iterdir()} == {p.name: p.read_bytes() for p in whole.iterdir()}
+
+
+def test_a_film_is_whole_or_not_there(tmp_path, monkeypatch):
+    """Ctrl-C while clips are moved to their places waits until all are there."""
+    move = os.replace
+
+    def replace(a, b):
+        if Path(b).name == "phone0.mp4":
+            signal.raise_signal(signal.SIGINT)
+        move(a, b)
+
+    monkeypatch.setattr("otsync.cli.calibrate.os.replace", replace)
+    tiny = ["--phones", "2", "--frames", "3", "--walk", "3", "--width", "64", "--height", "36"]
+    assert run(["film", str(tmp_path / "out"), *tiny])[0] == 130
+    there = {p.name for p in (tmp_path / "out").iterdir()} - {".otsync.lock"}
+    assert there == {"phone0.mp4", "phone1.mp4", "walk.mp4", "truth.json", "cameras.json"}
 
 
 @pytest.fixture(scope="module")

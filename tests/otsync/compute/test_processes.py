@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
+from types import ModuleType, SimpleNamespace
 
 import pytest
 
@@ -16,6 +17,10 @@ from otsync.compute.processes import Processes
 
 def double(x):
     return 2 * x, os.getpid()
+
+
+def where(item):
+    return os.getpid()
 
 
 def refuse(x):
@@ -66,6 +71,25 @@ def test_where_the_system_gives_no_processes_the_work_is_done_here(monkeypatch):
         assert call(double, 3) == (6, os.getpid())
 
 
+@pytest.mark.parametrize("item", [lambda: 5, SimpleNamespace(hold=lambda: 5)])
+def test_what_cannot_be_sent_is_done_here(item):
+    with Processes(2) as call:
+        assert call(lambda x: os.getpid(), 1) == os.getpid()
+        assert call(where, item) == os.getpid()
+        assert call(where, 1) != os.getpid()
+
+
+def test_what_the_other_process_does_not_know_is_done_here(monkeypatch):
+    """As classes of a notebook: pickled by name, and nobody else can read them."""
+    module = ModuleType("of_this_session")
+    exec("class Item: pass", module.__dict__)
+    monkeypatch.setitem(sys.modules, "of_this_session", module)
+    module.Item.__module__ = "of_this_session"
+    with Processes(2) as call:
+        assert call(where, module.Item()) == os.getpid()
+        assert call(where, 1) != os.getpid()
+
+
 def test_fewer_than_one_are_refused():
     with pytest.raises(ValueError, match="workers: expected at least one process; found 0"):
         Processes(0)
@@ -85,7 +109,7 @@ if __name__ == "__main__":
 
 def nap(seconds):
     if seconds:
-        print("napping", os.getpid(), flush=True)
+        os.write(1, f"napping {os.getpid()}\n".encode())  # at once: two write to one pipe
     time.sleep(seconds)
 
 
@@ -97,26 +121,35 @@ def alive(pid):
         return False
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="looks into /proc")
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
-def test_no_process_outlives_its_parent(tmp_path, how):
+def napping(tmp_path):
+    """A process of which two children nap, and these."""
     script = tmp_path / "parent.py"
     script.write_text(CHILD.format(here=os.path.dirname(__file__)))
     parent = subprocess.Popen(
         [sys.executable, script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
     )
-    assert parent.stdout is not None and parent.stderr is not None
-    children = [int(parent.stdout.readline().split()[1]) for _ in range(2)]
+    assert parent.stdout is not None
+    return parent, [int(parent.stdout.readline().split()[1]) for _ in range(2)]
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="looks into /proc")
+def test_no_process_outlives_its_parent(tmp_path):
+    parent, children = napping(tmp_path)
     assert all(map(alive, children))
-    if how == signal.SIGKILL:
-        parent.kill()
-        deadline = time.monotonic() + 60
-        while any(map(alive, children)):
-            assert time.monotonic() < deadline, "a process lives on"
-            time.sleep(0.05)
-    else:
-        os.killpg(parent.pid, how)  # as a terminal does: only the parent is to hear it
-        time.sleep(1)
-        assert all(map(alive, children))
-        os.killpg(parent.pid, signal.SIGKILL)
+    parent.kill()
+    deadline = time.monotonic() + 60
+    while any(map(alive, children)):
+        assert time.monotonic() < deadline, "a process lives on"
+        time.sleep(0.05)
+    parent.communicate()
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="looks into /proc")
+def test_ctrl_c_is_the_parents(tmp_path):
+    """A terminal sends it to all: those that compare end their pair, and say nothing."""
+    parent, children = napping(tmp_path)
+    os.killpg(parent.pid, signal.SIGINT)
+    time.sleep(1)
+    assert all(map(alive, children))
+    os.killpg(parent.pid, signal.SIGKILL)
     parent.communicate()
