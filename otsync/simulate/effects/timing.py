@@ -7,12 +7,14 @@ every frame shows.
 
 from __future__ import annotations
 
+import numbers
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
 
+from ...types.checks import check_number, check_whole
 from ..observation import Observation
 
 if TYPE_CHECKING:
@@ -60,6 +62,13 @@ def _late_at(
     return np.asarray(low + np.where(jumps, np.round(share), share) * (high - low))
 
 
+def check_moment(name: str, at: Any) -> None:
+    """Refuse what is no share of a clip, from 0 to 1, nor None."""
+    real = isinstance(at, numbers.Real) and not isinstance(at, bool)
+    if not (at is None or (real and 0 <= at <= 1)):
+        raise ValueError(f"{name}: expected a share of the clip, from 0 to 1; found {at!r}.")
+
+
 def moment(at: float | None, clock: np.ndarray, rng: np.random.Generator) -> int:
     """The frame at the share ``at`` of the clip; None: any in the middle of it."""
     share = rng.uniform(*MIDDLE) if at is None else at
@@ -80,6 +89,10 @@ class Freeze:
     frames: int = 15
     at: float | None = None
     catches_up: bool = False
+
+    def __post_init__(self) -> None:
+        check_whole("Freeze.frames", self.frames, 1)
+        check_moment("Freeze.at", self.at)
 
     def __call__(self, obs: Observation, rng: np.random.Generator) -> Observation:
         own = obs.times - obs.times[0]
@@ -104,6 +117,10 @@ class Drop:
     seconds: float = 10 / 30
     at: float | None = None
 
+    def __post_init__(self) -> None:
+        check_number("Drop.seconds", self.seconds)
+        check_moment("Drop.at", self.at)
+
     def __call__(self, obs: Observation, rng: np.random.Generator) -> Observation:
         own = obs.times - obs.times[0]
         k = moment(self.at, own, rng)
@@ -116,6 +133,9 @@ class Cut:
 
     at: float | None = None
 
+    def __post_init__(self) -> None:
+        check_moment("Cut.at", self.at)
+
     def __call__(self, obs: Observation, rng: np.random.Generator) -> Observation:
         own = obs.times - obs.times[0]
         return showing(obs, np.roll(own, moment(self.at, own, rng)))
@@ -127,6 +147,9 @@ class Repeats:
 
     fps: float = 24.0
 
+    def __post_init__(self) -> None:
+        check_number("Repeats.fps", self.fps)
+
     def __call__(self, obs: Observation, rng: np.random.Generator) -> Observation:
         own = obs.times - obs.times[0]
         return showing(obs, np.floor(own * self.fps + 1e-9) / self.fps)
@@ -137,6 +160,9 @@ class Loop:
     """The first ``seconds`` over and over again."""
 
     seconds: float = 40 / 30
+
+    def __post_init__(self) -> None:
+        check_number("Loop.seconds", self.seconds)
 
     def __call__(self, obs: Observation, rng: np.random.Generator) -> Observation:
         return showing(obs, np.mod(obs.times - obs.times[0], self.seconds))
@@ -161,6 +187,11 @@ class SlowMotion:
     factor: float = 2.0
     begin: float = 0.3
     end: float = 0.6
+
+    def __post_init__(self) -> None:
+        check_number("SlowMotion.factor", self.factor)
+        check_moment("SlowMotion.begin", self.begin)
+        check_moment("SlowMotion.end", self.end)
 
     def __call__(self, obs: Observation, rng: np.random.Generator) -> Observation:
         own = obs.times - obs.times[0]

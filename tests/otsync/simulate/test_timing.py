@@ -79,3 +79,22 @@ def test_motions_that_mislead_are_smooth_and_drawn_by_the_seed(motion):
     steps = np.abs(np.diff(b.positions(), axis=1)).max(2)
     jumps = motion in ("rain", "portals")  # every second or two, whatever the frame rate
     assert np.nanquantile(steps, 0.95 if jumps else 1.0) < 1.0
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: Freeze(0.5), "Freeze.frames: expected a whole number, 1 or more; found 0.5"),
+        (lambda: Freeze(5, at=2), "Freeze.at: expected a share of the clip, from 0 to 1; found 2"),
+        (lambda: Drop(-1.0), "Drop.seconds: expected a finite number above 0; found -1.0"),
+        (lambda: Drop(at=float("nan")), "Drop.at"),
+        (lambda: Cut(at=-0.1), "Cut.at"),
+        (lambda: Repeats(0), "Repeats.fps"),
+        (lambda: Loop(0.0), "Loop.seconds"),
+        (lambda: SlowMotion(factor=0), "SlowMotion.factor"),
+        (lambda: SlowMotion(begin=True), "SlowMotion.begin"),
+    ],
+)
+def test_what_cannot_happen_is_refused(make, said):
+    with pytest.raises(ValueError, match=said):
+        make()
