@@ -19,6 +19,7 @@ import pytest
 
 from otsync import DTW, PAPER, Graph, Method, OptimalTransport, PartialFGW, SplineRefine, Unrefined, synchronize
 from otsync.cli import main
+from otsync.compute.processes import Processes
 from otsync.costs import Cosine, EpipolarDistance
 from otsync.files.digest import content_key
 from otsync.io import open_scene
@@ -26,10 +27,11 @@ from otsync.match import UnbalancedOT
 from otsync.plugins import forget, register
 from otsync.priors import Cache, ChainedFlow, Daisy, MedianBackground
 from otsync.progress import Deadline
-from otsync.recordings.kept_pairs import KeptPairs, pack, unpack
+from otsync.recordings.kept_pairs import MANY, KeptPairs, pack, unpack
 from otsync.recordings.routes import _refuse_unused, _too_late, choose_route, synchronize_scene, without_times
 from otsync.recordings.stages import PIXELS, SPACE, Stages, stages_from, with_labels, with_method
 from otsync.recordings.tracking import Tracking, track_labels
+from otsync.simulate import simulate
 from otsync.sync.pairs import Job, run
 from otsync.types import Offsets, Similarity
 from tests.otsync.epipolar.test_epipolar import world
@@ -351,6 +353,54 @@ def test_kept_pairs_compute_once_and_tell_algorithms_apart(tmp_path):
     kept(counted, [replace(job, aligner=EpipolarScan(motion_scale=3.0))])
     assert len(calls) == 2
     assert KeptPairs(Cache())(lambda x: x + 1, [1, 2]) == [2, 3]
+
+
+def test_many_pairs_are_spread_over_processes_with_the_same_answers(tmp_path):
+    tracks, _ = simulate("tennis", preset="mid", videos=6, tracks=40, seed=9)
+    here = synchronize(tracks, rematch=0)
+    asked = []
+    with Processes(2) as call, ThreadPoolExecutor(2) as pool:
+
+        def spread(function, item):
+            found, there = call(with_process, (function, item))
+            asked.append((function, there))
+            return found
+
+        kept = KeptPairs(Cache(tmp_path), pool.map, spread)
+        there = synchronize(tracks, rematch=0, map=kept)
+        before = len(asked)
+        again = synchronize(tracks, rematch=0, map=kept)
+    assert {pid for _, pid in asked}.isdisjoint({os.getpid()})
+    assert sum(function is run for function, _ in asked[:before]) >= 15
+    assert not any(function is run for function, _ in asked[before:])  # they are kept
+    for other in (there, again):
+        np.testing.assert_array_equal(other.seconds, here.seconds)
+        np.testing.assert_array_equal(other.sigma, here.sigma)
+        assert other.flags == here.flags
+
+
+def with_process(task):
+    function, item = task
+    return function(item), os.getpid()
+
+
+def test_few_pairs_begin_no_processes():
+    def spread(function, item):
+        raise AssertionError("asked for a process")
+
+    kept = KeptPairs(Cache(), call=spread)
+    assert kept(abs, range(MANY - 1)) == list(range(MANY - 1))
+    with pytest.raises(AssertionError, match="asked for a process"):
+        kept(abs, range(MANY))
+
+
+def test_a_scene_spreads_its_pairs_as_it_is_told(recording, synced, monkeypatch):
+    asked = []
+    monkeypatch.setattr("otsync.recordings.routes.Processes", lambda n: asked.append(n) or Processes(1))
+    synchronize_scene(open_scene(recording), cache=Cache(synced / "stages"), processes=3)
+    assert asked and set(asked) == {3}
+    with pytest.raises(ValueError, match="processes: expected a whole number, 1 or more; found 0"):
+        synchronize_scene(open_scene(recording), processes=0)
 
 
 def test_init_check_and_sync_from_the_shell(recording, tmp_path, capsys):
