@@ -13,7 +13,7 @@ from ..compute.threads import MapLike
 from ..files.cache import Cache
 from ..files.digest import content_key
 from ..geometry import undistort
-from .stereo import HullStereo, Rig, Space
+from .stereo import MADE_BY, HullStereo, Rig, Space
 from .working import WorkingFrames
 
 
@@ -56,7 +56,7 @@ class DenseStereo:
         store = cache if cache is not None and key else Cache()
         space = Space.of(self.stereo, rig)
         # the box of the hull, and with it where voxels lie, depends on all moments
-        key = (*key, self, content_key(rig.index))
+        key = (*key, MADE_BY, self, content_key(rig.index))
         wanted: dict[int, list[tuple[int, int]]] = {}
         for v, chosen in enumerate(frames):
             for k in sorted(set(chosen)):
@@ -114,11 +114,7 @@ class DenseStereo:
         w, h = self.size(rig.frames[v])
         inside, uv = mask_pixels(np.asarray(rig.masks[v][k]), w, h)
         points = undistort(rig.cameras[v], uv / rig.frames[v].scale) * rig.frames[v].scale
-        start, scores = self.stereo.scores(space, hull, images, near, v, k, points)
-        group = neighbourhood(inside, self.reach)
-        # one row more stands for "no such pixel": its hull depth 0 takes it out of every sum
-        start, scores = np.append(start, 0.0), np.concatenate([scores, np.zeros((1, scores.shape[1]))])
-        depth = self.stereo.choose(space, start[group], scores[group])
+        depth = self.stereo.depths(space, hull, images, near, v, k, points, neighbourhood(inside, self.reach))
         out = np.zeros((h, w), np.float32)
         out[inside] = depth
         return consistent(out, self.around, self.jump, self.company)

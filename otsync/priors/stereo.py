@@ -26,6 +26,19 @@ WIDE = 1.0
 as large in the image."""
 
 
+MADE_BY = 2
+"""Counted up where what is measured changes, so that a folder made by an older version does not mix both."""
+
+SURFACE = 0.05
+"""Metres by which the hull's depths of two pixels of one surface differ at most."""
+
+BEHIND = 0.6
+"""Correlation that a depth loses per metre behind the hull: of two that are as good, the nearer one is more likely."""
+
+NOISE = 4.0
+"""Variance of the grey levels, which keeps flat patches from correlating."""
+
+
 class EmptyHull(ValueError):
     """No place in space is foreground in enough views."""
 
@@ -142,7 +155,7 @@ class HullStereo:
         chunks = [wanted[k : k + size] for k in range(0, len(wanted), size)]
         # without a key of the pixels nothing may be kept: the tracks alone do not say which images they came from
         store = cache if key else Cache()
-        key = (*key, self, content_key(rig.index, *uv))
+        key = (*key, MADE_BY, self, content_key(rig.index, *uv))
 
         def part(moments: Int[np.ndarray, " C"]) -> dict[str, np.ndarray]:
             return store.arrays("stereo", (*key, int(moments[0])), lambda: self._chunk(rig, space, uv, moments))
@@ -186,9 +199,8 @@ class HullStereo:
             [(0, 0), (-1, -1), (0, -1), (1, -1), (-1, 0), (1, 0), (-1, 1), (0, 1), (1, 1)], float
         )
         sub = (points[:, None] + around[None]).reshape(-1, 2)
-        start, scores = self.scores(space, hull, images, self.partners(space, np.array(list(images)), v), v, k, sub)
-        shape = (len(points), len(around))
-        return self.choose(space, start.reshape(shape), scores.reshape(*shape, -1))
+        group = np.arange(len(sub)).reshape(len(points), len(around))
+        return self.depths(space, hull, images, self.partners(space, np.array(list(images)), v), v, k, sub, group)
 
     def enough(self, present: Int[np.ndarray, " P"]) -> bool:
         """Whether the videos that show a moment suffice for a hull and a correlation."""
@@ -199,7 +211,7 @@ class HullStereo:
         here = set(present.tolist())
         return [u for u in space.order[v] if u in here][: self.neighbours]
 
-    def scores(
+    def depths(
         self,
         space: Space,
         hull: np.ndarray,
@@ -207,44 +219,82 @@ class HullStereo:
         near: Sequence[int],
         v: int,
         k: int,
-        points: Float[np.ndarray, "N 2"],
-    ) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, "N D"]]:
-        """Depth at which each point's ray enters the hull, 0 never, and the correlations over the sweep behind it."""
-        from .kernels_stereo import first_hit, sweep
-
-        R, center, inverse_K = space.pose(v, k)
-        unit = space.unit
-        rays = np.concatenate([points, np.ones((len(points), 1))], 1) @ inverse_K.T @ R.T
-        start = first_hit(
-            hull, space.low, self.voxel * unit, center, rays, 0.4 * self.voxel * unit, space.near, space.far
-        )
-        depths = unit * np.arange(self.sweep[0], self.sweep[1] + 1e-9, self.step)
-        if len(near) < 2:
-            return np.zeros(len(points)), np.full((len(points), len(depths)), -1.0)
-        scores = sweep(
-            points,
-            start,
-            depths,
-            images[v],
-            np.stack([images[u] for u in near]),
-            space.P[near],
-            R,
-            center,
-            inverse_K,
-            self.patch,
-            4.0,
-        )
-        return start, scores
-
-    def choose(
-        self, space: Space, start: Float[np.ndarray, "N S"], scores: Float[np.ndarray, "N S D"]
+        points: Float[np.ndarray, "M 2"],
+        group: Int[np.ndarray, "N S"],
     ) -> Float[np.ndarray, " N"]:
-        """Depth by the summed correlations of a point and those around it, 0 where they are not believed."""
-        from .kernels_stereo import choose_depth
+        """Depth of the first point of each group, by the summed correlations of all; 0 where it is not believed.
 
-        unit = space.unit
-        depth, quality = choose_depth(scores, start, self.sweep[0] * unit, self.step * unit, 0.05 * unit, 0.6 / unit)
+        Args:
+            near: views to compare with. points: working pixels. group: numbers of points, M for none.
+        """
+        from .kernels_stereo import at_points, choose_depth, correlate, first_hit, planes_of
+
+        if len(near) < 2 or not len(group):
+            return np.zeros(len(group), np.float32)
+        R, center, inverse_K = space.pose(v, k)
+        unit, image = space.unit, images[v]
+        rays = np.concatenate([points, np.ones((len(points), 1))], 1) @ inverse_K.T @ R.T
+        voxel = self.voxel * unit
+        start = first_hit(hull, space.low, voxel, center, rays, 0.4 * voxel, space.near, space.far)
+        start = np.append(start, 0.0)  # of the point that is none: no group adds it
+        h, w = image.shape
+        first, last, close, step = unit * self.sweep[0], unit * self.sweep[1], unit * SURFACE, unit * self.step
+        low, high, owner = planes_of(start, group, first, last, close, step)
+        boxes, own, squares = boxes_to_compare(points, low, high, owner, len(group), self.patch, h, w)
+        at = np.concatenate([[0], np.cumsum(_pixels(boxes[:, 1:]))])
+        others, P, sizes = together([images[u] for u in near]), space.P[near], space.sizes[near]
+        A, b = P[:, :, :3] @ (R @ inverse_K), P[:, :, :3] @ center + P[:, :, 3]
+        volume = correlate(image, others, sizes, A, b, boxes, at, step, self.patch, np.float32(NOISE))
+        scores, begins = at_points(points, low, high, volume, boxes, at, own, squares, self.patch, h, w)
+        depth, quality = choose_depth(start, group, scores, begins, low, first, last, close, step, BEHIND / unit)
         return np.where(quality > self.least, depth, 0.0).astype(np.float32)
+
+
+def boxes_to_compare(
+    points: Float[np.ndarray, "M 2"],
+    low: Int[np.ndarray, " M"],
+    high: Int[np.ndarray, " M"],
+    owner: Int[np.ndarray, " M"],
+    groups: int,
+    half: int,
+    h: int,
+    w: int,
+) -> tuple[Int[np.ndarray, "B 5"], Int[np.ndarray, " M"], Int[np.ndarray, "P Y X"]]:
+    """The boxes of pixels that are compared, plane by plane: one a group, or squares that groups share.
+
+    Whichever samples fewer pixels: few points lie alone, the pixels of a map side by side.
+
+    Args:
+        points, low, high, owner: see :mod:`otsync.priors.kernels_stereo`. half: of a patch. h, w: of the image.
+
+    Returns:
+        plane, first and last column, first and last row of each box; the box of each point's first plane, -1 where
+        squares tell; and the box of every square of every plane, -1 for none.
+    """
+    from .kernels_stereo import TILE, boxes_of_groups, boxes_of_squares
+
+    squares, number = boxes_of_squares(points, low, high, half, h, w)
+    inside = owner >= 0
+    if not (owner == -1).any() and inside.any():
+        alone = boxes_of_groups(points, owner, groups, half, h, w)
+        planes = np.zeros((groups, 2), int)
+        planes[owner[inside]] = np.stack([low[inside], high[inside] + 1], 1)
+        planes[_pixels(alone) == 0] = 0
+        counts = planes[:, 1] - planes[:, 0]
+        fits = (alone[:, 1::2] - alone[:, ::2] < TILE).all()
+        if fits and (counts * _pixels(alone, 2 * half)).sum() < _pixels(squares[:, 1:], 2 * half).sum():
+            which = np.repeat(np.arange(groups), counts)
+            begins = np.cumsum(counts) - counts
+            plane = np.arange(len(which)) - begins[which] + planes[which, 0]
+            own = np.where(inside, begins[owner], -1)
+            return np.column_stack([plane, alone[which]]).astype(np.int32), own, np.full((0, 0, 0), -1)
+    return squares, np.full(len(points), -1), number
+
+
+def _pixels(boxes: Int[np.ndarray, "*B 4"], more: int = 0) -> Int[np.ndarray, "*B"]:
+    """Pixels of boxes (first and last column, first and last row), ``more`` along each side; 0 for empty ones."""
+    x0, x1, y0, y1 = np.moveaxis(boxes.astype(np.int64), -1, 0)
+    return np.where((x1 >= x0) & (y1 >= y0), (x1 - x0 + 1 + more) * (y1 - y0 + 1 + more), 0)
 
 
 def fill_between(
@@ -268,10 +318,14 @@ def fill_between(
 
 @dataclass(frozen=True, eq=False)
 class Space:
-    """The box that the hull is carved from, and the cameras at working resolution."""
+    """The box that the hull is carved from, and the cameras at working resolution, images of ``sizes`` (width, height).
+
+    Views may be of different sizes.
+    """
 
     P: Float[np.ndarray, "V 3 4"]
     K: Float[np.ndarray, "V 3 3"]
+    sizes: Int[np.ndarray, "V 2"]
     cameras: tuple[Camera, ...]
     order: list[list[int]]
     unit: float
@@ -300,14 +354,16 @@ class Space:
         near, far = 0.1 * unit, float(distance.max()) * 2.5
         coarse, radius = 0.08 * unit, float(np.median(distance)) * 1.1
         low, dims = target - radius, np.full(3, int(2 * radius / coarse) // 4 * 4)
-        box = cls(P, K, rig.cameras, order, unit, low, dims, near, far)
+        sizes = np.array([f.size for f in rig.frames])
+        box = cls(P, K, sizes, rig.cameras, order, unit, low, dims, near, far)
         # where anything is ever occupied, from a few moments
         full = np.flatnonzero((rig.index >= 0).sum(1) >= stereo.min_views)
         occupied = []
         for s in full[:: max(1, len(full) // 12)]:
             present = np.flatnonzero(rig.index[s] >= 0)
             masks = box.masks(rig, int(s), present, round(coarse / unit * 160))
-            grid = carve(masks, masks, P[present], low, coarse, dims, 4, stereo.min_views, stereo.misses, near)
+            seen = (masks, masks, sizes[present], P[present])
+            grid = carve(*seen, low, coarse, dims, 4, stereo.min_views, stereo.misses, near)
             occupied.append(np.argwhere(grid))
         corners = np.concatenate(occupied) if occupied else np.zeros((0, 3), int)
         if len(corners) == 0:
@@ -319,7 +375,7 @@ class Space:
         start = low + (corners.min(0) - margin) * coarse
         size = (np.ptp(corners, axis=0) + 1 + 2 * margin) * coarse
         fine = np.ceil(size / (stereo.voxel * unit) / 4).astype(int) * 4
-        return cls(P, K, rig.cameras, order, unit, start, fine, near, far)
+        return cls(P, K, sizes, rig.cameras, order, unit, start, fine, near, far)
 
     def masks(self, rig: Rig, s: int, present: np.ndarray, grow: int) -> np.ndarray:
         import cv2
@@ -330,7 +386,7 @@ class Space:
             mask = rig.masks[int(v)][int(rig.index[s, v])].astype(np.uint8)
             mask = _straight(mask, rig.cameras[int(v)], self.K[v], cv2.INTER_NEAREST)
             out.append(cv2.dilate(mask, kernel) if grow > 1 else mask)
-        return np.stack(out)
+        return together(out)
 
     def hull(self, stereo: HullStereo, rig: Rig, s: int, present: np.ndarray) -> np.ndarray:
         from .kernels_stereo import carve
@@ -341,6 +397,7 @@ class Space:
         return carve(
             masks,
             coarse,
+            self.sizes[present],
             self.P[present],
             self.low,
             stereo.voxel * self.unit,
@@ -359,6 +416,17 @@ class Space:
     def pose(self, v: int, k: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         R = self.cameras[v].w2c[:3, :3].T
         return np.ascontiguousarray(R), self.cameras[v].center, np.linalg.inv(self.K[v])
+
+
+def together(images: Sequence[np.ndarray]) -> np.ndarray:
+    """Images in one array; zeros beside and below those that are smaller than others."""
+    sizes = [image.shape for image in images]
+    if len(set(sizes)) == 1:
+        return np.stack(images)
+    out = np.zeros((len(images), *np.max(sizes, 0)), images[0].dtype)
+    for one, image in zip(out, images, strict=True):
+        one[: image.shape[0], : image.shape[1]] = image
+    return out
 
 
 def _straight(image: np.ndarray, camera: Camera, K: np.ndarray, how: int) -> np.ndarray:

@@ -171,11 +171,12 @@ def _surface(
         wide[0, v, : camera.height, : camera.width] = mask
         wide[1, v, : camera.height, : camera.width] = maximum_filter(mask, grown)
     P = np.stack([c.K @ c.w2c[:3] for c in cameras])
+    sizes = np.array([(c.width, c.height) for c in cameras])
     low, dims = focus - ROOM * distance, np.full(3, int(2 * ROOM * distance / voxel) // BLOCK * BLOCK)
     views = min(len(cameras), max(VIEWS, math.ceil(SHARED * len(cameras))))
     surface = np.zeros((0, 3), int)
     for misses in range(int(len(cameras) >= STRICT), views):
-        grid = carve(wide[0], wide[1], P, low, voxel, dims, BLOCK, views, misses, NEAR * distance).astype(bool)
+        grid = carve(wide[0], wide[1], sizes, P, low, voxel, dims, BLOCK, views, misses, NEAR * distance) > 0
         surface = np.argwhere(grid & ~binary_erosion(grid))
         if len(surface) >= LEAST:
             break

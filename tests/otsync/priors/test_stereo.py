@@ -1,0 +1,131 @@
+"""The plane sweep against its definition, patch by patch; and views of different sizes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from otsync.io.scene import Scene
+from otsync.priors.kernels_stereo import EDGE, at_points, correlate, first_hit, planes_of
+from otsync.priors.stereo import NOISE, boxes_to_compare, together
+from otsync.recordings.dense_depth import depth_maps
+from tests.otsync.recordings.test_depth_maps import AT, CHOSEN, FRAMES, STAGES, errors, measured, world
+
+__all__ = ["measured", "world"]
+
+HALF, STEP = 2, 0.03
+K = np.array([[70.0, 0, 33], [0, 72, 25], [0, 0, 1]])
+SIZES = np.array([(64, 48), (64, 48), (50, 56)])
+
+
+def view(seed: int, width: int, height: int) -> np.ndarray:
+    noise = np.random.default_rng(seed).uniform(0, 255, (height, width)).astype(np.float32)
+    return cv2.GaussianBlur(noise, (0, 0), 1.5)
+
+
+def cameras(seed: int, turn: float) -> np.ndarray:
+    """(3,3,4) projections of views beside one that stands in the world's origin."""
+    rng = np.random.default_rng(seed)
+    R = [cv2.Rodrigues(turn * rng.normal(size=3))[0] for _ in SIZES]
+    return np.stack([K @ np.column_stack([r, 0.3 * rng.normal(size=3)]) for r in R])
+
+
+def sampled(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray | None:
+    """Grey levels at pixels (+0.5 convention); None where one is too near to the border or beyond it."""
+    h, w = image.shape
+    if u.min() < EDGE or v.min() < EDGE or u.max() >= w - EDGE or v.max() >= h - EDGE:
+        return None
+    i, j = (u - 0.5).astype(int), (v - 0.5).astype(int)
+    a, b = u - 0.5 - i, v - 0.5 - j
+    top = (1 - a) * image[j, i] + a * image[j, i + 1]
+    return (1 - b) * top + b * ((1 - a) * image[j + 1, i] + a * image[j + 1, i + 1])
+
+
+def by_definition(image: np.ndarray, others: list[np.ndarray], P: np.ndarray, x: int, y: int, z: float) -> float:
+    b, a = np.mgrid[-HALF : HALF + 1, -HALF : HALF + 1]
+    own = image[y + b, x + a].astype(float)
+    rays = np.stack([x + a + 0.5, y + b + 0.5, np.ones(a.shape)], -1) @ np.linalg.inv(K).T
+    scores = []
+    for other, p in zip(others, P, strict=True):
+        at = z * rays @ p[:, :3].T + p[:, 3]
+        corners = at[[0, 0, -1, -1], [0, -1, 0, -1]]
+        seen = (
+            None if (corners[:, 2] < 0.1 * z).any() else sampled(other, *np.moveaxis(at[..., :2] / at[..., 2:], 2, 0))
+        )
+        if seen is not None:
+            one, two = own - own.mean(), seen - seen.mean()
+            power = ((one**2).sum() + one.size * NOISE) * ((two**2).sum() + one.size * NOISE)
+            scores.append((one * two).sum() / np.sqrt(power))
+    scores.sort()
+    return -1.0 if not scores else scores[-1] - 0.2 if len(scores) == 1 else (scores[-1] + scores[-2]) / 2
+
+
+@settings(max_examples=12, deadline=None)
+@given(st.integers(0, 10**6), st.floats(0.0, 0.25), st.booleans(), st.booleans())
+def test_the_sweep_is_the_correlation_of_every_patch(seed, turn, grey, alone):
+    """Whatever the views see of a patch, for pixels all over the image, whose sums share their samples."""
+    others = [view(seed + 1 + v, *size) for v, size in enumerate(SIZES)]
+    image = others[0] if grey else view(seed, 64, 48)
+    P = cameras(seed, turn)
+    A, b = P[:, :, :3] @ np.linalg.inv(K), P[:, :, 3]
+    rng = np.random.default_rng(seed)
+    pixels = rng.integers(0, [64, 48], (40, 2))
+    start = np.where(rng.uniform(size=40) < 0.1, 0.0, rng.uniform(0.8, 1.6, 40))
+    group = np.arange(40)[:, None] if alone else np.column_stack([np.arange(40), np.full((40, 2), [40, 0])])
+    if not alone:
+        start[0] = 1.2  # which all that are near it ask for, too
+    low, high, owner = planes_of(np.append(start, 0.0), group, -0.1, 0.2, 0.05, STEP)
+    boxes, own, squares = boxes_to_compare(pixels + 0.5, low, high, owner, 40, HALF, 48, 64)
+    assert (own < 0).all() == (squares.size > 0)
+    area = (boxes[:, 2] - boxes[:, 1] + 1) * (boxes[:, 4] - boxes[:, 3] + 1)
+    at = np.concatenate([[0], np.cumsum(area)])
+    volume = correlate(image, together(others), SIZES, A, b, boxes, at, STEP, HALF, np.float32(NOISE))
+    scores, begins = at_points(pixels + 0.5, low, high, volume, boxes, at, own, squares, HALF, 48, 64)
+    assert begins[-1] == len(scores)
+    np.testing.assert_array_equal(low[start > 0][1:], np.ceil((start[start > 0][1:] - 0.1) / STEP))
+    np.testing.assert_array_equal(high[start > 0][1:], np.floor((start[start > 0][1:] + 0.2) / STEP))
+    for m, (x, y) in enumerate(pixels):
+        found = scores[begins[m] : begins[m + 1]]
+        planes = np.arange(low[m], high[m] + 1)
+        assert len(found) == len(planes)
+        whole = HALF <= x < 64 - HALF and HALF <= y < 48 - HALF
+        for score, i in zip(found, planes, strict=True):
+            true = by_definition(image, others, P, x, y, i * STEP) if whole else -1.0
+            assert score == pytest.approx(max(true, -0.2), abs=2e-3)
+
+
+def test_a_ray_enters_the_hull_where_it_first_meets_it():
+    rng = np.random.default_rng(0)
+    grid = (rng.uniform(size=(12, 10, 8)) < 0.3).astype(np.uint8)
+    low, voxel, center = np.array([-0.6, -0.5, 2.0]), 0.1, np.array([0.02, -0.03, -0.5])
+    rays = np.column_stack([rng.uniform(-0.3, 0.3, (300, 2)), np.ones(300)])
+    rays[0] = [0.0, 0.0, 1.0]
+    found = first_hit(grid, low, voxel, center, rays, 0.4 * voxel, 0.2, 8.0)
+    steps = 0.2 + 0.4 * voxel * np.arange(195)
+    for ray, z in zip(rays, found, strict=True):
+        at = np.floor((center + steps[:, None] * ray - low) / voxel).astype(int)
+        inside = ((at >= 0) & (at < grid.shape)).all(1)
+        hit = np.flatnonzero([i and grid[tuple(a)] for i, a in zip(inside, at, strict=True)])
+        assert z == pytest.approx(steps[hit[0]] if len(hit) else 0.0)
+    assert 0.3 < (found > 0).mean() < 1
+
+
+def test_views_of_other_sizes_tell_depth_as_well(world, measured):
+    """Some cameras' images cut: what is beyond them is not seen, rather than seen to be empty."""
+    scene, true = world
+    videos, masks = list(scene.videos), list(scene.masks)
+    for v, (width, height) in {1: (250, 180), 3: (320, 150), 6: (230, 160)}.items():
+        camera = replace(videos[v].camera, width=width, height=height)
+        frames = [np.ascontiguousarray(f[:height, :width]) for f in videos[v].frames]
+        videos[v] = replace(videos[v], frames=frames, camera=camera)
+        masks[v] = [m[:height, :width] for m in masks[v]]
+    found = depth_maps(Scene(tuple(videos), tuple(masks)), AT, FRAMES, width=160, stages=STAGES)
+    for v in CHOSEN:
+        error, share = errors(found[v], true[v])
+        assert np.median(error) < 0.01
+        assert share > 0.9 * errors(measured[v], true[v])[1]
