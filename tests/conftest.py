@@ -11,10 +11,15 @@ import numpy as np
 import pytest
 
 from otsync import TrackSet
+from tests.slow import mark
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN and threading.current_thread() is threading.main_thread():
     # a shell starts background jobs with Ctrl-C ignored, and children inherit that; what interrupts does is tested here
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    mark(items, whole_files=not any("::" in argument for argument in config.args))
 
 
 @pytest.fixture(scope="session")

@@ -1,0 +1,92 @@
+"""Which tests are slow, by what they took: `make test` leaves them out, `make test-all` runs them.
+
+Tests that are slow by design say so themselves (``@pytest.mark.slow``). Others are found slow, case by case: they are
+listed in slow.txt beside this file, and marked when they are collected. The list is made anew from a report of all
+tests, of a machine that does nothing else:
+
+    make test-all PYTEST="--junitxml report.xml"
+    python -m tests.slow report.xml
+
+What is listed already stays: times of what all cases of a file share are told of the first alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+LIST = Path(__file__).with_name("slow.txt")
+
+SLOW = 2.5
+"""Seconds from which a case is slow, unless it is the fastest of its test."""
+
+TOO_SLOW = 6.0
+"""Seconds from which the fastest case of a test is slow, too."""
+
+KEPT = (
+    "tests/otsync/sync/test_breaks.py::test_a_break_is_found_named_and_mended[freeze of 30]",
+    "tests/docs/test_code_blocks.py::test_the_code_of_a_page_runs_in_order[README.md]",
+    "tests/recon/cli/test_recon_cli.py::test_fit_writes_offsets_scene_metrics_and_report",
+)
+"""Cases that run always, however slow: each goes a way of its own from end to end."""
+
+
+def listed() -> set[str]:
+    """Node ids of slow.txt."""
+    return {line for line in LIST.read_text(encoding="utf-8").splitlines() if line and not line.startswith("#")}
+
+
+def mark(items: Sequence[pytest.Item], whole_files: bool) -> None:
+    """Mark the listed among the collected items.
+
+    UsageError names one that is listed, or kept, and does not exist, where files were collected as a whole.
+    """
+    slow = listed()
+    for item in items:
+        if item.nodeid in slow:
+            item.add_marker(pytest.mark.slow)
+    files = {item.nodeid.split("::")[0] for item in items} if whole_files else set()
+    for name in sorted({*slow, *KEPT} - {item.nodeid for item in items}):
+        if name.split("::")[0] in files:
+            where = "slow.py" if name in KEPT else "slow.txt"
+            raise pytest.UsageError(f"tests/{where}: {name} does not exist. Take it out, or give its new name.")
+
+
+def slow_cases(times: dict[str, float]) -> set[str]:
+    """The slow ones of cases that took so many seconds, see :data:`SLOW`, :data:`TOO_SLOW` and :data:`KEPT`."""
+    tests: dict[str, list[str]] = defaultdict(list)
+    for name in times:
+        tests[name.split("[")[0]].append(name)
+    slow = set()
+    for cases in tests.values():
+        fastest = min(cases, key=lambda name: times[name])
+        slow |= {c for c in cases if times[c] >= (TOO_SLOW if c == fastest else SLOW)}
+    return slow - set(KEPT)
+
+
+def times_of(report: Path) -> dict[str, float]:
+    """Seconds of every case of a JUnit report, by node id."""
+    cases = ElementTree.parse(report).iter("testcase")
+    return {f"{c.attrib['classname'].replace('.', '/')}.py::{c.attrib['name']}": float(c.attrib["time"]) for c in cases}
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Write slow.txt anew."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("report", type=Path, help="JUnit report of a run of all tests")
+    times = times_of(parser.parse_args(arguments).report)
+    old = listed() if LIST.exists() else set()
+    names = sorted((old | slow_cases(times)) - set(KEPT))
+    head = "# Cases that `make test` leaves out. Made by `python -m tests.slow`, see slow.py.\n"
+    LIST.write_text(head + "".join(f"{name}\n" for name in names), encoding="utf-8")
+    left = sum(seconds for name, seconds in times.items() if name not in names)
+    print(f"{len(names)} slow cases of {len(times)}; the others took {left:.0f} s")
+
+
+if __name__ == "__main__":
+    main()
