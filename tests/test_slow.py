@@ -12,8 +12,8 @@ ROOT = Path(__file__).parents[1]
 
 
 def test_slow_are_all_but_the_fastest_case_of_a_test_and_that_too_where_it_takes_long():
-    times = {"a.py::one[1]": 5.0, "a.py::one[2]": 3.0, "a.py::one[3]": 1.0, "b.py::two": 5.9, "b.py::three[x]": 9.0}
-    times |= {slow.KEPT[0]: 100.0}
+    times = {"a.py::one[1]": 5.0, "a.py::one[2]": 3.0, "a.py::one[3]": 1.0, "b.py::two": 3.9, "b.py::three[x]": 9.0}
+    times |= {slow.KEPT[-1]: 100.0, f"{slow.KEPT[0]}::in_a_file": 9.0}
     assert slow.slow_cases(times) == {"a.py::one[1]", "a.py::one[2]", "b.py::three[x]"}
 
 
@@ -62,7 +62,7 @@ def test_a_kept_case_that_does_not_exist_is_named(tmp_path, monkeypatch):
     monkeypatch.setattr(slow, "LIST", tmp_path / "slow.txt")
 
     class Item:
-        nodeid = slow.KEPT[0].split("::")[0] + "::another"
+        nodeid = slow.KEPT[-1].split("::")[0] + "::another"
 
     with pytest.raises(pytest.UsageError, match=r"slow\.py: "):
         slow.mark([Item()], whole_files=True)

@@ -239,7 +239,8 @@ def read_intrinsics(path: str | os.PathLike[str]) -> dict[str, Lens]:
             bends = None if distortion is None else np.asarray(distortion, float).reshape(-1)
         except (TypeError, KeyError, ValueError) as error:
             raise ValueError(
-                f"{path}: {shown(str(name))[1:-1]}: expected K (3,3) in pixels, and distortion or none; {error}."
+                f"{path}: {shown(str(name))[1:-1]}: expected K (3,3) in pixels, and distortion or none; "
+                f"{str(error).rstrip('.')}."
             ) from None
         if K.shape != (3, 3) or not np.isfinite(K).all() or not (K[0, 0] > 0 and K[1, 1] > 0):
             raise ValueError(f"{path}: {name}: K: expected 3x3 with positive focal lengths; found {shown(K.tolist())}.")

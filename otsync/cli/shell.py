@@ -13,7 +13,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from typing import Any, TextIO
 
@@ -190,7 +190,7 @@ class Interrupted:
 def ended_like_ctrl_c(told: Interrupted) -> Iterator[None]:
     """Ctrl-C, and SIGTERM, which schedulers and service managers send, raise KeyboardInterrupt, so that everything is
     cleared up; ``told`` remembers it. One that comes where no error can be raised (a library's callback) would be told
-    on standard error and forgotten: it comes again.
+    on standard error and forgotten: it comes again. Where clearing up takes long, standard error says why.
 
     Only a process's main thread can be told so.
     """
@@ -199,8 +199,16 @@ def ended_like_ctrl_c(told: Interrupted) -> Iterator[None]:
         return
 
     def interrupt(number: int, frame: Any) -> None:
+        if not told.came:
+            _thread.start_new_thread(patience, ())  # threading.Thread takes locks, which the handler's thread may hold
         told.came = True
         raise KeyboardInterrupt
+
+    def patience() -> None:
+        time.sleep(PATIENCE)
+        if told.runs:
+            with suppress(OSError):  # nobody reads it any more
+                os.write(2, f"\n{WAITS}\n".encode())
 
     def swallowed(error: Any) -> None:
         if issubclass(error.exc_type, KeyboardInterrupt):
@@ -235,6 +243,11 @@ def ended_like_ctrl_c(told: Interrupted) -> Iterator[None]:
 
 SWALLOWED = 0.05
 """Seconds until an interrupt that was swallowed comes again."""
+
+PATIENCE = 1.5
+"""Seconds after an interrupt that a command may take to end without a word."""
+
+WAITS = "interrupted: waits for what is under way, so that it is kept ..."
 
 
 def parsed(prog: str, commands: Mapping[str, Load], args: list[str], description: str) -> Any:

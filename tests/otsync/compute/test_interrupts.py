@@ -99,6 +99,24 @@ def ran(what) -> int:
     )
 
 
+@pytest.mark.parametrize(("clearing", "says"), [(0.5, True), (0.0, False)])
+def test_a_command_that_takes_long_to_end_says_what_it_waits_for(clearing, says, monkeypatch, capfd):
+    monkeypatch.setattr("otsync.cli.shell.PATIENCE", 0.1)
+
+    def slow_to_end() -> int:
+        try:
+            signal.raise_signal(signal.SIGINT)
+        finally:
+            time.sleep(clearing)
+        return 0
+
+    assert ran(slow_to_end) == 130
+    time.sleep(0.2)
+    told = capfd.readouterr().err
+    assert told.count("waits for what is under way") == says
+    assert told.rstrip().endswith("prog: interrupted; nothing is left")
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupt_that_a_callback_swallows_comes_again(number, capsys):
     import weakref
