@@ -5,13 +5,14 @@ Needs a rig that is synchronised, or aligned already: the hull intersects masks 
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 
 from ..compute.threads import MapLike
 from ..files.cache import Cache
@@ -361,7 +362,7 @@ class Space:
         occupied = []
         for s in full[:: max(1, len(full) // 12)]:
             present = np.flatnonzero(rig.index[s] >= 0)
-            masks = box.masks(rig, int(s), present, round(coarse / unit * 160))
+            masks = grown(box.masks(rig, int(s), present), round(coarse / unit * 160))
             seen = (masks, masks, sizes[present], P[present])
             grid = carve(*seen, low, coarse, dims, 4, stereo.min_views, stereo.misses, near)
             occupied.append(np.argwhere(grid))
@@ -377,26 +378,24 @@ class Space:
         fine = np.ceil(size / (stereo.voxel * unit) / 4).astype(int) * 4
         return cls(P, K, sizes, rig.cameras, order, unit, start, fine, near, far)
 
-    def masks(self, rig: Rig, s: int, present: np.ndarray, grow: int) -> np.ndarray:
+    def masks(self, rig: Rig, s: int, present: np.ndarray) -> UInt8[np.ndarray, "P h w"]:
+        """Masks at moment s of the videos that show it, without lens distortion."""
         import cv2
 
-        kernel = np.ones((grow | 1, grow | 1), np.uint8)
         out = []
-        for v in present:
-            mask = rig.masks[int(v)][int(rig.index[s, v])].astype(np.uint8)
-            mask = _straight(mask, rig.cameras[int(v)], self.K[v], cv2.INTER_NEAREST)
-            out.append(cv2.dilate(mask, kernel) if grow > 1 else mask)
+        for v in present.tolist():
+            mask = rig.masks[v][int(rig.index[s, v])].astype(np.uint8)
+            out.append(_straight(mask, rig.cameras[v], self.K[v], cv2.INTER_NEAREST))
         return together(out)
 
     def hull(self, stereo: HullStereo, rig: Rig, s: int, present: np.ndarray) -> np.ndarray:
         from .kernels_stereo import carve
 
         block = 4
-        masks = self.masks(rig, s, present, 1)
-        coarse = self.masks(rig, s, present, round(block * stereo.voxel * 160))
+        masks = self.masks(rig, s, present)
         return carve(
             masks,
-            coarse,
+            grown(masks, round(block * stereo.voxel * 160)),
             self.sizes[present],
             self.P[present],
             self.low,
@@ -418,6 +417,14 @@ class Space:
         return np.ascontiguousarray(R), self.cameras[v].center, np.linalg.inv(self.K[v])
 
 
+def grown(masks: UInt8[np.ndarray, "V h w"], by: int) -> UInt8[np.ndarray, "V h w"]:
+    """Masks widened by half of ``by`` pixels on every side."""
+    import cv2
+
+    kernel = np.ones((by | 1, by | 1), np.uint8)
+    return np.stack([cv2.dilate(mask, kernel) for mask in masks])
+
+
 def together(images: Sequence[np.ndarray]) -> np.ndarray:
     """Images in one array; zeros beside and below those that are smaller than others."""
     sizes = [image.shape for image in images]
@@ -435,11 +442,20 @@ def _straight(image: np.ndarray, camera: Camera, K: np.ndarray, how: int) -> np.
         return image
     import cv2
 
-    h, w = image.shape
-    # cv2's pixel centres lie at whole numbers, K's at halves
-    shifted = K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-    maps = cv2.initUndistortRectifyMap(shifted, camera.distortion, None, shifted, (w, h), cv2.CV_32FC1)
+    size = (image.shape[1], image.shape[0])
+    maps = _maps(camera.distortion.tobytes(), K.tobytes(), size)
     return cv2.remap(image, *maps, how)
+
+
+@functools.lru_cache(64)
+def _maps(distortion: bytes, K: bytes, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Where the pixels of an image without lens distortion lie in the distorted one."""
+    import cv2
+
+    lens, matrix = np.frombuffer(distortion), np.frombuffer(K).reshape(3, 3)
+    # cv2's pixel centres lie at whole numbers, K's at halves
+    shifted = matrix - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+    return cv2.initUndistortRectifyMap(shifted, lens, None, shifted, size, cv2.CV_32FC1)
 
 
 def _nearest(clock: np.ndarray, moments: np.ndarray, within: float) -> np.ndarray:
