@@ -13,7 +13,7 @@ from ..compute.threads import MapLike
 from ..files.cache import Cache
 from ..files.digest import content_key
 from ..geometry import undistort
-from .stereo import MADE_BY, HullStereo, Rig, Space
+from .stereo import MADE_BY, Hull, HullStereo, Rig, Space
 from .working import WorkingFrames
 
 
@@ -109,7 +109,7 @@ class DenseStereo:
         return out
 
     def _map(
-        self, rig: Rig, space: Space, hull: np.ndarray, images: dict[int, np.ndarray], near: list[int], v: int, k: int
+        self, rig: Rig, space: Space, hull: Hull, images: dict[int, np.ndarray], near: list[int], v: int, k: int
     ) -> Float[np.ndarray, "h w"]:
         w, h = self.size(rig.frames[v])
         inside, uv = mask_pixels(np.asarray(rig.masks[v][k]), w, h)

@@ -14,6 +14,9 @@ _fast = {"contract", "reassoc", "nsz", "arcp"}
 TILE = 24
 """Pixels along a side of the squares in which an image is correlated, at most: patches of one share their samples."""
 
+SKIP = 16
+"""Voxels along a side of the blocks that rays go through at once where they are empty."""
+
 EDGE = 2.0
 """Pixels from the border of another view within which nothing is compared."""
 
@@ -66,9 +69,27 @@ def carve(masks, coarse_masks, sizes, P, low, voxel, dims, block, min_views, mis
     return grid
 
 
+@kernel()
+def blocks_of(grid):
+    """Which blocks of :data:`SKIP` voxels a side hold an occupied one, uint8."""
+    X, Y, Z = grid.shape
+    out = np.zeros((X // SKIP + 1, Y // SKIP + 1, Z // SKIP + 1), np.uint8)
+    for i in range(X):
+        for j in range(Y):
+            for c in range(Z // SKIP + 1):
+                some = np.uint8(0)
+                for k in range(c * SKIP, min((c + 1) * SKIP, Z)):
+                    some |= grid[i, j, k]
+                out[i // SKIP, j // SKIP, c] |= some
+    return out
+
+
 @kernel(fastmath=_fast)
-def first_hit(grid, low, voxel, center, rays, step, near, far):
-    """Depth at which each ray ``center + z ray`` (rays have unit z in the camera) enters the hull; 0: never."""
+def first_hit(grid, blocks, low, voxel, center, rays, step, near, far):
+    """Depth at which each ray ``center + z ray`` (rays have unit z in the camera) enters the hull; 0: never.
+
+    Depths are ``near`` and whole steps from there. blocks: of :func:`blocks_of`: a ray goes through empty ones at once.
+    """
     out = np.zeros(len(rays))
     for n in range(len(rays)):
         # from where the ray enters the box to where it leaves it
@@ -81,14 +102,30 @@ def first_hit(grid, low, voxel, center, rays, step, near, far):
         k = max(0, int((enters - near) / step) - 1)
         while near + k * step < leaves + step:
             z = near + k * step
-            i = int(np.floor((center[0] + z * rays[n, 0] - low[0]) / voxel))
-            j = int(np.floor((center[1] + z * rays[n, 1] - low[1]) / voxel))
-            m = int(np.floor((center[2] + z * rays[n, 2] - low[2]) / voxel))
-            if 0 <= i < grid.shape[0] and 0 <= j < grid.shape[1] and 0 <= m < grid.shape[2] and grid[i, j, m]:
-                out[n] = z
-                break
+            x = (center[0] + z * rays[n, 0] - low[0]) / voxel
+            y = (center[1] + z * rays[n, 1] - low[1]) / voxel
+            t = (center[2] + z * rays[n, 2] - low[2]) / voxel
+            i, j, m = int(np.floor(x)), int(np.floor(y)), int(np.floor(t))
             k += 1
+            if not (0 <= i < grid.shape[0] and 0 <= j < grid.shape[1] and 0 <= m < grid.shape[2]):
+                continue
+            if blocks[i // SKIP, j // SKIP, m // SKIP]:
+                if grid[i, j, m]:
+                    out[n] = z
+                    break
+            else:
+                ahead = _within(x, i, rays[n, 0]), _within(y, j, rays[n, 1]), _within(t, m, rays[n, 2])
+                k = max(k, int((z - near + voxel * min(ahead)) / step))
     return out
+
+
+@inlined(fastmath=_fast)
+def _within(x, i, ray):
+    """How far along a ray, in voxels, it stays within the block of voxel i, from place x on one axis."""
+    if abs(ray) < 1e-12:
+        return 1e9
+    begin = i // SKIP * SKIP
+    return ((begin + SKIP if ray > 0 else begin) - x) / ray
 
 
 @kernel(fastmath=_fast)

@@ -194,7 +194,7 @@ class HullStereo:
         return out
 
     def _depths(
-        self, space: Space, hull: np.ndarray, images: dict[int, np.ndarray], v: int, points: np.ndarray, k: int
+        self, space: Space, hull: Hull, images: dict[int, np.ndarray], v: int, points: np.ndarray, k: int
     ) -> Float[np.ndarray, " N"]:
         around = self.spread * np.array(
             [(0, 0), (-1, -1), (0, -1), (1, -1), (-1, 0), (1, 0), (-1, 1), (0, 1), (1, 1)], float
@@ -215,7 +215,7 @@ class HullStereo:
     def depths(
         self,
         space: Space,
-        hull: np.ndarray,
+        hull: Hull,
         images: dict[int, np.ndarray],
         near: Sequence[int],
         v: int,
@@ -236,7 +236,7 @@ class HullStereo:
         unit, image = space.unit, images[v]
         rays = np.concatenate([points, np.ones((len(points), 1))], 1) @ inverse_K.T @ R.T
         voxel = self.voxel * unit
-        start = first_hit(hull, space.low, voxel, center, rays, 0.4 * voxel, space.near, space.far)
+        start = first_hit(hull.grid, hull.blocks, space.low, voxel, center, rays, 0.4 * voxel, space.near, space.far)
         start = np.append(start, 0.0)  # of the point that is none: no group adds it
         h, w = image.shape
         first, last, close, step = unit * self.sweep[0], unit * self.sweep[1], unit * SURFACE, unit * self.step
@@ -318,6 +318,14 @@ def fill_between(
 
 
 @dataclass(frozen=True, eq=False)
+class Hull:
+    """The visual hull of a moment: its occupied voxels, and the blocks of them that hold one."""
+
+    grid: UInt8[np.ndarray, "X Y Z"]
+    blocks: UInt8[np.ndarray, "x y z"]
+
+
+@dataclass(frozen=True, eq=False)
 class Space:
     """The box that the hull is carved from, and the cameras at working resolution, images of ``sizes`` (width, height).
 
@@ -388,12 +396,12 @@ class Space:
             out.append(_straight(mask, rig.cameras[v], self.K[v], cv2.INTER_NEAREST))
         return together(out)
 
-    def hull(self, stereo: HullStereo, rig: Rig, s: int, present: np.ndarray) -> np.ndarray:
-        from .kernels_stereo import carve
+    def hull(self, stereo: HullStereo, rig: Rig, s: int, present: np.ndarray) -> Hull:
+        from .kernels_stereo import blocks_of, carve
 
         block = 4
         masks = self.masks(rig, s, present)
-        return carve(
+        grid = carve(
             masks,
             grown(masks, round(block * stereo.voxel * 160)),
             self.sizes[present],
@@ -406,6 +414,7 @@ class Space:
             stereo.misses,
             self.near,
         )
+        return Hull(grid, blocks_of(grid))
 
     def image(self, rig: Rig, v: int, k: int) -> np.ndarray:
         import cv2
