@@ -5,7 +5,7 @@ BIN    := $(VENV)/bin
 # --no-compile: byte code is made of what is imported, when it is; compiling all of torch takes half a minute
 PIP    := $(BIN)/pip --disable-pip-version-check install --quiet --no-compile -c constraints.txt
 WORKERS ?= 2
-PYTEST  ?=  # more options of pytest
+MORE    ?=  # options of pytest: make test MORE=--lf
 
 .PHONY: demo pictures test test-all test-floors bench schemas docs stability lint format clean
 .DELETE_ON_ERROR:
@@ -30,10 +30,10 @@ demo: $(VENV)/.demo  ## films a small moving world, and does the whole job on th
 	$(BIN)/otsync --quiet demo --out demo
 
 test: $(VENV)/.test lint  ## under ten minutes on two quiet cores; what is left out: tests/slow.py
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m "not slow" --durations=20 --durations-min=4 $(PYTEST)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m "not slow" --durations=20 --durations-min=4 $(MORE)
 
 test-all: $(VENV)/.test lint  ## every test, the slow ones too
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile $(PYTEST)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile $(MORE)
 
 test-floors:  ## fast tests of the core with the lowest versions that pyproject.toml allows, in an environment of its own
 	PYTHON=$(PYTHON) WORKERS=$(WORKERS) .ci/floors

@@ -19,7 +19,9 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN and threading.current_threa
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    mark(items, whole_files=not any("::" in argument for argument in config.args))
+    # what failed last, or comes behind it, is no whole file
+    part = config.getoption("lf", False) or config.getoption("stepwise", False)
+    mark(items, whole_files=not part and not any("::" in argument for argument in config.args))
 
 
 @pytest.fixture(scope="session")

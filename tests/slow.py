@@ -1,20 +1,20 @@
 """Which tests are slow, by what they took: `make test` leaves them out, `make test-all` runs them.
 
 Tests that are slow by design say so themselves (``@pytest.mark.slow``). Others are found slow, case by case: they are
-listed in slow.txt beside this file, and marked when they are collected. The list is made anew from a report of all
-tests, of a machine that does nothing else:
+listed in slow.txt beside this file, and marked when they are collected. A report of tests, of a machine that does
+nothing else, adds to the list:
 
-    make test-all PYTEST="--junitxml report.xml"
+    make test MORE="--junitxml report.xml"
     python -m tests.slow report.xml
 
-What is listed already stays: times of what all cases of a file share are told of the first alone.
+What is listed stays: the time of what all cases of a file share is that of whichever comes first.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -72,15 +72,19 @@ def mark(items: Sequence[pytest.Item], whole_files: bool) -> None:
             raise pytest.UsageError(f"tests/{where}: {name} does not exist. Take it out, or give its new name.")
 
 
-def slow_cases(times: dict[str, float]) -> set[str]:
-    """The slow ones of cases that took so many seconds, see :data:`SLOW`, :data:`TOO_SLOW` and :data:`KEPT`."""
+def slow_cases(times: dict[str, float], old: Set[str] = frozenset()) -> set[str]:
+    """The slow ones of cases that took so many seconds, and those that were slow before.
+
+    See :data:`SLOW`, :data:`TOO_SLOW` and :data:`KEPT`. The fastest of a test is that of those that were not slow.
+    """
     tests: dict[str, list[str]] = defaultdict(list)
     for name in times:
         tests[name.split("[")[0]].append(name)
-    slow = set()
+    slow = set(old)
     for cases in tests.values():
-        fastest = min(cases, key=lambda name: times[name])
-        slow |= {c for c in cases if times[c] >= (TOO_SLOW if c == fastest else SLOW)}
+        left = [c for c in cases if c not in old]
+        fastest = min(left, key=lambda name: times[name], default="")
+        slow |= {c for c in left if times[c] >= (TOO_SLOW if c == fastest else SLOW)}
     return {name for name in slow if not kept(name)}
 
 
@@ -96,11 +100,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("report", type=Path, help="JUnit report of a run of all tests")
     times = times_of(parser.parse_args(arguments).report)
     old = listed() if LIST.exists() else set()
-    names = sorted(name for name in old | slow_cases(times) if not kept(name))
+    names = sorted(slow_cases(times, old))
     head = "# Cases that `make test` leaves out. Made by `python -m tests.slow`, see slow.py.\n"
     LIST.write_text(head + "".join(f"{name}\n" for name in names), encoding="utf-8")
     left = sum(seconds for name, seconds in times.items() if name not in names)
-    print(f"{len(names)} slow cases of {len(times)}; the others took {left:.0f} s")
+    print(f"{len(names)} slow cases; the others of the report took {left:.0f} s")
 
 
 if __name__ == "__main__":

@@ -17,6 +17,12 @@ def test_slow_are_all_but_the_fastest_case_of_a_test_and_that_too_where_it_takes
     assert slow.slow_cases(times) == {"a.py::one[1]", "a.py::one[2]", "b.py::three[x]"}
 
 
+def test_the_fastest_case_stays_the_one_that_was():
+    old = {"a.py::one[1]"}
+    assert slow.slow_cases({"a.py::one[1]": 2.0, "a.py::one[2]": 2.1}, old) == old
+    assert slow.slow_cases({"a.py::one[1]": 2.0, "a.py::one[2]": 9.1}, old) == old | {"a.py::one[2]"}
+
+
 def test_the_list_is_made_of_a_report_and_keeps_what_it_has(tmp_path, monkeypatch, capsys):
     report, names = tmp_path / "report.xml", tmp_path / "slow.txt"
     cases = "".join(
@@ -28,7 +34,7 @@ def test_the_list_is_made_of_a_report_and_keeps_what_it_has(tmp_path, monkeypatc
     monkeypatch.setattr(slow, "LIST", names)
     slow.main([str(report)])
     assert slow.listed() == {"tests/a/test_b.py::test_three", "tests/a/test_b.py::test_one[x-1]"}
-    assert "2 slow cases of 2; the others took 0 s" in capsys.readouterr().out
+    assert "2 slow cases; the others of the report took 0 s" in capsys.readouterr().out
 
 
 def test_a_listed_case_that_does_not_exist_is_named(tmp_path, monkeypatch):

@@ -26,5 +26,5 @@ def main(args: list[str] | None = None) -> int:
         args,
         description=__doc__ or "",
         refused=(Refused,),
-        interrupted="nothing half-written is left, and the same command goes on from what is kept.",
+        interrupted="nothing half-written is left, and the same command may be given again.",
     )

@@ -199,16 +199,18 @@ def ended_like_ctrl_c(told: Interrupted) -> Iterator[None]:
         return
 
     def interrupt(number: int, frame: Any) -> None:
-        if not told.came:
-            _thread.start_new_thread(patience, ())  # threading.Thread takes locks, which the handler's thread may hold
-        told.came = True
+        first, told.came = not told.came, True
+        if first:
+            with suppress(RuntimeError, MemoryError):  # no more threads: then without a word
+                # threading.Thread takes locks, which this thread may hold
+                _thread.start_new_thread(patience, ())
         raise KeyboardInterrupt
 
     def patience() -> None:
         time.sleep(PATIENCE)
-        if told.runs:
-            with suppress(OSError):  # nobody reads it any more
-                os.write(2, f"\n{WAITS}\n".encode())
+        if told.runs and sys.stderr is not None:
+            with suppress(OSError, ValueError):  # nobody reads it any more
+                print(f"\n{WAITS}", file=sys.stderr, flush=True)
 
     def swallowed(error: Any) -> None:
         if issubclass(error.exc_type, KeyboardInterrupt):
@@ -247,7 +249,7 @@ SWALLOWED = 0.05
 PATIENCE = 1.5
 """Seconds after an interrupt that a command may take to end without a word."""
 
-WAITS = "interrupted: waits for what is under way, so that it is kept ..."
+WAITS = "interrupted: waits for what is under way ..."
 
 
 def parsed(prog: str, commands: Mapping[str, Load], args: list[str], description: str) -> Any:

@@ -17,6 +17,9 @@ TILE = 24
 SKIP = 16
 """Voxels along a side of the blocks that rays go through at once where they are empty."""
 
+CLOSE = 0.1
+"""Share of a point's own depth from which it lies in front of another view."""
+
 EDGE = 2.0
 """Pixels from the border of another view within which nothing is compared."""
 
@@ -100,7 +103,7 @@ def first_hit(grid, blocks, low, voxel, center, rays, step, near, far):
                 other = (low[a] + voxel * grid.shape[a] - center[a]) / rays[n, a]
                 enters, leaves = max(enters, min(one, other)), min(leaves, max(one, other))
         k = max(0, int((enters - near) / step) - 1)
-        while near + k * step < leaves + step:
+        while near + k * step < min(leaves + step, far):
             z = near + k * step
             x = (center[0] + z * rays[n, 0] - low[0]) / voxel
             y = (center[1] + z * rays[n, 1] - low[1]) / voxel
@@ -134,21 +137,25 @@ def planes_of(start, group, first, last, near, step):
 
     start (M+1,): depth of the hull at the points, 0 unknown, and a 0 for the point that is none; group (N,S): the
     points whose correlations are added, the one that is measured first. It asks for the planes, at whole numbers of
-    ``step``, from ``first`` to ``last`` behind its hull; the others are asked where their hull is no further than
-    ``near`` from its own. The group of a point is -1 where several ask for it.
+    ``step``, from ``first`` to ``last`` behind its hull, which are returned last, (N,2); the others are asked where
+    their hull is no further than ``near`` from its own. The group of a point is -1 where several ask for it, -2 where
+    none does.
     """
     low, high, owner = np.full(len(start), 2**30), np.full(len(start), -1), np.full(len(start), -2)
+    asked = np.zeros((len(group), 2), np.int64)
     for n in range(len(group)):
         z = start[group[n, 0]]
-        if z <= 0:
+        one, other = max(1, int(np.ceil((z + first) / step))), int(np.floor((z + last) / step))
+        if z <= 0 or other < one:
+            asked[n, 1] = -1
             continue
-        one, other = _planes(z, first, last, step)
+        asked[n, 0], asked[n, 1] = one, other
         for s in range(group.shape[1]):
             m = group[n, s]
             if start[m] > 0 and abs(start[m] - z) <= near:
                 low[m], high[m] = min(low[m], one), max(high[m], other)
                 owner[m] = n if owner[m] == -2 else -1
-    return low[:-1], high[:-1], owner[:-1]
+    return low[:-1], high[:-1], owner[:-1], asked
 
 
 @kernel(fastmath=_fast)
@@ -206,12 +213,6 @@ def boxes_of_squares(points, low, high, half, h, w):
 
 
 @inlined(fastmath=_fast)
-def _planes(z, first, last, step):
-    """First and last plane of the sweep behind a hull at depth z."""
-    return int(np.ceil((z + first) / step)), int(np.floor((z + last) / step))
-
-
-@inlined(fastmath=_fast)
 def _sums(values, side, rows, columns, across, out):
     """Sums of values over the squares of ``side``, whose first corners are the first rows and columns."""
     for y in range(rows + side - 1):
@@ -234,21 +235,22 @@ def _inside(A, b, z, left, right, top, bottom, w, h):
 
     All of its corners beyond one side of the image is nothing: straight lines stay straight.
     """
-    before, behind, above, below = 0, 0, 0, 0
+    before, behind, above, below, hidden = 0, 0, 0, 0, 0
     for c in range(4):
         x, y = right if c % 2 else left, bottom if c // 2 else top
         depth = z * (A[2, 0] * x + A[2, 1] * y + A[2, 2]) + b[2]
-        if depth < 0.1 * z:
-            return 0
+        if depth < CLOSE * z:
+            hidden += 1
+            continue
         u = (z * (A[0, 0] * x + A[0, 1] * y + A[0, 2]) + b[0]) / depth
         v = (z * (A[1, 0] * x + A[1, 1] * y + A[1, 2]) + b[1]) / depth
         before += u < EDGE
         behind += u >= w - EDGE
         above += v < EDGE
         below += v >= h - EDGE
-    if max(before, behind, above, below) == 4:
+    if max(before, behind, above, below, hidden) == 4:
         return 0
-    return 1 if before + behind + above + below == 0 else -1
+    return 1 if before + behind + above + below + hidden == 0 else -1
 
 
 @kernel(fastmath=_fast)
@@ -259,8 +261,8 @@ def correlate(image, others, sizes, A, b, boxes, at, step, half, noise):
     b (V,3): a pixel p = (x, y, 1) at depth z lies at ``z A p + b`` in another view. boxes (B,5): number of a plane,
     first and last column, first and last row; at (B+1,): where in the result each box begins, row by row. A patch has 2
     ``half`` + 1 pixels a side and lies in its plane z = i ``step``, parallel to the image. Each value is the mean of
-    the two best views, one view's less .2, -1 for none. ``noise``: variance of grey levels that keeps flat patches from
-    correlating.
+    the two best views, one view's less .2, and -1 where no view sees all of the patch. ``noise``: variance of grey
+    levels that keeps flat patches from correlating.
 
     Patches of neighbouring pixels share their samples: a view is sampled once a plane, and patches are sums over it.
     """
@@ -292,6 +294,7 @@ def correlate(image, others, sizes, A, b, boxes, at, step, half, noise):
             if whole == 0:
                 continue
             other = others[v]
+            close = f(CLOSE * z)
             du, dv, dz = f(z * A[v, 0, 0]), f(z * A[v, 1, 0]), f(z * A[v, 2, 0])
             for y in range(tall):
                 Y = top + y
@@ -299,10 +302,11 @@ def correlate(image, others, sizes, A, b, boxes, at, step, half, noise):
                 v0 = f(z * (A[v, 1, 0] * left + A[v, 1, 1] * Y + A[v, 1, 2]) + b[v, 1])
                 z0 = f(z * (A[v, 2, 0] * left + A[v, 2, 1] * Y + A[v, 2, 2]) + b[v, 2])
                 for x in range(wide):
-                    there = f(1) / (z0 + f(x) * dz)
+                    deep = z0 + f(x) * dz
+                    there = f(1) / max(deep, close)
                     U, V = (u0 + f(x) * du) * there, (v0 + f(x) * dv) * there
                     if whole < 0:
-                        beyond[y, x] = U < EDGE or V < EDGE or w - EDGE <= U or h - EDGE <= V
+                        beyond[y, x] = deep < close or U < EDGE or V < EDGE or w - EDGE <= U or h - EDGE <= V
                         U, V = min(max(U, f(EDGE)), f(w - EDGE)), min(max(V, f(EDGE)), f(h - EDGE))
                     U, V = U - offset, V - offset
                     k, m = np.int32(U), np.int32(V)
@@ -425,20 +429,20 @@ def at_points(points, low, high, volume, boxes, at, own, squares, half, h, w):
 
 
 @kernel(fastmath=_fast)
-def choose_depth(start, group, scores, begins, lows, first, last, near, step, prior):
+def choose_depth(start, group, asked, scores, begins, lows, near, step, prior):
     """Depth per group of points, their correlations added up plane by plane.
 
-    scores, begins: of :func:`at_points`; lows: first planes of the points; the rest is as of :func:`planes_of`.
+    asked, lows: planes of the groups and first planes of the points, of :func:`planes_of`, as the rest is; scores,
+    begins: of :func:`at_points`.
     ``prior``: score lost per unit behind the hull. Returns depth (N,), 0 unknown, and its score (N,).
     """
     depth, quality = np.zeros(len(group)), np.full(len(group), -1.0)
-    total = np.empty(int((last - first) / step) + 3)
+    total = np.empty(0 if len(asked) == 0 else max(0, (asked[:, 1] - asked[:, 0] + 1).max()))
     for n in range(len(group)):
-        z = start[group[n, 0]]
-        if z <= 0:
+        low, D = asked[n, 0], asked[n, 1] - asked[n, 0] + 1
+        if D < 1:
             continue
-        low, high = _planes(z, first, last, step)
-        D, count = high - low + 1, 0
+        z, count = start[group[n, 0]], 0
         total[:D] = 0.0
         for s in range(group.shape[1]):
             m = group[n, s]

@@ -19,7 +19,7 @@ from ..files.cache import Cache
 from ..files.digest import content_key
 from ..geometry import common_target
 from ..types import Camera, Video
-from ..types.checks import check_whole
+from ..types.checks import check_number, check_whole
 from .working import WorkingFrames
 
 WIDE = 1.0
@@ -46,7 +46,7 @@ class EmptyHull(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """What stereo needs of all videos: pixels and masks at one working size, and which frames belong together.
+    """What stereo needs of all videos: pixels and masks at working size, and which frames belong together.
 
     Args:
         index: (S,V) frame of every video at each moment, -1 where the video has none within half a frame.
@@ -110,9 +110,9 @@ class TrackDepth(Protocol):
 class HullStereo:
     """Depth at given pixels: where the ray enters the visual hull, then the best correlation up to a limb behind it.
 
-    Measured with 27 views: cross-camera median difference .59 %, p90 3.5 %. Lengths are in metres for cameras
-    about 3.3 m from the scene and scale with that distance, so that no unit is assumed, and with the part of the scene
-    that a long lens shows; pixels at 640 of width.
+    Measured with 14 views of basketball: dense maps of neighbouring cameras differ by .76 % (median; 90 %: 7 %).
+    Lengths are in metres for cameras about 3.3 m from the scene and scale with that distance, so that no unit is
+    assumed, and with the part of the scene that a long lens shows; pixels at 640 of width.
 
     Args:
         voxel, sweep (from, to), step: metres. patch: half width of the correlation window. neighbours: views that
@@ -139,6 +139,12 @@ class HullStereo:
     def __post_init__(self) -> None:
         check_whole("HullStereo.every", self.every, 1)
         check_whole("HullStereo.chunk", self.chunk, 1)
+        check_number("HullStereo.voxel", self.voxel)
+        check_number("HullStereo.step", self.step)
+        if not self.sweep[1] - self.sweep[0] >= self.step:
+            raise ValueError(
+                f"HullStereo.sweep: expected from and to, at least a step of {self.step:g} apart; found {self.sweep}."
+            )
 
     def __call__(
         self,
@@ -240,14 +246,14 @@ class HullStereo:
         start = np.append(start, 0.0)  # of the point that is none: no group adds it
         h, w = image.shape
         first, last, close, step = unit * self.sweep[0], unit * self.sweep[1], unit * SURFACE, unit * self.step
-        low, high, owner = planes_of(start, group, first, last, close, step)
+        low, high, owner, asked = planes_of(start, group, first, last, close, step)
         boxes, own, squares = boxes_to_compare(points, low, high, owner, len(group), self.patch, h, w)
         at = np.concatenate([[0], np.cumsum(_pixels(boxes[:, 1:]))])
         others, P, sizes = together([images[u] for u in near]), space.P[near], space.sizes[near]
         A, b = P[:, :, :3] @ (R @ inverse_K), P[:, :, :3] @ center + P[:, :, 3]
         volume = correlate(image, others, sizes, A, b, boxes, at, step, self.patch, np.float32(NOISE))
         scores, begins = at_points(points, low, high, volume, boxes, at, own, squares, self.patch, h, w)
-        depth, quality = choose_depth(start, group, scores, begins, low, first, last, close, step, BEHIND / unit)
+        depth, quality = choose_depth(start, group, asked, scores, begins, low, close, step, BEHIND / unit)
         return np.where(quality > self.least, depth, 0.0).astype(np.float32)
 
 
@@ -287,7 +293,8 @@ def boxes_to_compare(
             which = np.repeat(np.arange(groups), counts)
             begins = np.cumsum(counts) - counts
             plane = np.arange(len(which)) - begins[which] + planes[which, 0]
-            own = np.where(inside, begins[owner], -1)
+            own = np.full(len(points), -1)
+            own[inside] = begins[owner[inside]]
             return np.column_stack([plane, alone[which]]).astype(np.int32), own, np.full((0, 0, 0), -1)
     return squares, np.full(len(points), -1), number
 
@@ -392,7 +399,7 @@ class Space:
 
         out = []
         for v in present.tolist():
-            mask = rig.masks[v][int(rig.index[s, v])].astype(np.uint8)
+            mask = rig.frames[v].mask(rig.masks[v][int(rig.index[s, v])]).astype(np.uint8)
             out.append(_straight(mask, rig.cameras[v], self.K[v], cv2.INTER_NEAREST))
         return together(out)
 

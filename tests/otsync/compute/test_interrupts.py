@@ -99,22 +99,30 @@ def ran(what) -> int:
     )
 
 
-@pytest.mark.parametrize(("clearing", "says"), [(0.5, True), (0.0, False)])
-def test_a_command_that_takes_long_to_end_says_what_it_waits_for(clearing, says, monkeypatch, capfd):
-    monkeypatch.setattr("otsync.cli.shell.PATIENCE", 0.1)
+@pytest.mark.parametrize("says", [True, False])
+def test_a_command_that_takes_long_to_end_says_what_it_waits_for(says, monkeypatch, capfd):
+    monkeypatch.setattr("otsync.cli.shell.PATIENCE", 0.1 if says else 60.0)
 
     def slow_to_end() -> int:
         try:
             signal.raise_signal(signal.SIGINT)
         finally:
-            time.sleep(clearing)
+            time.sleep(1.0 if says else 0.0)
         return 0
 
     assert ran(slow_to_end) == 130
-    time.sleep(0.2)
     told = capfd.readouterr().err
     assert told.count("waits for what is under way") == says
     assert told.rstrip().endswith("prog: interrupted; nothing is left")
+
+
+def test_an_interrupt_that_can_begin_no_thread_is_one_all_the_same(monkeypatch, capsys):
+    def none_left(*_: object) -> int:
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr("otsync.cli.shell._thread.start_new_thread", none_left)
+    assert ran(lambda: signal.raise_signal(signal.SIGINT)) == 130
+    assert "prog: interrupted; nothing is left" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

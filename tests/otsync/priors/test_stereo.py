@@ -11,9 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from otsync.io.scene import Scene
-from otsync.priors.kernels_stereo import EDGE, at_points, blocks_of, correlate, first_hit, planes_of
-from otsync.priors.stereo import NOISE, boxes_to_compare, together
+from otsync.priors.kernels_stereo import EDGE, at_points, blocks_of, choose_depth, correlate, first_hit, planes_of
+from otsync.priors.stereo import NOISE, HullStereo, boxes_to_compare, together
 from otsync.recordings.dense_depth import depth_maps
+from tests.otsync.priors.test_priors import rig_of_balls
 from tests.otsync.recordings.test_depth_maps import AT, CHOSEN, FRAMES, STAGES, errors, measured, world
 
 __all__ = ["measured", "world"]
@@ -68,35 +69,94 @@ def by_definition(image: np.ndarray, others: list[np.ndarray], P: np.ndarray, x:
 @settings(max_examples=12, deadline=None)
 @given(st.integers(0, 10**6), st.floats(0.0, 0.25), st.booleans(), st.booleans())
 def test_the_sweep_is_the_correlation_of_every_patch(seed, turn, grey, alone):
-    """Whatever the views see of a patch, for pixels all over the image, whose sums share their samples."""
+    """Whatever the views see of a patch, for points all over the image and beyond, whose sums share their samples."""
     others = [view(seed + 1 + v, *size) for v, size in enumerate(SIZES)]
     image = others[0] if grey else view(seed, 64, 48)
     P = cameras(seed, turn)
     A, b = P[:, :, :3] @ np.linalg.inv(K), P[:, :, 3]
     rng = np.random.default_rng(seed)
-    pixels = rng.integers(0, [64, 48], (40, 2))
-    start = np.where(rng.uniform(size=40) < 0.1, 0.0, rng.uniform(0.8, 1.6, 40))
-    group = np.arange(40)[:, None] if alone else np.column_stack([np.arange(40), np.full((40, 2), [40, 0])])
-    if not alone:
-        start[0] = 1.2  # which all that are near it ask for, too
-    low, high, owner = planes_of(np.append(start, 0.0), group, -0.1, 0.2, 0.05, STEP)
-    boxes, own, squares = boxes_to_compare(pixels + 0.5, low, high, owner, 40, HALF, 48, 64)
+    points = rng.uniform(-2, [66, 50], (30, 2))
+    points[:10] = np.floor(points[:10]) + 0.5
+    start = np.append(np.where(rng.uniform(size=30) < 0.1, 0.0, rng.uniform(0.8, 1.6, 30)), 0.0)
+    group = np.arange(30)[:, None] if alone else np.column_stack([np.arange(30), np.full((30, 2), [30, 0])])
+    low, high, owner, asked = planes_of(start, group, -0.1, 0.2, 0.05, STEP)
+    boxes, own, squares = boxes_to_compare(points, low, high, owner, 30, HALF, 48, 64)
     assert (own < 0).all() == (squares.size > 0)
     area = (boxes[:, 2] - boxes[:, 1] + 1) * (boxes[:, 4] - boxes[:, 3] + 1)
     at = np.concatenate([[0], np.cumsum(area)])
     volume = correlate(image, together(others), SIZES, A, b, boxes, at, STEP, HALF, np.float32(NOISE))
-    scores, begins = at_points(pixels + 0.5, low, high, volume, boxes, at, own, squares, HALF, 48, 64)
+    scores, begins = at_points(points, low, high, volume, boxes, at, own, squares, HALF, 48, 64)
     assert begins[-1] == len(scores)
-    np.testing.assert_array_equal(low[start > 0][1:], np.ceil((start[start > 0][1:] - 0.1) / STEP))
-    np.testing.assert_array_equal(high[start > 0][1:], np.floor((start[start > 0][1:] + 0.2) / STEP))
-    for m, (x, y) in enumerate(pixels):
-        found = scores[begins[m] : begins[m + 1]]
+    for m, (x, y) in enumerate(points - 0.5):
         planes = np.arange(low[m], high[m] + 1)
-        assert len(found) == len(planes)
-        whole = HALF <= x < 64 - HALF and HALF <= y < 48 - HALF
-        for score, i in zip(found, planes, strict=True):
-            true = by_definition(image, others, P, x, y, i * STEP) if whole else -1.0
-            assert score == pytest.approx(max(true, -0.2), abs=2e-3)
+        assert len(planes) == begins[m + 1] - begins[m] and (len(planes) > 0) == (start[m] > 0)
+        i, j = int(np.floor(x)), int(np.floor(y))
+        for score, plane in zip(scores[begins[m] : begins[m + 1]], planes, strict=True):
+            true = 0.0
+            for k, r in ((i, j), (i + 1, j), (i, j + 1), (i + 1, j + 1)):
+                whole = HALF <= k < 64 - HALF and HALF <= r < 48 - HALF
+                here = by_definition(image, others, P, k, r, plane * STEP) if whole else -0.2
+                true += (1 - abs(x - k)) * (1 - abs(y - r)) * max(here, -0.2)
+            assert score == pytest.approx(true, abs=2e-3)
+    depth, quality = choose_depth(start, group, asked, scores, begins, low, 0.05, STEP, 0.6)
+    for n, points_of in enumerate(group):
+        z, told = start[points_of[0]], []
+        for plane in range(asked[n, 0], asked[n, 1] + 1):
+            near = [m for m in points_of if start[m] > 0 and abs(start[m] - z) <= 0.05]
+            told.append(np.mean([scores[begins[m] + plane - low[m]] for m in near]))
+        assert (len(told) > 0) == (z > 0)
+        if told:
+            best = int(np.argmax(np.array(told) - 0.6 * (np.arange(*(asked[n] + [0, 1])) * STEP - z)))
+            assert quality[n] == pytest.approx(told[best], abs=1e-5)
+            assert abs(depth[n] / STEP - asked[n, 0] - best) <= 0.5
+        else:
+            assert depth[n] == 0 and quality[n] == -1
+
+
+def test_a_sweep_without_a_plane_tells_no_depth():
+    """Planes lie at whole steps: a sweep that is narrower than a step may miss them all."""
+    start, group = np.array([1.0, 1.004, 0.0]), np.array([[0], [1]])
+    low, high, _, asked = planes_of(start, group, 0.0, 0.005, 0.05, 0.012)
+    assert asked[0].tolist() == [0, -1] and (high < low).tolist() == [True, False]
+    begins = np.array([0, 0, 1])
+    depth, quality = choose_depth(start, group, asked, np.full(1, 0.9, np.float32), begins, low, 0.05, 0.012, 0.6)
+    assert depth[0] == 0 and quality[0] == -1
+    assert depth[1] == pytest.approx(84 * 0.012) and quality[1] == pytest.approx(0.9)
+    with pytest.raises(ValueError, match=r"HullStereo\.sweep: expected from and to, at least a step"):
+        HullStereo(sweep=(0.0, 0.005))
+    with pytest.raises(ValueError, match=r"HullStereo\.step"):
+        HullStereo(step=0.0)
+
+
+@pytest.mark.parametrize("shift", range(-12, 13, 4))
+def test_one_track_of_a_video_is_measured_wherever_it_is(shift):
+    """Beside the ball's outline, too, where some of the points around it miss the hull."""
+    rig, uv, true = rig_of_balls(1)
+    moved = [x[:1] + np.array([shift, 0.3 * shift]) for x in uv]
+    found = HullStereo()(rig, moved)
+    assert [z.shape for z in found] == [(1, 1)] * len(rig.frames)
+    if shift == 0:
+        errors = [abs(z[0, 0] / t[0] - 1) for z, t in zip(found, true, strict=True) if z[0, 0] > 0]
+        assert len(errors) >= 5 and np.median(errors) < 0.02
+
+
+def test_a_part_of_a_box_behind_another_view_takes_nothing_from_the_rest():
+    """A view from the side, close to a plane of which it sees a part, and another part lies behind it."""
+    image = view(3, 64, 48)
+    turned = cv2.Rodrigues(np.array([0.0, 1.4, 0.0]))[0]
+    ahead = turned @ (0.5 * np.linalg.inv(K) @ [6.5, 22.5, 1.0])
+    P = np.stack([K @ np.column_stack([turned, np.array([0.0, 0.0, 0.15]) - ahead])] * 2)
+    other = view(4, 64, 48)
+    boxes = np.array([[10, HALF, 21, 20, 23]], np.int32)
+    at = np.array([0, 20 * 4])
+    A, b = P[:, :, :3] @ np.linalg.inv(K), P[:, :, 3]
+    sizes = np.array([(64, 48)] * 2)
+    found = correlate(image, np.stack([other] * 2), sizes, A, b, boxes, at, 0.05, HALF, np.float32(NOISE)).reshape(
+        4, 20
+    )
+    true = [[by_definition(image, [other] * 2, P, x, y, 0.5) for x in range(HALF, 22)] for y in range(20, 24)]
+    assert -1 in found and found.max() > -1
+    np.testing.assert_allclose(found, true, atol=2e-3)
 
 
 @pytest.mark.parametrize("full", [0.3, 0.02, 0.001])
