@@ -7,7 +7,7 @@ PIP    := $(BIN)/pip --disable-pip-version-check install --quiet --no-compile -c
 WORKERS ?= 2
 MORE    ?=  # options of pytest: make test MORE=--lf
 
-.PHONY: demo pictures test test-all test-floors bench schemas docs stability lint format clean
+.PHONY: demo pictures test fast-tests test-all test-floors bench schemas docs stability lint style types format clean
 .DELETE_ON_ERROR:
 
 NEEDED := pyproject.toml constraints.txt
@@ -29,7 +29,10 @@ $(VENV)/.demo: $(NEEDED) | $(BIN)/python
 demo: $(VENV)/.demo  ## films a small moving world, and does the whole job on the videos; writes demo/
 	$(BIN)/otsync --quiet demo --out demo
 
-test: $(VENV)/.test lint  ## under ten minutes on two quiet cores; what is left out: tests/slow.py
+test: $(VENV)/.test style  ## under ten minutes on two quiet cores; what is left out: tests/slow.py
+	@$(MAKE) --no-print-directory --jobs=2 types fast-tests
+
+fast-tests: $(VENV)/.test
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m "not slow" --durations=20 --durations-min=4 $(MORE)
 
 test-all: $(VENV)/.test lint  ## every test, the slow ones too
@@ -41,9 +44,13 @@ test-floors:  ## fast tests of the core with the lowest versions that pyproject.
 bench: $(VENV)/.test  ## what is timed; writes bench/out/
 	$(BIN)/otsync bench all --out bench/out
 
-lint: $(VENV)/.test
+lint: style types
+
+style: $(VENV)/.test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+
+types: $(VENV)/.test
 	$(BIN)/mypy
 
 $(VENV)/.docs: $(NEEDED) | $(BIN)/python
