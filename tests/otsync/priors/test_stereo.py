@@ -11,7 +11,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from otsync.io.scene import Scene
-from otsync.priors.kernels_stereo import EDGE, at_points, blocks_of, choose_depth, correlate, first_hit, planes_of
+from otsync.priors.kernels_stereo import (
+    EDGE,
+    at_points,
+    blocks_of,
+    carve,
+    choose_depth,
+    correlate,
+    first_hit,
+    planes_of,
+)
 from otsync.priors.stereo import NOISE, HullStereo, boxes_to_compare, together
 from otsync.recordings.dense_depth import depth_maps
 from tests.otsync.priors.test_priors import rig_of_balls
@@ -159,22 +168,47 @@ def test_a_part_of_a_box_behind_another_view_takes_nothing_from_the_rest():
     np.testing.assert_allclose(found, true, atol=2e-3)
 
 
-@pytest.mark.parametrize("full", [0.3, 0.02, 0.001])
+@pytest.mark.parametrize("full", [0.1, 0.003, 0.0001])
 def test_a_ray_enters_the_hull_where_it_first_meets_it(full):
+    """Through blocks that are full, and past those that are empty."""
     rng = np.random.default_rng(0)
-    grid = (rng.uniform(size=(22, 20, 18)) < full).astype(np.uint8)
-    low, voxel, center = np.array([-1.1, -1.0, 2.0]), 0.1, np.array([0.02, -0.03, -0.5])
+    grid = (rng.uniform(size=(72, 66, 60)) < full).astype(np.uint8)
+    low, voxel, center = np.array([-1.1, -1.0, 2.0]), 0.03, np.array([0.02, -0.03, -0.5])
     rays = np.column_stack([rng.uniform(-0.35, 0.35, (400, 2)), np.ones(400)])
     rays[0], rays[1] = [0.0, 0.0, 1.0], [0.1, 0.0, 1.0]
     step = 0.4 * voxel
     found = first_hit(grid, blocks_of(grid), low, voxel, center, rays, step, 0.2, 8.0)
-    steps = 0.2 + step * np.arange(196)
+    steps = np.arange(0.2, 8.0, step)
     for ray, z in zip(rays, found, strict=True):
         at = np.floor((center + steps[:, None] * ray - low) / voxel).astype(int)
         inside = ((at >= 0) & (at < grid.shape)).all(1)
         hit = np.flatnonzero([i and grid[tuple(a)] for i, a in zip(inside, at, strict=True)])
         assert z == pytest.approx(steps[hit[0]] if len(hit) else 0.0)
     assert 0 < (found > 0).mean() < 1
+    assert full > 0.001 or (blocks_of(grid) == 0).mean() > 0.5
+
+
+@pytest.mark.parametrize("misses", [0, 1])
+def test_a_hull_counts_the_views_that_contain_a_place(misses):
+    """Of views of other sizes, what lies beyond an image says nothing, though all masks are held in one array."""
+    rng = np.random.default_rng(misses)
+    P = cameras(5, 0.2)
+    P[:, :, 3] += K @ [0.0, 0.0, 2.0]
+    masks = [(rng.uniform(size=(h, w)) < 0.7).astype(np.uint8) for w, h in SIZES]
+    low, voxel, dims = np.array([-0.8, -0.6, -0.4]), 0.1, np.array([16, 12, 8])
+    anywhere = np.ones_like(together(masks))
+    found = carve(together(masks), anywhere, SIZES, P, low, voxel, dims, 1, 2, misses, 0.1)
+    middles = low + (np.argwhere(np.ones(dims)) + 0.5) * voxel
+    inside, missed = np.zeros((2, len(middles)), int)
+    for mask, p in zip(masks, P, strict=True):
+        at = middles @ p[:, :3].T + p[:, 3]
+        u, v = np.floor(at[:, :2] / at[:, 2:]).astype(int).T
+        seen = (at[:, 2] >= 0.1) & (u >= 0) & (v >= 0) & (u < mask.shape[1]) & (v < mask.shape[0])
+        inside += seen
+        missed[seen] += mask[v[seen], u[seen]] == 0
+    true = (inside >= 2) & (missed <= misses)
+    assert ((inside == 2) & true).any() and 0.1 < true.mean() < 0.95
+    np.testing.assert_array_equal(found.reshape(-1) > 0, true)
 
 
 def test_views_of_other_sizes_tell_depth_as_well(world, measured):
