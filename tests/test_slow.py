@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
-from tests import slow
+from tests import conftest, slow
 
 ROOT = Path(__file__).parents[1]
 
@@ -72,3 +73,21 @@ def test_a_kept_case_that_does_not_exist_is_named(tmp_path, monkeypatch):
 
     with pytest.raises(pytest.UsageError, match=r"slow\.py: "):
         slow.mark([Item()], whole_files=True)
+
+
+@pytest.mark.parametrize(
+    ("args", "options", "whole"),
+    [
+        (["tests"], {}, True),
+        (["tests/a.py::one"], {}, False),
+        (["tests"], {"lf": True}, False),
+        (["tests"], {"stepwise": True}, False),
+    ],
+)
+def test_files_are_whole_but_where_a_part_of_them_was_asked_for(args, options, whole, monkeypatch):
+    """``pytest --lf`` collects what failed last: it says nothing of cases that it leaves out."""
+    asked = []
+    monkeypatch.setattr(conftest, "mark", lambda items, whole_files: asked.append(whole_files))
+    config = SimpleNamespace(args=args, getoption=lambda name, default: options.get(name, default))
+    conftest.pytest_collection_modifyitems(config, [])
+    assert asked == [whole]
