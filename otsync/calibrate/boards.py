@@ -120,8 +120,10 @@ def lens_of(clip: Clip, board: Board) -> Lens:
     return Lens(K, np.array([float(np.ravel(bends)[0]), 0.0, 0.0, 0.0]), "board")
 
 
-def with_boards(clips: Sequence[Clip], text: str | None, tell: Tell = lambda text: None) -> list[Clip]:
-    """The clips without those of boards, with the lenses that these tell.
+def with_boards(
+    clips: Sequence[Clip], text: str | None, tell: Tell = lambda text: None
+) -> tuple[list[Clip], dict[str, Clip]]:
+    """The clips without those of boards, with the lenses that these tell; and by video's name the clip of its board.
 
     Args:
         text: which board it is, as :meth:`Board.parse` reads it.
@@ -130,7 +132,7 @@ def with_boards(clips: Sequence[Clip], text: str | None, tell: Tell = lambda tex
     """
     shown, others = [c for c in clips if c.kind == "board"], [c for c in clips if c.kind != "board"]
     if not shown and text is None:
-        return others
+        return others, {}
     if not shown:
         raise ValueError("--board: expected a clip of the board (board.mp4) in the folder; found none. Leave it out.")
     if text is None:
@@ -138,7 +140,7 @@ def with_boards(clips: Sequence[Clip], text: str | None, tell: Tell = lambda tex
             f"{shown[0].name}: expected --board to say which board it shows, such as --board 9x6 or --board "
             "5x7:DICT_4X4_50; found nothing."
         )
-    board, lenses = Board.parse(text), {}
+    board, lenses, own = Board.parse(text), {}, {}
     for clip in shown:
         whose = re.sub(r"^board[\W_]*", "", clip.name, flags=re.IGNORECASE)
         if whose and whose not in [other.name for other in others]:
@@ -146,6 +148,10 @@ def with_boards(clips: Sequence[Clip], text: str | None, tell: Tell = lambda tex
                 f"{clip.name}: expected the name of a video after 'board' ({', '.join(o.name for o in others)}), or "
                 f"nothing; found {whose!r}. Rename it."
             )
+        if whose:
+            own[whose] = clip
+        if any(other.name == whose and other.lens.source == "given" for other in others):
+            continue  # the lens is known: the clip may tell where the camera stands
         lenses[whose] = lens_of(clip, board), clip.size
         tell(f"{clip.name}: focal length {lenses[whose][0].K[0, 0]:.1f} pixels")
     out = []
@@ -153,4 +159,4 @@ def with_boards(clips: Sequence[Clip], text: str | None, tell: Tell = lambda tex
         found = lenses.get(other.name) or lenses.get("")
         fits = found is not None and found[1] == other.size and other.lens.source != "given"
         out.append(replace(other, lens=found[0]) if found is not None and fits else other)
-    return out
+    return out, own

@@ -24,8 +24,8 @@ class FoundCamera:
         lens: where K comes from: "given", "board", "file" (its metadata), "found" (by the mapping) or "guessed".
         w2c: world to camera, OpenCV axes; (4,4), or (T,4,4) where the camera moves; None where no pose was found.
         sigma_degrees, sigma_position: standard deviations of the pose: degrees, and units of the world; nan: not known.
-        inliers: matches that obey one two-view geometry with the nearest picture of another video.
-        points: points of the model that it sees.
+        inliers: matches that obey one two-view geometry with the nearest picture of another video; by a board: corners.
+        points: points of the model that it sees; by a board: its places.
         bridged: share of a moving camera's frames whose pose was put between those of their neighbours.
         doubt: why the camera is not to be trusted; empty where it is. remedy: what to do or to film about it.
     """
@@ -69,7 +69,8 @@ class Calibration:
 
     Args:
         cameras: one a video, in the videos' order.
-        method: how they were found: "incremental" or "global": whose model it is; "motion": by what moves, with depth.
+        method: how they were found: "incremental" or "global": whose model it is; "board": by a board that is
+            carried about; "motion": by what moves, with depth.
         unit: "metres", or "arbitrary": then the median distance from a camera to where all look is 3, or, by motion,
             lengths are in the unit of the first video's depth.
         helpers: cameras of clips that only helped (walk.mp4), which belong to no scene.

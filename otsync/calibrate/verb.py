@@ -12,6 +12,7 @@ import numpy as np
 from ..files.cache import Cache
 from ..progress import Progress, Tell
 from .adjusted import adjusted
+from .board_poses import cameras_by_board
 from .boards import Board, with_boards
 from .clips import Clip, Lens, read_clips
 from .found import Calibration, FoundCamera
@@ -52,6 +53,8 @@ class CalibrateOptions:
     """JSON with K and distortion by video, or another scene.json; held fixed. "*" stands for every video."""
     board: str | None = None
     """Which board clips called board... show: 9x6 (inner corners of a checkerboard) or 5x7:DICT_4X4_50 (ChArUco)."""
+    square: float | None = None
+    """Metres of a side of the board's squares: cameras that are found by the board are in metres."""
     distance: tuple[str, str, float] | None = None
     """Two videos of static cameras, and the metres between them: the scene is in metres."""
     key_frames: int = 24
@@ -66,6 +69,10 @@ class CalibrateOptions:
             raise ValueError(f"--key-frames: expected 2 and more; found {self.key_frames}.")
         if self.board is not None:
             Board.parse(self.board)
+        if self.square is not None and not (np.isfinite(self.square) and self.square > 0):
+            raise ValueError(f"--square: expected metres above 0; found {self.square}.")
+        if self.square is not None and (self.board is None or self.distance is not None):
+            raise ValueError("--square: expected --board beside it, and no --distance, which tells lengths too.")
         if self.width < 160:
             raise ValueError(f"--width: expected 160 pixels and more; found {self.width}.")
         if self.seed < 0:
@@ -99,8 +106,10 @@ def calibrate(
     """Find the cameras of a folder of videos.
 
     Videos called ``walk...`` only help: a phone that is carried past all others. So do those called ``board...``, which
-    show a board to one lens or to all (see :mod:`otsync.calibrate.boards`). Static cameras are found by the median
-    of their frames, moving ones by key frames without what moves, then frame by frame.
+    show a board to one lens or to all (see :mod:`otsync.calibrate.boards`); where several phones saw it at rest from
+    their places, it tells these, too (:mod:`otsync.calibrate.board_poses`), and the background is asked only where it
+    leaves a camera out. Of both ways the one that more cameras are to be trusted by is taken. Static cameras are found
+    by the median of their frames, moving ones by key frames without what moves, then frame by frame.
 
     Args:
         cache: where stages are kept; a run that was killed continues from there, with the same result.
@@ -111,8 +120,44 @@ def calibrate(
     """
     options, cache = options or CalibrateOptions(), cache or Cache()
     clips, _ = read_clips(folder, options.intrinsics)
-    clips = with_boards(clips, options.board, tell)
-    return calibrate_clips(clips, options, cache=cache, tell=tell)
+    clips, shown = with_boards(clips, options.board, tell)
+    if not shown:
+        return calibrate_clips(
+            clips, _without_board(options, "no clip of a board has the name of a video", tell), cache=cache, tell=tell
+        )
+    progress, options = Progress(tell), _with_distance(options, clips)
+    with progress.stage("board"):
+        by_board = cameras_by_board(
+            clips,
+            shown,
+            Board.parse(str(options.board)),
+            square=options.square,
+            distance=options.distance,
+            cache=cache,
+            tell=tell,
+        )
+    if by_board is not None and by_board.ok:
+        unused = [clip for clip in clips if clip.kind == "walk"]
+        helpers = tuple(FoundCamera(c.name, *c.size, c.lens.K, c.lens.distortion, c.lens.source) for c in unused)
+        if unused:
+            tell(f"the board tells all cameras; not asked: {', '.join(clip.name for clip in unused)}")
+        return replace(by_board, helpers=helpers, seconds=dict(progress.seconds))
+    if by_board is None:
+        tell("the board was not at rest at one place before two cameras often enough: the background is asked")
+    else:
+        lost = ", ".join(camera.name for camera in by_board.cameras if not camera.ok)
+        tell(f"the board does not tell where {lost} stands: the background is asked, too")
+    found = calibrate_clips(clips, replace(options, square=None), cache=cache, tell=tell)
+    seconds = progress.seconds | found.seconds
+    if by_board is not None and _worth(by_board) > _worth(found):
+        return replace(by_board, helpers=found.helpers, seconds=seconds)
+    _without_board(options, "the board tells no more cameras than the background", tell)
+    return replace(found, seconds=seconds)
+
+
+def _worth(found: Calibration) -> tuple[int, int]:
+    """How many cameras are to be trusted, and how many have a pose."""
+    return sum(camera.ok for camera in found.cameras), len(found.found)
 
 
 def calibrate_clips(
@@ -303,6 +348,13 @@ def _split(
     scene = tuple(camera for camera in cameras if kinds[camera.name] == "scene")
     helpers = tuple(camera for camera in cameras if kinds[camera.name] != "scene")
     return Calibration(scene, method, unit, helpers, seconds=dict(progress.seconds))
+
+
+def _without_board(options: CalibrateOptions, why: str, tell: Tell) -> CalibrateOptions:
+    """The options where the board told no camera; says that a square's side was given in vain."""
+    if options.square is not None:
+        tell(f"note: --square is not used, and lengths are arbitrary: {why}")
+    return replace(options, square=None)
 
 
 def _with_distance(options: CalibrateOptions, clips: Sequence[Clip]) -> CalibrateOptions:

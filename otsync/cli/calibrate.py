@@ -252,6 +252,9 @@ class Film:
     """Phones sway in hands; off: they stand on tripods."""
     walk: int = 600
     """Frames of the clip that is carried past all phones; 0: none is filmed."""
+    board: int = 0
+    """Places where a board is held before the phones on their tripods, which film it: board phone0.mp4, ...; 0: none.
+    Then: otsync calibrate FOLDER --board 5x7:DICT_4X4_50 --square 0.08"""
     frames: int = 150
     fps: float = 30.0
     width: int = 640
@@ -303,6 +306,7 @@ class Film:
             size=(self.width, self.height),
             max_offset=self.max_offset,
             room=draw_room(self.seed, contrast=self.contrast),
+            board=self.board,
             tell=tell,
         )
         cameras = [(name, camera) for name, camera in zip(truth.names, truth.cameras, strict=True)]

@@ -97,10 +97,11 @@ class CalibratedFile(Document, frozen=True, kw_only=True):
 class CalibrationFile(Document, frozen=True, kw_only=True):
     """What was found out about cameras that nobody calibrated, by video; videos without a camera too.
 
-    method: how ``otsync calibrate`` mapped the scene; motion: by what moves, with depth, as ``sync --frames own`` does.
+    method: how ``otsync calibrate`` mapped the scene; board: by a board that rests before the cameras; motion: by what
+        moves, with depth, as ``sync --frames own`` does.
     """
 
-    method: Literal["incremental", "global", "motion"]
+    method: Literal["incremental", "global", "motion", "board"]
     unit: Literal["arbitrary", "metres"]
     cameras: Annotated[dict[Name, CalibratedFile], Meta(max_length=MAX_VIDEOS)]
     helpers: Annotated[list[Name], Meta(max_length=MAX_VIDEOS)] = field(default_factory=list)

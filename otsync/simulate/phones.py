@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..types import Camera
+from .board import length, with_board
 from .observation import stream
 from .room import MIDDLE, Room, RoomCamera, draw_room, look_at
 
@@ -116,9 +117,10 @@ def film(
     size: tuple[int, int] = (640, 360),
     max_offset: float = 20.0,
     room: Room | None = None,
+    board: int = 0,
     tell: Callable[[str], None] = lambda text: None,
 ) -> PhoneTruth:
-    """Write ``phone0.mp4``, ``phone1.mp4``, ... and ``walk.mp4`` into ``folder``; nothing else.
+    """Write ``phone0.mp4``, ``phone1.mp4``, ..., ``walk.mp4`` and the clips of a board into ``folder``; nothing else.
 
     Args:
         seed: decides everything.
@@ -126,6 +128,8 @@ def film(
         walk: frames of the clip that walks past all phones; 0: there is none.
         frames: of every phone's video. max_offset: the largest offset, in frames.
         room: default: one drawn by ``seed``.
+        board: places where a board is held still before the phones (see :mod:`otsync.simulate.board`), which each film
+            it from their tripods: ``board phone0.mp4``, ...; 0: there is none.
         tell: receives a line for every clip that is written.
     """
     if phones < 2 or frames < 2 or walk < 0 or walk == 1:
@@ -133,6 +137,8 @@ def film(
             f"phones, frames, walk: expected 2 and more, 2 and more, and 0 or at least 2; found {phones}, {frames}, "
             f"{walk}."
         )
+    if board < 0 or (board and not isinstance(held or Tripod(), Tripod)):
+        raise ValueError(f"board: expected 0 places and more, and phones on tripods; found {board} and {held}.")
     folder, room, held = Path(folder), room or draw_room(seed), held or Tripod()
     azimuths = np.radians(gap) * (np.arange(phones) - (phones - 1) / 2)
     shift = np.array([0.0, *(max_offset * stream(seed, v, "offset").uniform(-1, 1) for v in range(1, phones))]) / fps
@@ -142,6 +148,13 @@ def film(
         w2c = held(float(azimuths[v]), times, stream(seed, v, "hand"))
         cameras.append(_clip(folder / f"{name}.mp4", room, w2c, times + shift[v], size, fps, stream(seed, v, "phone")))
         tell(f"filmed {name}.mp4, {frames} frames")
+    if board:
+        stands = np.stack([-camera.w2c[:3, :3].T @ camera.w2c[:3, 3] for camera in cameras])
+        empty, times = with_board(room, seed, board, stands), np.arange(round(length(board) * fps)) / fps
+        for v, (name, camera) in enumerate(zip(names, cameras, strict=True)):
+            late = max_offset / fps * stream(seed, v, "board clip").uniform(-1, 1)
+            _clip(folder / f"board {name}.mp4", empty, camera.w2c, times + late, size, fps, stream(seed, v, "phone"))
+            tell(f"filmed board {name}.mp4, {len(times)} frames")
     carried = None
     if walk:
         times = np.arange(walk) / fps

@@ -44,6 +44,20 @@ NOISE = 3.0
 """Standard deviation of the images' noise, in 255ths."""
 
 
+@dataclass(frozen=True, eq=False)
+class ShownBoard:
+    """A flat board in the room; its back is plain.
+
+    Args:
+        picture: of its front. size: (width, height), m.
+        pose: a real time (s) -> (4,4) from the board (metres; x right, y down, from a corner) to the world.
+    """
+
+    picture: UInt8[np.ndarray, "h w 3"]
+    size: tuple[float, float]
+    pose: Callable[[float], Float[np.ndarray, "4 4"]]
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Room:
     """A room and what moves in it.
@@ -52,6 +66,7 @@ class Room:
         pictures: six walls' pictures, two for each axis (low, high). skins: what balls wear, in turns.
         radii: (B,) of the moving balls, m. colours: (B,3) what shines through their pictures, 0 to 255.
         places: seconds (T,) -> centres (B,T,3) of the moving balls, m, at every real time.
+        board: one that is carried about, or None.
     """
 
     pictures: tuple[UInt8[np.ndarray, "h w 3"], ...]
@@ -59,6 +74,7 @@ class Room:
     radii: Float[np.ndarray, " B"]
     colours: Float[np.ndarray, "B 3"]
     places: Callable[[Float[np.ndarray, " T"]], Float[np.ndarray, "B T 3"]]
+    board: ShownBoard | None = None
 
     def __repr__(self) -> str:
         return f"Room({len(self.radii)} moving things)"
@@ -165,6 +181,8 @@ class RoomCamera:
             where, hit = self._ball(w2c, rays, image, depth, centre, float(radius), b)
             image[where][hit] = 0.55 * image[where][hit] + 0.45 * self.room.colours[b]
             moving[where] |= hit
+        if self.room.board is not None:
+            self._board(self.room.board, w2c, t, rays, image, depth, moving)
         return image, moving, depth
 
     def _background(self, w2c: Float[np.ndarray, "4 4"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -237,6 +255,42 @@ class RoomCamera:
         image[where][hit] = skin[hit]
         depth[where][hit] = z[hit]
         return where, hit
+
+    def _board(
+        self,
+        board: ShownBoard,
+        w2c: np.ndarray,
+        t: float,
+        rays: np.ndarray,
+        image: np.ndarray,
+        depth: np.ndarray,
+        moving: np.ndarray,
+    ) -> None:
+        """Draw the board into image, depth and what moves."""
+        import cv2
+
+        pose = board.pose(t)
+        corners = np.array([[x, y, 0] for x in (0, board.size[0]) for y in (0, board.size[1])]) @ pose[:3, :3].T
+        local = (corners + pose[:3, 3]) @ w2c[:3, :3].T + w2c[:3, 3]
+        if (local[:, 2] < 0.2).any():
+            return
+        uv = (local @ self.K.T)[:, :2] / local[:, 2:]
+        (x0, y0), (x1, y1) = (
+            np.clip(uv.min(0), 0, self.size).astype(int),
+            np.clip(uv.max(0) + 1, 0, self.size).astype(int),
+        )
+        where = slice(y0, y1), slice(x0, x1)
+        way, away = rays[where] @ pose[:3, 2].astype(np.float32), pose[:3, 3] - _eye(w2c)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            z = np.float32(away @ pose[:3, 2]) / way
+            at = (rays[where] * z[..., None] - away.astype(np.float32)) @ pose[:3, :2].astype(np.float32)
+        hit = (z > 0) & (z < depth[where]) & (at >= 0).all(-1) & (at <= np.array(board.size)).all(-1)
+        h, w = board.picture.shape[:2]
+        x, y = (np.where(hit, at[..., k] * n / board.size[k] - 0.5, 0).astype(np.float32) for k, n in enumerate((w, h)))
+        front = cv2.remap(board.picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        image[where][hit] = np.where((way > 0)[..., None], front, 205)[hit]
+        depth[where][hit] = z[hit]
+        moving[where] |= hit
 
 
 def _eye(w2c: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, " 3"]:

@@ -623,11 +623,14 @@ def test_options_of_film(tmp_path):
         ["--height", "40"],
         ["--max-offset", "2"],
         ["--contrast", "0.5"],
+        ["--board", "1"],
         ["--seed", "5"],
     ):
         assert filmed(*args) != plain, args
     code, _, err = run(["film", str(tmp_path / "plain")])
     assert code == 2 and "holds some" in err
+    code, _, err = run(["film", str(tmp_path / "hands"), "--handheld", "--board", "3"])
+    assert code == 2 and "tripods" in err and not list((tmp_path / "hands").glob("*.mp4"))
 
 
 @pytest.mark.parametrize("stopped", ["by Ctrl-C", "by a kill"])
@@ -784,9 +787,9 @@ def rows() -> set[str]:
         "recording.allow_outside recording.workers recording.masks recording.points recording.flow recording.features "
         "recording.depth recording.selection recording.width",
         "simulate": "out motion preset videos frames fps max_offset own_frames seed",
-        "film": "out phones gap handheld walk frames fps width height max_offset contrast seed",
-        "calibrate": "folder out force way options.intrinsics options.board options.distance options.key_frames "
-        "options.width options.seed json",
+        "film": "out phones gap handheld walk board frames fps width height max_offset contrast seed",
+        "calibrate": "folder out force way options.intrinsics options.board options.square options.distance "
+        "options.key_frames options.width options.seed json",
         "init": "folder out reader fps order timestamps force",
         "audit": "scene out tolerance cameras allow_outside json",
         "import-offsets": "source recording kind sigma offsets out allow_outside",

@@ -71,11 +71,13 @@ def test_each_video_gets_the_lens_of_its_board():
     left, right = (Clip(name, {}, [], SIZE, 30.0, guessed) for name in ("left", "right"))
     small = replace(left, name="small", size=(240, 180))
     known = replace(left, name="known", lens=pinhole(999, SIZE, "given"))
-    own = with_boards([left, right, small, clip_of(board, name="board_left")], "7x5")
+    own, shown = with_boards([left, right, small, clip_of(board, name="board_left")], "7x5")
+    assert list(shown) == ["left"] and shown["left"].name == "board_left"
     assert [c.lens.source for c in own] == ["board", "guessed", "guessed"]
-    every = with_boards([left, right, small, known, clip_of(board)], "7x5")
+    every, shown = with_boards([left, right, small, known, clip_of(board)], "7x5")
+    assert not shown  # a clip of all lenses tells no place
     assert [c.lens.source for c in every] == ["board", "board", "guessed", "given"]
-    assert with_boards([left, right], None) == [left, right]
+    assert with_boards([left, right], None) == ([left, right], {})
 
 
 @pytest.mark.parametrize(
