@@ -2,7 +2,9 @@
 
 clips.py      which videos there are, and what is known of their lenses
 boards.py     lenses from clips of a checkerboard or a ChArUco board
-board_poses.py  cameras from a board that rests here and there before them
+board_rests.py where a clip shows a board at rest
+board_solve.py poses of cameras that see a board at the same places, adjusted together
+board_poses.py cameras from a board, and which of them are to be trusted
 stills.py     backgrounds of static cameras, masked key frames of moving ones
 mapping.py    structure from motion by two mappers that check each other (pycolmap)
 poses.py      every frame of a moving camera (poselib)

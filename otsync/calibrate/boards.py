@@ -27,6 +27,9 @@ LEAST_PICTURES, LEAST_CORNERS = 8, 6
 WORST = 1.5
 """Pixels at 1000 of width: a larger mean error is that of a board which is not flat, or not the one that was named."""
 
+LARGEST = 1600
+"""Pixels of the longer side of a picture in which corners are looked for."""
+
 TILT = 20.0
 """Degrees between the most different views of a board: of one view any focal length is right."""
 
@@ -65,9 +68,17 @@ class Board:
         return board
 
     def corners(self, image: np.ndarray) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 2"]] | None:
-        """Corners on the board (in squares) and their pixels (centres at +0.5); None where too few are seen."""
+        """Corners on the board (in squares) and their pixels (centres at +0.5); None where too few are seen.
+
+        They are looked for in a picture of 1600 pixels at the most: in larger ones that takes seconds.
+        """
         import cv2
 
+        smaller = min(1.0, LARGEST / max(image.shape[:2]))
+        if smaller < 1:
+            h, w = (round(smaller * n) for n in image.shape[:2])
+            reduced = self.corners(cv2.resize(image, (w, h), interpolation=cv2.INTER_AREA))
+            return None if reduced is None else (reduced[0], reduced[1] * [image.shape[1] / w, image.shape[0] / h])
         gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         if not self.dictionary:
             found, uv = cv2.findChessboardCornersSB(gray, (self.columns, self.rows))
@@ -140,7 +151,8 @@ def with_boards(
             f"{shown[0].name}: expected --board to say which board it shows, such as --board 9x6 or --board "
             "5x7:DICT_4X4_50; found nothing."
         )
-    board, lenses, own = Board.parse(text), {}, {}
+    board, lenses = Board.parse(text), {}
+    own: dict[str, Clip] = {}
     for clip in shown:
         whose = re.sub(r"^board[\W_]*", "", clip.name, flags=re.IGNORECASE)
         if whose and whose not in [other.name for other in others]:
@@ -148,11 +160,19 @@ def with_boards(
                 f"{clip.name}: expected the name of a video after 'board' ({', '.join(o.name for o in others)}), or "
                 f"nothing; found {whose!r}. Rename it."
             )
+        if whose in own:
+            raise ValueError(f"{clip.name}: expected one clip of a board for {whose}; found {own[whose].name}, too.")
         if whose:
             own[whose] = clip
         if any(other.name == whose and other.lens.source == "given" for other in others):
             continue  # the lens is known: the clip may tell where the camera stands
-        lenses[whose] = lens_of(clip, board), clip.size
+        try:
+            lenses[whose] = lens_of(clip, board), clip.size
+        except ValueError as error:
+            if not whose or len(shown) == 1:
+                raise
+            tell(f"note: {error}")  # the other phones' clips may be good
+            continue
         tell(f"{clip.name}: focal length {lenses[whose][0].K[0, 0]:.1f} pixels")
     out = []
     for other in others:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..compute.threads import pool_of
 from ..files.cache import Cache
 from ..progress import Progress, Tell
 from .adjusted import adjusted
@@ -126,7 +127,7 @@ def calibrate(
             clips, _without_board(options, "no clip of a board has the name of a video", tell), cache=cache, tell=tell
         )
     progress, options = Progress(tell), _with_distance(options, clips)
-    with progress.stage("board"):
+    with progress.stage("board"), pool_of(os.cpu_count() or 1) as pool:
         by_board = cameras_by_board(
             clips,
             shown,
@@ -134,30 +135,37 @@ def calibrate(
             square=options.square,
             distance=options.distance,
             cache=cache,
+            map=pool.map,
             tell=tell,
         )
-    if by_board is not None and by_board.ok:
-        unused = [clip for clip in clips if clip.kind == "walk"]
-        helpers = tuple(FoundCamera(c.name, *c.size, c.lens.K, c.lens.distortion, c.lens.source) for c in unused)
-        if unused:
-            tell(f"the board tells all cameras; not asked: {', '.join(clip.name for clip in unused)}")
-        return replace(by_board, helpers=helpers, seconds=dict(progress.seconds))
-    if by_board is None:
-        tell("the board was not at rest at one place before two cameras often enough: the background is asked")
-    else:
-        lost = ", ".join(camera.name for camera in by_board.cameras if not camera.ok)
-        tell(f"the board does not tell where {lost} stands: the background is asked, too")
-    found = calibrate_clips(clips, replace(options, square=None), cache=cache, tell=tell)
-    seconds = progress.seconds | found.seconds
-    if by_board is not None and _worth(by_board) > _worth(found):
+    walks = [clip for clip in clips if clip.kind == "walk"]
+    helpers = tuple(FoundCamera(c.name, *c.size, c.lens.K, c.lens.distortion, c.lens.source) for c in walks)
+    by_board = replace(by_board, helpers=helpers, seconds=dict(progress.seconds))
+    if by_board.ok:
+        if walks:
+            tell(f"the board tells all cameras; not used: {', '.join(clip.name for clip in walks)}")
+        return by_board
+    for camera in by_board.cameras:
+        if not camera.ok:
+            tell(f"by the board: {camera.doubt}")
+    tell("what the board leaves out is looked for by the background")
+    try:
+        found = calibrate_clips(clips, replace(options, square=None), cache=cache, tell=tell)
+    except ValueError as error:
+        if _worth(by_board)[0] < 2:
+            raise
+        tell(f"note: the background does not help: {error}")
+        return by_board
+    seconds = dict(progress.seconds) | found.seconds
+    if _worth(by_board) > _worth(found):
         return replace(by_board, helpers=found.helpers, seconds=seconds)
     _without_board(options, "the board tells no more cameras than the background", tell)
     return replace(found, seconds=seconds)
 
 
-def _worth(found: Calibration) -> tuple[int, int]:
-    """How many cameras are to be trusted, and how many have a pose."""
-    return sum(camera.ok for camera in found.cameras), len(found.found)
+def _worth(found: Calibration) -> tuple[int, bool, int]:
+    """How many cameras are to be trusted, whether in metres, and how many have a pose."""
+    return sum(camera.ok for camera in found.cameras), found.unit == "metres", len(found.found)
 
 
 def calibrate_clips(

@@ -268,6 +268,11 @@ class Film:
     def run(self) -> int:
         from ..files.claim import claimed
 
+        if self.board < 0 or (self.board and self.handheld):
+            found = "--handheld" if self.board > 0 else str(self.board)
+            raise ValueError(
+                f"--board: expected 0 places and more, and phones on tripods; found {found}. Leave it out."
+            )
         with claimed(self.out, "otsync film"):
             return self._run()
 

@@ -138,7 +138,8 @@ def film(
             f"{walk}."
         )
     if board < 0 or (board and not isinstance(held or Tripod(), Tripod)):
-        raise ValueError(f"board: expected 0 places and more, and phones on tripods; found {board} and {held}.")
+        found = "phones in hands" if board > 0 else str(board)
+        raise ValueError(f"board: expected 0 places and more, and phones on tripods; found {found}.")
     folder, room, held = Path(folder), room or draw_room(seed), held or Tripod()
     azimuths = np.radians(gap) * (np.arange(phones) - (phones - 1) / 2)
     shift = np.array([0.0, *(max_offset * stream(seed, v, "offset").uniform(-1, 1) for v in range(1, phones))]) / fps
