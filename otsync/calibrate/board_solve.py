@@ -8,15 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.optimize import least_squares
-from scipy.sparse import coo_matrix
-from scipy.spatial.transform import Rotation
 
 from ..compute.threads import FEW, MapLike, blas_for
+from .board_adjust import Problem, Views
 from .board_rests import Rest, carried, turns_of
 from .boards import Board
 from .world import centres, degrees
@@ -35,6 +33,9 @@ AGREEING = 0.6
 
 BEND = 0.02
 """By what the first radial coefficient of a lens may be off."""
+
+EXACT = 2e6
+"""Numbers of a Jacobian from which on its steps are found by iteration."""
 
 NOISE, LEAST_NOISE, OUTLYING = 0.3, 0.02, 3.0
 """Pixels by which corners are off, to begin with and at the least, and how many of that make an outlier."""
@@ -279,21 +280,6 @@ def _chained(links: Mapping[tuple[int, int], Relation], cameras: int) -> dict[in
     return best
 
 
-@dataclass(frozen=True, eq=False)
-class Views:
-    """What is adjusted: all corners of all cameras.
-
-    Args:
-        camera, place: (N,) whose corner it is. xyz: (N,3) on the board. uv: (N,2) pixels. boards: (P,4,4).
-    """
-
-    camera: Int[np.ndarray, " N"]
-    place: Int[np.ndarray, " N"]
-    xyz: Float[np.ndarray, "N 3"]
-    uv: Float[np.ndarray, "N 2"]
-    boards: Float[np.ndarray, "P 4 4"]
-
-
 NOTHING = Views(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 2)), np.zeros((0, 4, 4)))
 
 
@@ -350,41 +336,30 @@ def _adjusted(linked: Linked, K: Sequence[np.ndarray], within: Sequence[float], 
     views, poses, cameras = linked.views, linked.poses, len(K)
     fixed, *free = sorted(poses, key=lambda v: -int((views.camera == v).sum()))
     loose = [v for v in sorted(poses) if within[v]]
-    w2c = np.stack([poses.get(v, np.eye(4)) for v in range(cameras)])
-    lens = np.stack([np.asarray(k, float) for k in K])[views.camera]
-    count, places = 6 * len(free), len(views.boards)
-    stop = count + 6 * places
-    firm = noise / np.array([(within[v], BEND) for v in loose]).reshape(-1)
-
-    def moved(x: Float[np.ndarray, " X"]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        out, zoom, bend = w2c.copy(), np.ones(cameras), np.zeros(cameras)
-        out[free] = _nudged(w2c[free], x[:count].reshape(-1, 6))
-        zoom[loose], bend[loose] = np.exp(x[stop::2]), x[stop + 1 :: 2]
-        return out, _nudged(views.boards, x[count:stop].reshape(-1, 6)), zoom, bend
-
-    def residuals(x: Float[np.ndarray, " X"]) -> Float[np.ndarray, " R"]:
-        out, boards, zoom, bend = moved(x)
-        both = out[views.camera] @ boards[views.place]
-        local = np.einsum("nij,nj->ni", both[:, :3, :3], views.xyz) + both[:, :3, 3]
-        ray = local[:, :2] / np.maximum(local[:, 2:], 1e-6)
-        ray = ray * (1 + bend[views.camera] * (ray**2).sum(1))[:, None]
-        uv = zoom[views.camera, None] * np.einsum("nij,nj->ni", lens[:, :2, :2], ray) + lens[:, :2, 2]
-        return np.concatenate([(uv - views.uv).ravel(), firm * x[stop:]])
-
-    with blas_for(FEW):  # trf with many threads of BLAS stalls
+    problem = Problem(
+        views,
+        np.stack([poses.get(v, np.eye(4)) for v in range(cameras)]),
+        np.stack([np.asarray(k, float) for k in K]),
+        free,
+        loose,
+        noise / np.array([(within[v], BEND) for v in loose]).reshape(-1),
+    )
+    with blas_for(FEW):
         done = least_squares(
-            residuals,
-            np.zeros(stop + 2 * len(loose)),
-            jac_sparsity=_sparsity(views, free, loose),
+            problem.residuals,
+            np.zeros(problem.size),
+            problem.jacobian,
             loss="soft_l1",
             f_scale=OUTLYING * noise,
             x_scale="jac",
+            tr_solver="exact" if 2 * len(views.uv) * problem.size < EXACT else "lsmr",
             max_nfev=100,
         )
-    out, boards, zoom, bend = moved(done.x)
+    out, boards, zoom, bend = problem.at(done.x)
+    stop = problem.poses
     off = done.fun[: 2 * len(views.uv)].reshape(-1, 2)
     pulls = done.fun * (1 + (done.fun / (OUTLYING * noise)) ** 2) ** 0.25  # as scipy scaled the Jacobian for its loss
-    variances = _variances(np.asarray(done.jac.todense()), pulls, views, count, noise)
+    variances = _variances(np.asarray(done.jac), pulls, views, problem.cameras, noise)
     turn, move, unsure = (np.full(cameras, np.nan) for _ in range(3))
     for n, v in enumerate(free):
         own = variances[:, 6 * n :][:, :6]
@@ -425,29 +400,6 @@ def _variances(J: np.ndarray, f: np.ndarray, views: Views, free: int, noise: flo
     known = noise**2 * J[corners:].T @ J[corners:]
     sandwich = H @ (pulls.T @ pulls * groups / max(groups - free / 6, 1) + known) @ H
     return np.stack([np.diag(H) * scatter, np.diag(sandwich)])
-
-
-def _sparsity(views: Views, free: Sequence[int], loose: Sequence[int]) -> Any:
-    """Which parameters each residual depends on: the camera's six, the place's six, and the lens's two."""
-    stop = 6 * (len(free) + len(views.boards))
-    camera, lens = (np.array([list(of).index(int(v)) if v in of else -1 for v in views.camera]) for of in (free, loose))
-    n, last = np.arange(len(views.uv)), 2 * len(views.uv)
-    columns = [np.where(camera >= 0, 6 * camera + k, -1) for k in range(6)]
-    columns += [6 * (len(free) + views.place) + k for k in range(6)]
-    columns += [np.where(lens >= 0, stop + 2 * lens + k, -1) for k in range(2)]
-    rows = np.concatenate([2 * n + axis for _ in columns for axis in (0, 1)])
-    cols = np.concatenate([column for column in columns for _ in (0, 1)])
-    priors = np.arange(2 * len(loose))
-    rows, cols = np.append(rows[cols >= 0], last + priors), np.append(cols[cols >= 0], stop + priors)
-    return coo_matrix((np.ones(len(rows)), (rows, cols)), (last + len(priors), stop + len(priors)))
-
-
-def _nudged(poses: Float[np.ndarray, "P 4 4"], steps: Float[np.ndarray, "P 6"]) -> Float[np.ndarray, "P 4 4"]:
-    """Poses turned by rotation vectors, and moved, in the axes that they lead to."""
-    more = np.tile(np.eye(4), (len(poses), 1, 1))
-    more[:, :3, :3] = Rotation.from_rotvec(steps[:, :3]).as_matrix()
-    more[:, :3, 3] = steps[:, 3:]
-    return more @ poses
 
 
 def _pixels(K: Float[np.ndarray, "3 3"], local: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 2"]:

@@ -42,6 +42,7 @@ TIED = ("tests/otsync/recordings/test_learned_depth.py",)
 COTRACKER = ("tests/otsync/priors/learned/test_cotracker.py",)
 RUNS = ("tests/otsync/io/test_masks.py",)
 DENSE = ("tests/recon/pipeline/test_dense_tracks.py",)
+BOARD = ("tests/otsync/calibrate/test_board_poses.py",)
 
 
 @dataclass(frozen=True)
@@ -1503,5 +1504,45 @@ BREAKS = (
         "return np.zeros_like(start_sigma)",
         (*FIT, *SIGMA),
         "a fit of two steps says that it knows the clocks where it began",
+    ),
+    Break(
+        "pairings-without-rivals",
+        "otsync/calibrate/board_solve.py",
+        "return Relation(best.pose, best.pairs, 2 * rival <= best.count)",
+        "return Relation(best.pose, best.pairs, True)",
+        BOARD,
+        "a board that is carried by even steps places cameras a step apart from where they stand",
+    ),
+    Break(
+        "pieces-of-a-rest",
+        "otsync/calibrate/board_solve.py",
+        "if ((turned < NEAR_TURN) & (np.linalg.norm(moved, axis=1) < near)).any():",
+        "if False:",
+        BOARD,
+        "pieces of one rest count as so many places, and cameras that share nothing are linked",
+    ),
+    Break(
+        "lenses-known-too-well",
+        "otsync/calibrate/board_solve.py",
+        "return _adjusted(linked, K, within, max(noise, LEAST_NOISE))",
+        "return first",
+        BOARD,
+        "sigma takes a lens for known as well as corners that are better than they were taken to be",
+    ),
+    Break(
+        "a-moved-phone-unheard",
+        "otsync/calibrate/board_poses.py",
+        "if shift is not None and shift > MOVED:",
+        "if False:",
+        BOARD,
+        "a phone that was moved between board and scene is believed",
+    ),
+    Break(
+        "another-lens-unheard",
+        "otsync/calibrate/board_poses.py",
+        "another > max(ANOTHER, 3 * float(freed.sigma_zoom[v])):",
+        "another > 9:",
+        BOARD,
+        "a focal length that the board contradicts is believed",
     ),
 )

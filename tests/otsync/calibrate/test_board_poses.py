@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from otsync.calibrate import CalibrateOptions, calibrate
+from otsync.calibrate.board_adjust import Problem
 from otsync.calibrate.board_poses import cameras_by_board
 from otsync.calibrate.board_rests import Rest, grid_of, poses_of, turns_of
 from otsync.calibrate.board_solve import LEAST_PLACES, linked, related, solve
@@ -100,6 +101,21 @@ def test_a_board_at_rest_tells_cameras_and_lengths(board, seed):
     turn, place = errors(solved, cameras)
     assert turn.max() < 0.35 and place.max() < 0.03
     assert (solved.off < 0.5).all() and (solved.places >= LEAST_PLACES).all()
+
+
+def test_derivatives_are_those_of_the_residuals():
+    rng = np.random.default_rng(7)
+    cameras = ring(rng, 3)
+    links = linked(filmed(BOARDS[2], cameras, rng, places=9), [K] * 3, BOARDS[2])
+    w2c = np.stack([links.poses[v] for v in range(3)])
+    problem = Problem(links.views, w2c, np.stack([K] * 3), [0, 2], [1, 2], np.array([40.0, 10, 40, 10]))
+    for size in (0.0, 0.1):  # at the start, and away from it
+        x = size * rng.normal(size=problem.size)
+        found = problem.jacobian(x)
+        for n in rng.choice(problem.size, 25, replace=False):
+            step = 1e-6 * np.eye(problem.size)[n]
+            true = (problem.residuals(x + step) - problem.residuals(x - step)) / 2e-6
+            np.testing.assert_allclose(found[:, n], true, atol=1e-4 * max(1, np.abs(true).max()))
 
 
 def test_its_sigma_holds():
