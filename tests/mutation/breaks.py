@@ -1522,12 +1522,12 @@ BREAKS = (
         "pieces of one rest count as so many places, and cameras that share nothing are linked",
     ),
     Break(
-        "lenses-known-too-well",
+        "corners-taken-for-worse",
         "otsync/calibrate/board_solve.py",
         "return _adjusted(linked, K, within, max(noise, LEAST_NOISE))",
         "return first",
         BOARD,
-        "sigma takes a lens for known as well as corners that are better than they were taken to be",
+        "sigma of a board's cameras is that of corners three times as bad as these",
     ),
     Break(
         "a-moved-phone-unheard",

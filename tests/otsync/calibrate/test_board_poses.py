@@ -216,7 +216,7 @@ def test_sigma_knows_that_lenses_are_not_known_exactly():
         true, found = relative(cameras), relative(solved.w2c)
         away = np.linalg.norm(centres(true) - SQUARE * centres(found))
         z.append(away / (SQUARE * np.hypot(*solved.sigma_position)))
-    assert np.sqrt(np.mean(np.square(z))) < 1.6 and max(z) < 3
+    assert 0.35 < np.sqrt(np.mean(np.square(z))) < 1.6 and max(z) < 3  # nor is it far too careful
 
 
 def test_a_camera_that_shares_no_place_is_left_out():
