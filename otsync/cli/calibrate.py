@@ -145,6 +145,7 @@ def prepared(
     if (path / "scene.json").exists():
         _told_of_late_clips(path)
         return 0
+    from ..calibrate.clips import kind_of
     from ..files.claim import claimed
     from ..io.scene import read_document
     from ..recordings.check import check_scene
@@ -164,6 +165,11 @@ def prepared(
             raise ValueError(f"{option}: expected some of {', '.join(there)}; found {absent[0]!r}.")
     if truth is not None:
         Offsets.load(truth)
+    if boards := [name for name in there if kind_of(name) == "board"]:
+        raise ValueError(
+            f"{path}: {', '.join(boards)}: expected to know which board they show. Say so first: otsync calibrate "
+            f"{quoted(path)} --board 9x6 (or 5x7:DICT_4X4_50 ...) --square METRES; then give this command again."
+        )
     tell(f"{path}: no scene.json and no cameras: looking for them (otsync calibrate {quoted(path)})")
     with claimed(path / "calibration", "otsync calibrate") as out:
         found = calibrate_folder(path, out, CalibrateOptions())

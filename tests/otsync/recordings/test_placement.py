@@ -151,3 +151,15 @@ def test_options_are_read_before_cameras_are_looked_for(tmp_path, monkeypatch, g
     monkeypatch.setattr("otsync.cli.calibrate.calibrate_folder", lambda *_: pytest.fail("the work began"))
     with pytest.raises((ValueError, OSError), match=field):
         prepared(tmp_path, **given)
+
+
+def test_clips_of_a_board_are_asked_about_before_the_work(tmp_path, monkeypatch):
+    write_recording(tmp_path, [0.0, 2.0], frames=3)
+    document = json.loads((tmp_path / "scene.json").read_text())
+    (tmp_path / "scene.json").unlink()
+    bare = [{k: v for k, v in video.items() if k != "camera"} for video in document["videos"]]
+    videos = [*bare, {**bare[0], "name": "board cam0"}]
+    monkeypatch.setattr("otsync.io.scene.read_document", lambda path: ({**document, "videos": videos}, path))
+    monkeypatch.setattr("otsync.cli.calibrate.calibrate_folder", lambda *_: pytest.fail("the work began"))
+    with pytest.raises(ValueError, match=r"board cam0: expected to know which board .* otsync calibrate .* --board 9x6"):
+        prepared(tmp_path)
