@@ -28,13 +28,14 @@ class Views:
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Least squares over X = 6 F + 6 P + 2 L numbers: turn and move of each free camera and of each place, and by lens
-    the logarithm of its focal length's factor and what is added to its first radial coefficient.
+    """Least squares over X = 6 F + 6 P + 2 L + 1 numbers: turn and move of each free camera and of each place; by lens
+    the logarithm of its focal length's factor and what is added to its first radial coefficient; and the logarithm of
+    how much wider than high the board's squares are.
 
     Args:
         views: the corners. w2c: (V,4,4) poses to begin with. K: (V,3,3) intrinsics.
         free: cameras that are adjusted; one is not. loose: cameras whose lens is.
-        firm: (2 L,) pixels by which a residual grows with each of the lenses' numbers.
+        firm: (2 L + 1,) pixels by which a residual grows with each of the lenses' numbers and with the board's.
     """
 
     views: Views
@@ -42,7 +43,7 @@ class Problem:
     K: Float[np.ndarray, "V 3 3"]
     free: Sequence[int]
     loose: Sequence[int]
-    firm: Float[np.ndarray, " L2"]
+    firm: Float[np.ndarray, " S"]
 
     @property
     def cameras(self) -> int:
@@ -57,23 +58,24 @@ class Problem:
     @property
     def size(self) -> int:
         """How many numbers there are."""
-        return self.poses + 2 * len(self.loose)
+        return self.poses + len(self.firm)
 
     def at(self, x: Float[np.ndarray, " X"]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Cameras (V,4,4), places (P,4,4), factors of focal lengths (V,) and what is added to coefficients (V,)."""
         w2c, zoom, bend = self.w2c.copy(), np.ones(len(self.w2c)), np.zeros(len(self.w2c))
         w2c[list(self.free)] = nudged(w2c[list(self.free)], x[: self.cameras].reshape(-1, 6))
-        zoom[list(self.loose)], bend[list(self.loose)] = np.exp(x[self.poses :: 2]), x[self.poses + 1 :: 2]
+        lenses = x[self.poses : -1]
+        zoom[list(self.loose)], bend[list(self.loose)] = np.exp(lenses[::2]), lenses[1::2]
         return w2c, nudged(self.views.boards, x[self.cameras : self.poses].reshape(-1, 6)), zoom, bend
 
     def residuals(self, x: Float[np.ndarray, " X"]) -> Float[np.ndarray, " R"]:
-        """Pixels that corners are off (u, v in turns), then what lenses are off."""
+        """Pixels that corners are off (u, v in turns), then what lenses and the board are off."""
         _, _, _, uv = self._seen(x)
         return np.concatenate([(uv - self.views.uv).ravel(), self.firm * x[self.poses :]])
 
     def jacobian(self, x: Float[np.ndarray, " X"]) -> Float[np.ndarray, "R X"]:
         """Derivatives of the residuals."""
-        w2c, _, zoom, bend = self.at(x)
+        w2c, boards, zoom, bend = self.at(x)
         world, local, ray, uv = self._seen(x)
         v, n = self.views, len(self.views.uv)
         wide = 1 + bend[v.camera] * (ray**2).sum(1)
@@ -98,6 +100,8 @@ class Problem:
             corners[mine, :, first + 1] = np.einsum(
                 "nij,nj->ni", lens[mine], ray[mine] * (ray[mine] ** 2).sum(1)[:, None]
             )
+        wider = np.einsum("nij,nj->ni", boards[v.place, :3, :2], printed(v.xyz, x[-1])[:, :2] * [0.5, -0.5])
+        corners[:, :, -1] = np.einsum("nij,nj->ni", of_world, wider)
         out[2 * n + np.arange(len(self.firm)), self.poses + np.arange(len(self.firm))] = self.firm
         return out
 
@@ -105,7 +109,8 @@ class Problem:
         """Corners in the world, before their cameras, as rays (at depth 1), and their pixels."""
         w2c, boards, zoom, bend = self.at(x)
         v = self.views
-        world = np.einsum("nij,nj->ni", boards[v.place, :3, :3], v.xyz) + boards[v.place, :3, 3]
+        xyz = printed(v.xyz, x[-1])
+        world = np.einsum("nij,nj->ni", boards[v.place, :3, :3], xyz) + boards[v.place, :3, 3]
         local = np.einsum("nij,nj->ni", w2c[v.camera, :3, :3], world) + w2c[v.camera, :3, 3]
         ray = local[:, :2] / np.maximum(local[:, 2:], LEAST_DEPTH)
         wide = 1 + bend[v.camera] * (ray**2).sum(1)
@@ -115,6 +120,11 @@ class Problem:
 
 LEAST_DEPTH = 1e-6
 """Squares before a camera at which a corner is taken to be at the least."""
+
+
+def printed(xyz: Float[np.ndarray, "N 3"], wider: float) -> Float[np.ndarray, "N 3"]:
+    """Corners of a board whose squares are wider than high by a factor, of which this is the logarithm."""
+    return xyz * [np.exp(wider / 2), np.exp(-wider / 2), 1.0]
 
 
 def nudged(poses: Float[np.ndarray, "P 4 4"], steps: Float[np.ndarray, "P 6"]) -> Float[np.ndarray, "P 4 4"]:

@@ -35,6 +35,9 @@ OF_BOARD, GIVEN, FREED = 0.007, 0.003, 0.3
 ANOTHER = 0.006
 """Share from which on a given focal length is that of another lens, where the board's places say so."""
 
+PRINTED = 0.003
+"""Share by which squares may be wider than high before that is told."""
+
 UNSURE = 2.0
 """Degrees: a camera that is not known better is doubted."""
 
@@ -89,6 +92,11 @@ def cameras_by_board(
         lost = [_without(cameras[v], clip, shown.get(clip.name), links, v) for v, clip in enumerate(used)]
         return Calibration(tuple(lost), "board")
     world, unit = _world(used, solved, sorted(links.poses), square, distance, tell)
+    # of squares that are not square nobody knows which side was measured
+    unknown = 0.0 if square is None else abs(solved.wider) / 2
+    if abs(solved.wider) > PRINTED:
+        how = "wider than high" if solved.wider > 0 else "higher than wide"
+        tell(f"note: the board's squares are {100 * abs(solved.wider):.1f} % {how}; lengths are by the mean of both")
     for v, clip in enumerate(used):
         if v not in links.poses:
             cameras[v] = _without(cameras[v], clip, shown.get(clip.name), links, v)
@@ -96,13 +104,17 @@ def cameras_by_board(
         shift = moved_by(shown[clip.name], clip)
         if shift is None:
             tell(f"note: nothing behind the board tells whether {clip.name} was moved before it filmed the scene")
+        w2c = world.camera(solved.w2c[v])
+        away = unknown * float(np.linalg.norm(centres(w2c)))
         camera = replace(
             cameras[v],
             K=_zoomed(clip.lens.K, float(solved.zoom[v])),
             distortion=_bent(clip.lens.distortion, float(solved.zoom[v]), float(solved.bend[v])),
-            w2c=world.camera(solved.w2c[v]),
+            w2c=w2c,
             sigma_degrees=float(np.hypot(sure.sigma_degrees[v], _turn(shift, clip))),
-            sigma_position=float(world.scale * np.hypot(sure.sigma_position[v], _way(shift, clip, solved, v))),
+            sigma_position=float(
+                np.hypot(away, world.scale * np.hypot(sure.sigma_position[v], _way(shift, clip, solved, v)))
+            ),
             inliers=int(solved.corners[v]),
             points=int(solved.places[v]),
         )

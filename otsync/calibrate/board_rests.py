@@ -14,11 +14,8 @@ from ..files.cache import Cache
 from ..geometry import undistort
 from ..progress import Tell
 from ..types import Camera
-from .boards import LEAST_CORNERS, Board
+from .boards import LEAST_CORNERS, Board, Look, looks_of, step_of
 from .clips import Clip, Lens
-
-LOOKS_A_SECOND = 8.0
-"""How often the board is looked for."""
 
 STEADY, DRIFT = 1.0, 3.0
 """Pixels at 1000 of width that a resting board may seem to move from one look to the next, and in all."""
@@ -54,33 +51,15 @@ def rests_of(
     clip: Clip, board: Board, lens: Lens, cache: Cache | None = None, tell: Tell = lambda text: None
 ) -> list[Rest]:
     """Where a clip shows the board at rest, in order of time. ``cache``: where corners are kept."""
-    step = max(1, round(clip.fps / LOOKS_A_SECOND))
-
-    def look() -> dict[str, np.ndarray]:
-        frames, xyz, uv = [], [], []
-        tell(f"{clip.name}: looking for the board in {len(range(0, len(clip.frames), step))} pictures")
-        for k in range(0, len(clip.frames), step):
-            found = board.corners(clip.frames[k])
-            if found is not None:
-                frames.append(np.full(len(found[0]), k))
-                xyz.append(found[0])
-                uv.append(found[1])
-        if not frames:
-            return {"frame": np.zeros(0, int), "xyz": np.zeros((0, 3)), "uv": np.zeros((0, 2))}
-        return {"frame": np.concatenate(frames), "xyz": np.concatenate(xyz), "uv": np.concatenate(uv)}
-
-    kept = (cache or Cache()).arrays("corners", (clip.key, board, step), look)
-    looks = [
-        (int(k), kept["xyz"][kept["frame"] == k], kept["uv"][kept["frame"] == k]) for k in np.unique(kept["frame"])
-    ]
+    looks = looks_of(clip, board, cache, tell)
     unit = max(clip.size) / 1000
     camera = Camera(lens.K, np.eye(4), *clip.size, lens.distortion)
     out = []
-    for group in _steady(looks, step, unit):
+    for group in _steady(looks, step_of(clip), unit):
         seconds = (group[-1][0] - group[0][0]) / clip.fps
         if seconds < RESTS:
             continue
-        xyz, uv = _mean_corners(group)
+        xyz, uv = _stillest(group)
         if len(xyz) < LEAST_CORNERS:
             continue
         ideal = undistort(camera, uv)
@@ -88,10 +67,6 @@ def rests_of(
         if len(poses):
             out.append(Rest(group[0][0] / clip.fps, group[-1][0] / clip.fps, xyz, ideal, poses, len(turns_of(board))))
     return out
-
-
-Look = tuple[int, np.ndarray, np.ndarray]
-"""Frame, corners on the board, and their pixels."""
 
 
 def _steady(looks: Sequence[Look], step: int, unit: float) -> list[list[Look]]:
@@ -122,25 +97,22 @@ def _names(xyz: Float[np.ndarray, "N 3"]) -> Int[np.ndarray, " N"]:
     return 1000 * at[:, 0] + at[:, 1]
 
 
-def _mean_corners(group: Sequence[Look]) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 2"]]:
-    """The corners that most looks have, and the mean of their pixels over the stillest half of the looks.
+def _stillest(group: Sequence[Look]) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 2"]]:
+    """The corners of a board at rest and their pixels, from the half of the looks in which it is stillest.
 
     A board that is set down is slow at first and last: each camera would see another part of that.
     """
-    for _ in range(2):
-        xyz, uv = (np.concatenate([look[n] for look in group]) for n in (1, 2))
-        names, first, inverse, count = np.unique(
-            _names(xyz), return_index=True, return_inverse=True, return_counts=True
-        )
-        often = count > len(group) / 2
-        order = np.argsort(inverse, kind="stable")
-        middle = np.stack([np.median(part, 0) for part in np.split(uv[order], np.cumsum(count)[:-1])])
-        mean = (0, xyz[first[often]], middle[often])
-        if not often.any():
-            break
-        group = sorted(group, key=lambda look: _moved(mean, look))[: max(3, (len(group) + 1) // 2)]
-    total = np.stack([np.bincount(inverse, uv[:, axis], len(names)) for axis in (0, 1)], 1)
-    return xyz[first[often]], total[often] / count[often, None]
+    usual = (0, *_usual(group))
+    still = sorted(group, key=lambda look: _moved(usual, look))[: max(3, (len(group) + 1) // 2)]
+    return _usual(still)
+
+
+def _usual(looks: Sequence[Look]) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 2"]]:
+    """The corners that most looks have, and the median of their pixels."""
+    xyz, uv = (np.concatenate([look[n] for look in looks]) for n in (1, 2))
+    _, first, corner, count = np.unique(_names(xyz), return_index=True, return_inverse=True, return_counts=True)
+    often = np.flatnonzero(2 * count > len(looks))
+    return xyz[first[often]], np.array([np.median(uv[corner == k], 0) for k in often]).reshape(-1, 2)
 
 
 def turns_of(board: Board) -> Float[np.ndarray, "R 4 4"]:

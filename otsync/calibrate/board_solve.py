@@ -31,8 +31,9 @@ NEAR_TURN, NEAR_PLACE = 2.0, 0.02
 AGREEING = 0.6
 """Share of the rests that two cameras have at one time which must agree on their pose."""
 
-BEND = 0.02
-"""By what the first radial coefficient of a lens may be off."""
+BEND, WIDER = 0.02, 0.01
+"""By what the first radial coefficient of a lens may be off, and a share by which a printer makes squares wider: half a
+per cent that nobody asks about puts cameras three sigmas off."""
 
 EXACT = 2e6
 """Numbers of a Jacobian from which on its steps are found by iteration."""
@@ -78,7 +79,7 @@ class Solved:
         w2c: (V,4,4) in the frame of one of them, lengths in squares; nan where a camera is linked to no other.
         boards: (P,4,4) the board's places, to the world.
         zoom: (V,) by what focal lengths were multiplied. sigma_zoom: (V,) its standard deviation, 0 where held.
-        bend: (V,) what was added to the first radial coefficient.
+        bend: (V,) what was added to the first radial coefficient. wider: share by which squares are wider than high.
         corners: (V,) how many corners tell of each camera. places: (V,) at how many places of the board.
         off: (V,) their errors, rms, in pixels.
         sigma_degrees, sigma_position: (V,) standard deviations of the poses: degrees and squares.
@@ -89,6 +90,7 @@ class Solved:
     zoom: Float[np.ndarray, " V"]
     sigma_zoom: Float[np.ndarray, " V"]
     bend: Float[np.ndarray, " V"]
+    wider: float
     corners: Int[np.ndarray, " V"]
     places: Int[np.ndarray, " V"]
     off: Float[np.ndarray, " V"]
@@ -342,7 +344,7 @@ def _adjusted(linked: Linked, K: Sequence[np.ndarray], within: Sequence[float], 
         np.stack([np.asarray(k, float) for k in K]),
         free,
         loose,
-        noise / np.array([(within[v], BEND) for v in loose]).reshape(-1),
+        noise / np.array([*(x for v in loose for x in (within[v], BEND)), WIDER]),
     )
     with blas_for(FEW):
         done = least_squares(
@@ -365,7 +367,7 @@ def _adjusted(linked: Linked, K: Sequence[np.ndarray], within: Sequence[float], 
         own = variances[:, 6 * n :][:, :6]
         turn[v] = np.degrees(np.sqrt(own[:, :3].sum(1).max()))
         move[v] = np.sqrt(own[:, 3:].sum(1).max())  # a step's turn is about the centre, which it leaves where it is
-    unsure[loose] = np.sqrt(variances[:, stop::2].max(0))
+    unsure[loose] = np.sqrt(variances[:, stop:-1:2].max(0))
     turn[fixed], move[fixed] = np.nanmin(turn), np.nanmin(move)  # poses are relative: no camera is surer than all
     out[[v not in poses for v in range(cameras)]] = np.nan
     seen = [views.camera == v for v in range(cameras)]
@@ -375,6 +377,7 @@ def _adjusted(linked: Linked, K: Sequence[np.ndarray], within: Sequence[float], 
         zoom,
         unsure,
         bend,
+        float(np.expm1(done.x[-1])),
         np.array([int(s.sum()) for s in seen]),
         np.array([len(np.unique(views.place[s])) for s in seen]),
         np.array([float(np.sqrt(np.mean(np.sum(off[s] ** 2, 1)))) if s.any() else np.nan for s in seen]),

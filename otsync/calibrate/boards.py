@@ -15,11 +15,12 @@ import numpy as np
 from jaxtyping import Float
 
 from ..compute.indices import evenly
+from ..files.cache import Cache
 from ..progress import Tell
 from .clips import Clip, Lens
 
-LOOKED_AT, USED = 120, 30
-"""Frames of a clip in which the board is looked for, and pictures that the lens is found from."""
+LOOKS_A_SECOND, LEAST_LOOKS, USED = 8.0, 120, 30
+"""How often the board is looked for, in how many frames at the least, and pictures that the lens is found from."""
 
 LEAST_PICTURES, LEAST_CORNERS = 8, 6
 """Pictures of the board that a lens needs, and corners of a picture that counts."""
@@ -94,15 +95,45 @@ class Board:
         return None
 
 
-def lens_of(clip: Clip, board: Board) -> Lens:
+Look = tuple[int, Float[np.ndarray, "N 3"], Float[np.ndarray, "N 2"]]
+"""Frame of a clip, corners on the board (in squares), and their pixels."""
+
+
+def step_of(clip: Clip) -> int:
+    """Frames from one look for the board to the next: of a short clip each is looked at."""
+    return max(1, min(round(clip.fps / LOOKS_A_SECOND), len(clip.frames) // LEAST_LOOKS))
+
+
+def looks_of(clip: Clip, board: Board, cache: Cache | None = None, tell: Tell = lambda text: None) -> list[Look]:
+    """Where the board is in a clip: the looks that found it. ``cache``: where they are kept."""
+    every = range(0, len(clip.frames), step_of(clip))
+
+    def look() -> dict[str, np.ndarray]:
+        tell(f"{clip.name}: looking for the board in {len(every)} pictures")
+        found = [(k, *seen) for k in every if (seen := board.corners(clip.frames[k]))]
+        return {
+            "frame": np.concatenate([np.zeros(0, int), *(np.full(len(xyz), k) for k, xyz, _ in found)]),
+            "xyz": np.concatenate([np.zeros((0, 3)), *(xyz for _, xyz, _ in found)]),
+            "uv": np.concatenate([np.zeros((0, 2)), *(uv for _, _, uv in found)]),
+        }
+
+    kept = (cache or Cache()).arrays("corners", (clip.key, board, len(every)), look)
+    frames = [int(k) for k in np.unique(kept["frame"])]
+    return [(k, kept["xyz"][kept["frame"] == k], kept["uv"][kept["frame"] == k]) for k in frames]
+
+
+def lens_of(clip: Clip, board: Board, looks: Sequence[Look] | None = None) -> Lens:
     """The lens that filmed a clip of the board: focal length and one radial term, the principal point in the middle.
+
+    Args:
+        looks: as of :func:`looks_of`; default: they are made.
 
     ValueError names the clip where the board is seen too little, from one side only, or does not fit.
     """
     import cv2
 
     w, h = clip.size
-    views = [found for k in evenly(len(clip.frames), LOOKED_AT) if (found := board.corners(clip.frames[int(k)]))]
+    views = [(xyz, uv) for _, xyz, uv in (looks_of(clip, board) if looks is None else looks)]
     if len(views) < LEAST_PICTURES:
         raise ValueError(
             f"{clip.name}: expected the board in {LEAST_PICTURES} pictures and more; found it in {len(views)}. Film it "
@@ -132,12 +163,12 @@ def lens_of(clip: Clip, board: Board) -> Lens:
 
 
 def with_boards(
-    clips: Sequence[Clip], text: str | None, tell: Tell = lambda text: None
+    clips: Sequence[Clip], text: str | None, cache: Cache | None = None, tell: Tell = lambda text: None
 ) -> tuple[list[Clip], dict[str, Clip]]:
     """The clips without those of boards, with the lenses that these tell; and by video's name the clip of its board.
 
     Args:
-        text: which board it is, as :meth:`Board.parse` reads it.
+        text: which board it is, as :meth:`Board.parse` reads it. cache: where corners are kept.
 
     ValueError for board clips of an unknown board, for a board that no clip shows, and for a clip of no video.
     """
@@ -167,7 +198,7 @@ def with_boards(
         if any(other.name == whose and other.lens.source == "given" for other in others):
             continue  # the lens is known: the clip may tell where the camera stands
         try:
-            lenses[whose] = lens_of(clip, board), clip.size
+            lenses[whose] = lens_of(clip, board, looks_of(clip, board, cache, tell)), clip.size
         except ValueError as error:
             if not whose or len(shown) == 1:
                 raise

@@ -121,11 +121,10 @@ def calibrate(
     """
     options, cache = options or CalibrateOptions(), cache or Cache()
     clips, _ = read_clips(folder, options.intrinsics)
-    clips, shown = with_boards(clips, options.board, tell)
+    clips, shown = with_boards(clips, options.board, cache, tell)
     if not shown:
-        return calibrate_clips(
-            clips, _without_board(options, "no clip of a board has the name of a video", tell), cache=cache, tell=tell
-        )
+        _told_of_square(options, "no clip of a board has the name of a video", tell)
+        return calibrate_clips(clips, options, cache=cache, tell=tell)
     progress, options = Progress(tell), _with_distance(options, clips)
     with progress.stage("board"), pool_of(os.cpu_count() or 1) as pool:
         by_board = cameras_by_board(
@@ -150,7 +149,7 @@ def calibrate(
             tell(f"by the board: {camera.doubt}")
     tell("what the board leaves out is looked for by the background")
     try:
-        found = calibrate_clips(clips, replace(options, square=None), cache=cache, tell=tell)
+        found = calibrate_clips(clips, options, cache=cache, tell=tell)
     except ValueError as error:
         if _worth(by_board)[0] < 2:
             raise
@@ -159,7 +158,7 @@ def calibrate(
     seconds = dict(progress.seconds) | found.seconds
     if _worth(by_board) > _worth(found):
         return replace(by_board, helpers=found.helpers, seconds=seconds)
-    _without_board(options, "the board tells no more cameras than the background", tell)
+    _told_of_square(options, "the board tells no more cameras than the background", tell)
     return replace(found, seconds=seconds)
 
 
@@ -175,7 +174,7 @@ def calibrate_clips(
     cache: Cache | None = None,
     tell: Tell = lambda text: None,
 ) -> Calibration:
-    """The same for clips that are already described, walk clips among them."""
+    """The same by the background alone, for clips that are already described, walk clips among them."""
     options, cache, progress = options or CalibrateOptions(), cache or Cache(), Progress(tell)
     options = _with_distance(options, clips)
     with progress.stage("pictures"):
@@ -358,11 +357,10 @@ def _split(
     return Calibration(scene, method, unit, helpers, seconds=dict(progress.seconds))
 
 
-def _without_board(options: CalibrateOptions, why: str, tell: Tell) -> CalibrateOptions:
-    """The options where the board told no camera; says that a square's side was given in vain."""
+def _told_of_square(options: CalibrateOptions, why: str, tell: Tell) -> None:
+    """Say that a square's side was given in vain, where it was."""
     if options.square is not None:
         tell(f"note: --square is not used, and lengths are arbitrary: {why}")
-    return replace(options, square=None)
 
 
 def _with_distance(options: CalibrateOptions, clips: Sequence[Clip]) -> CalibrateOptions:
