@@ -188,10 +188,10 @@ class Run:
             else observer_at_once(scene, p.clips, shots, clocks, depth=depth, probes=asked)
         )
         observe, losses, errors = compose(observe, p.effects, values), [], []
+        held = prior(p.effects, values)  # of every image, so that it weighs as much in any batch
         for shot in shots:
             seen = self.seen(scene, values, observe(shot), p.clips[shot.video], shot)
             parts = [loss.weight * value for loss in p.losses if (value := loss(seen)) is not None]
-            held = prior(p.effects, values)
             losses.append(sum(parts if held is None else [*parts, held], torch.zeros((), device=p.device)))
             errors.append((seen.rendered.detach() - seen.image).square().mean())
         loss = sum(losses[1:], losses[0])

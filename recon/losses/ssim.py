@@ -6,6 +6,7 @@ The definitions are in torch, for any float type and device; the loss in float32
 from __future__ import annotations
 
 import importlib.util
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -21,19 +22,34 @@ def ssim_map(x: Tensor, y: Tensor, window: Window = STANDARD) -> Tensor:
 
     Beyond the border images are black (zero padding), in both alike.
     """
-    k, radius = window.weights().tolist(), window.radius
-
-    def blur(image: Tensor) -> Tensor:
-        # shifted sums: 20 times faster than a convolution of single channels
-        h, w = image.shape[:2]
-        image = F.pad(image, (0, 0, radius, radius, radius, radius))
-        down = sum((k[i] * image[i : i + h] for i in range(1, window.taps)), k[0] * image[:h])
-        return sum((k[i] * down[:, i : i + w] for i in range(1, window.taps)), k[0] * down[:, :w])
-
-    mean_x, mean_y, xx, yy, xy = blur(torch.cat([x, y, x * x, y * y, x * y], -1)).split(x.shape[-1], -1)
+    blur = _shifted_sums if x.device.type == "cpu" else _convolved
+    mean_x, mean_y, xx, yy, xy = blur(torch.cat([x, y, x * x, y * y, x * y], -1), window).split(x.shape[-1], -1)
     var_x, var_y, covariance = xx - mean_x**2, yy - mean_y**2, xy - mean_x * mean_y
     similar = (2 * mean_x * mean_y + C1) * (2 * covariance + C2)
     return similar / ((mean_x**2 + mean_y**2 + C1) * (var_x + var_y + C2))
+
+
+def _shifted_sums(image: Tensor, window: Window) -> Tensor:
+    """Windowed means [h,w,c]. On a CPU 20 times faster than a convolution of single channels."""
+    k, radius = window.weights().tolist(), window.radius
+    h, w = image.shape[:2]
+    image = F.pad(image, (0, 0, radius, radius, radius, radius))
+    down = sum((k[i] * image[i : i + h] for i in range(1, window.taps)), k[0] * image[:h])
+    return sum((k[i] * down[:, i : i + w] for i in range(1, window.taps)), k[0] * down[:, :w])
+
+
+def _convolved(image: Tensor, window: Window) -> Tensor:
+    """The same in one operation: a GPU waits for its orders, not for sums. By channels, which is never done in TF32."""
+    channels = image.shape[-1]
+    kernel = _kernel(window, image.dtype, image.device).expand(channels, 1, -1, -1)
+    return F.conv2d(image.permute(2, 0, 1)[None], kernel, padding=window.radius, groups=channels)[0].permute(1, 2, 0)
+
+
+@lru_cache(maxsize=8)
+def _kernel(window: Window, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """The window [taps,taps], put on the device once."""
+    k = window.weights()
+    return (k[:, None] * k).to(device, dtype)
 
 
 ROWS_PER_PART = 64  # of the CPU kernel: fixed, so that sums do not depend on the threads

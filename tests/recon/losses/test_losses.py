@@ -17,7 +17,7 @@ from otsync import TrackSet
 from otsync.compute.threads import get_threads
 from recon.losses import image as losses
 from recon.losses.image import Seen
-from recon.losses.ssim import photometric, photometric_reference, ssim_map
+from recon.losses.ssim import _convolved, _shifted_sums, photometric, photometric_reference, ssim_map
 from recon.losses.window import C1, SMALL, STANDARD, Window
 from recon.raster import set_threads
 
@@ -48,6 +48,12 @@ def test_ssim_is_its_definition():
         va, vb, cov = blur(a * a) - ma**2, blur(b * b) - mb**2, blur(a * b) - ma * mb
         expected = (2 * ma * mb + 1e-4) * (2 * cov + 9e-4) / ((ma**2 + mb**2 + 1e-4) * (va + vb + 9e-4))
         np.testing.assert_allclose(ssim_map(x, y, window).numpy(), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("window", [SMALL, STANDARD], ids=["small", "standard"])
+def test_a_gpus_windows_are_those_of_the_cpu(window):
+    image = torch.from_numpy(np.random.default_rng(2).random((9, 23, 15)))
+    torch.testing.assert_close(_convolved(image, window), _shifted_sums(image, window), rtol=0, atol=1e-14)
 
 
 def test_ssim_of_flat_images_compares_means_only():
