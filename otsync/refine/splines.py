@@ -94,7 +94,7 @@ class SplineRefine(Refiner):
     neighbourhoods of matches or blocks of one second (wider where these are few), the ``spread`` of the answers with
     the other windows (the largest difference, so its square counts half), and what blur predicts: errors of the model
     that no residual shows. It holds at both ends of the overlap: the uncertainty of the rate grows with the distance
-    from the middle.
+    from the middle, and what all seconds are off by beyond chance joins it.
 
     Args:
         windows: half windows of detrending in seconds: the answer's, and those that it is compared with.
@@ -133,7 +133,10 @@ class SplineRefine(Refiner):
         long = overlap_seconds(*curves, fit.clock) >= LONG - 1e-9
         unsettled = unsettled_rate(rate_stats, fit.clock.rate, UNSETTLED if long else UNSETTLED_SHORT)
         seconds = Seconds.of(*curves, fit.clock, self.windows[0], weight)
-        ends = self._ends(curves, fit, free, shared, unsettled, rate_stats.get("rate_sigma"))
+        floor = self._wanders(fit.blur)
+        even = self._ends(curves, fit, free, shared, unsettled, rate_stats.get("rate_sigma"))
+        sways = seconds.beyond(floor)
+        ends = math.hypot(even[0], sways), math.hypot(even[1], sways)
         stats = (
             alignment.stats
             | rate_stats
@@ -145,7 +148,7 @@ class SplineRefine(Refiner):
                 "blur": fit.blur,
                 "common_motion": common_motion(*curves, fit.clock, fit.weights, self.windows[0]),
                 "wander": fit.wander,
-                "unsteady": seconds.unsteady(self._wanders(fit.blur)),
+                "unsteady": seconds.unsteady(floor),
                 "untold": seconds.untold(),
                 "settled": float(fit.settled),
                 "common_error": common,
@@ -227,7 +230,7 @@ class SplineRefine(Refiner):
         unsettled: float,
         measured: float | None,
     ) -> tuple[float, float]:
-        """One sigma at the beginning and at the end of the overlap.
+        """One sigma at the beginning and at the end of the overlap, of a clock that runs evenly.
 
         shared: variance of errors that both ends have; unsettled: what the rate may be off by; measured: one sigma of
         the rate where it was fitted.

@@ -305,6 +305,22 @@ BREAKS = (
         "a span of a's clock is taken for one of b's",
     ),
     Break(
+        "seconds-sway-unsaid",
+        "otsync/refine/splines.py",
+        "sways = seconds.beyond(floor)",
+        "sways = 0.0 * seconds.beyond(floor)",
+        SECONDS,
+        "sigma is that of an even clock, however much single seconds are off",
+    ),
+    Break(
+        "seconds-wild-counts",
+        "otsync/refine/seconds.py",
+        "np.minimum(self.late[known] ** 2, WILD**2 * chance) - chance",
+        "self.late[known] ** 2 - chance",
+        SECONDS,
+        "one wild second makes a whole answer unsure",
+    ),
+    Break(
         "seconds-rest-speaks",
         "otsync/refine/seconds.py",
         "(self.sigma[k] for k in (0, -1) if moves[k] and unusual[k])",

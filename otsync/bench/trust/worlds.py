@@ -12,6 +12,8 @@ import numpy as np
 from ...simulate import PRESETS, Truth, simulate
 from ...simulate.effects import (
     ClockDrift,
+    ClockRamp,
+    ClockSway,
     Cut,
     Drop,
     Effect,
@@ -169,6 +171,13 @@ def rated(seed: int, *, rate: float, frames: int, preset: str = "mid") -> World:
     return plain(seed, rates=[1.0, float(up)], frames=frames, preset=preset)
 
 
+def speeds_up(seed: int) -> World:
+    """One video's clock speeds up, or slows down, by 1 to 4 % within its 5 s."""
+    rng = np.random.default_rng([seed, 904])
+    change = float(rng.choice([-1, 1]) * rng.uniform(0.01, 0.04))
+    return plain(seed, first=(In(1, ClockRamp(change)),))
+
+
 def paused(seed: int) -> World:
     """A recorder that was paused for .25 to .5 s, and goes on between two frames of before."""
     return plain(seed, first=(In(1, Drop(float(np.random.default_rng([seed, 903]).uniform(0.25, 0.5)))),))
@@ -239,6 +248,8 @@ CLASSES: dict[str, Callable[[int], World]] = {
     "rate .1 %, 20 s": partial(rated, rate=0.001, frames=600),
     "rate .1 %, 30 s": partial(rated, rate=0.001, frames=900),
     "rate 1 %, 5 s": partial(rated, rate=0.01, frames=150),
+    "clock speeds up": speeds_up,
+    "clock sways": partial(plain, first=(In(1, ClockSway()),)),
     "tracks that lag": partial(plain, first=(In(1, Lag(3 / 30)),)),
     "tracks that lag, hard": partial(plain, preset="hard", first=(In(1, Lag(3 / 30)),)),
     "one of two late": partial(plain, classes=("basketball", "football"), first=(In(1, PartLate()),)),

@@ -13,7 +13,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from ..observation import Observation
-from .camera import CameraFrame, ClockDrift, DroppedFrames, OwnFrame, RigidFrame, RollingShutter
+from .camera import CameraFrame, ClockDrift, ClockRamp, ClockSway, DroppedFrames, OwnFrame, RigidFrame, RollingShutter
 from .noise import (
     CameraDepthDrift,
     DepthBias,
@@ -33,6 +33,8 @@ __all__ = [
     "CameraDepthDrift",
     "CameraFrame",
     "ClockDrift",
+    "ClockRamp",
+    "ClockSway",
     "Cut",
     "DepthBias",
     "DepthDrift",

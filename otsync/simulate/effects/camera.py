@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from ...types.checks import check_number
 from ..observation import Observation, Similarity
 from .noise import smooth_noise
 
@@ -107,9 +108,43 @@ class ClockDrift:
     correlation: float = 2.0
 
     def __call__(self, obs: Observation, rng: np.random.Generator) -> Observation:
-        off = self.size * smooth_noise((1,), obs.times, self.correlation, rng, np.float64)[0]
-        late = off if obs.late is None else obs.late + off
-        return replace(obs, xyz=obs.xyz + obs.moved(off), late=late)
+        return _shown_late(obs, self.size * smooth_noise((1,), obs.times, self.correlation, rng, np.float64)[0])
+
+
+@dataclass(frozen=True)
+class ClockRamp:
+    """The video's clock speeds up evenly: from its first frame to its last one its rate grows by ``change``.
+
+    The file tells times of the mean rate. ``Truth.shown`` tells the true ones: at both ends ``change`` · length / 8
+    later than those told, or earlier where ``change`` is negative.
+    """
+
+    change: float = 0.02
+
+    def __call__(self, obs: Observation, rng: np.random.Generator) -> Observation:
+        t = obs.times - (obs.times[0] + obs.times[-1]) / 2
+        return _shown_late(obs, self.change * t**2 / (2 * max(float(np.ptp(t)), 1e-9)))
+
+
+@dataclass(frozen=True)
+class ClockSway:
+    """The video's clock runs ahead and falls behind in turn, by ``size`` s, once in ``period`` s."""
+
+    size: float = 0.5 / 30
+    period: float = 2.0
+
+    def __post_init__(self) -> None:
+        check_number("ClockSway.period", self.period)
+
+    def __call__(self, obs: Observation, rng: np.random.Generator) -> Observation:
+        turn = 2 * np.pi * (obs.times / self.period + rng.random())
+        return _shown_late(obs, self.size * np.sin(turn))
+
+
+def _shown_late(obs: Observation, off: Float[np.ndarray, " T"]) -> Observation:
+    """Every frame shows what was ``off`` s later than the time that its file tells."""
+    late = off if obs.late is None else obs.late + off
+    return replace(obs, xyz=obs.xyz + obs.moved(off), late=late)
 
 
 @dataclass(frozen=True)

@@ -227,6 +227,8 @@ def test_the_absence_of_an_effect_changes_no_bit_of_the_others():
         effects.Outliers(0),
         effects.Hallucination(0),
         effects.ClockDrift(0),
+        effects.ClockRamp(0),
+        effects.ClockSway(0),
     ],
     ids=lambda e: type(e).__name__,
 )

@@ -223,6 +223,25 @@ def test_clock_drift_moves_the_instants():
         assert np.abs(near[:, 0] - worse.xyz[:, k]).max() < 0.1 * np.abs(want[:, 0] - worse.xyz[:, k]).max() + 1e-6
 
 
+def test_a_clock_that_speeds_up_shows_what_is_later_at_both_ends():
+    exact, worse, _, truth = with_and_without(effects.ClockRamp(0.04), tracks=30)
+    late = 0.04 / 8 * (exact.times[-1] - exact.times[0])
+    off = truth.shown[0] - exact.times
+    np.testing.assert_allclose([off[0], off[-1]], late)
+    assert np.all(np.diff(off, 2) > 0) and abs(off[len(off) // 2]) < 1e-5
+    np.testing.assert_allclose(worse.xyz, truth.positions(0, truth.shown[0]), atol=1e-5)
+
+
+def test_a_clock_that_sways_is_ahead_and_behind_in_turn():
+    exact, worse, _, truth = with_and_without(effects.ClockSway(0.02, 1.0), tracks=30)
+    off = truth.shown[0] - exact.times
+    assert np.ptp(off) == pytest.approx(0.04, rel=0.02)
+    np.testing.assert_allclose(off[30:], off[:-30], atol=1e-9)
+    np.testing.assert_allclose(worse.xyz, truth.positions(0, truth.shown[0]), atol=1e-5)
+    with pytest.raises(ValueError, match=r"ClockSway\.period"):
+        effects.ClockSway(period=0)
+
+
 def test_dropped_frames_keep_their_times():
     exact, worse, truth, _ = with_and_without(effects.DroppedFrames(0.2), tracks=30)
     assert 100 < worse.n_frames < 140
