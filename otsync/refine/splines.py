@@ -94,7 +94,7 @@ class SplineRefine(Refiner):
     neighbourhoods of matches or blocks of one second (wider where these are few), the ``spread`` of the answers with
     the other windows (the largest difference, so its square counts half), and what blur predicts: errors of the model
     that no residual shows. It holds at both ends of the overlap: the uncertainty of the rate grows with the distance
-    from the middle, and what all seconds are off by beyond chance joins it.
+    from the middle, and it is no less than what all seconds are off by beyond chance.
 
     Args:
         windows: half windows of detrending in seconds: the answer's, and those that it is compared with.
@@ -136,7 +136,7 @@ class SplineRefine(Refiner):
         floor = self._wanders(fit.blur)
         even = self._ends(curves, fit, free, shared, unsettled, rate_stats.get("rate_sigma"))
         sways = seconds.beyond(floor)
-        ends = math.hypot(even[0], sways), math.hypot(even[1], sways)
+        ends = max(even[0], sways), max(even[1], sways)  # errors in common make single seconds differ, too
         stats = (
             alignment.stats
             | rate_stats
