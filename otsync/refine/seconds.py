@@ -37,7 +37,8 @@ itself: of few tracks such seconds are off by 5.6 of their sigmas, rms (12 world
 by up to 3.6; in two takes, slow motion, freezes and films played backwards there is none."""
 
 WILD = 3.0
-"""Sigmas by which a second counts as off at most, where all of them are asked for their scatter."""
+"""Times as many sigmas as is usual among the seconds that one of them counts as off by at most, where all are asked for
+their scatter."""
 
 ITERATIONS = 12
 
@@ -91,23 +92,25 @@ class Seconds:
             return 0.0
         return float(np.sqrt((self.late[known] ** 2 / (self.sigma[known] ** 2 + floor**2)).mean()))
 
-    def beyond(self, floor: float) -> float:
-        """By how much an even clock is off at any moment beyond what chance explains, one sigma, s; 0 where few parts
-        can tell.
+    def sway(self, floor: float) -> float:
+        """By how much an even clock is off at any moment, one sigma, s, as far as chance does not explain it; 0 where
+        few parts can tell.
 
         A clock that sways shows it in all of its seconds: what they are off by has more variance than their sigmas
         have. This is the difference, averaged by information (the method of moments of DerSimonian and Laird 1986,
-        about the answer); one wild second counts as off by :data:`WILD` sigmas. A clock that bends by less than single
-        seconds can tell looks even.
+        about the answer) and cut off at 0: of an even clock it is some tenths of a second's own sigma by chance. A
+        second that is wild among the others counts as off by :data:`WILD` times as much as usual. A clock that bends by
+        less than single seconds can tell looks even.
 
         Args:
             floor: as of :meth:`unsteady`.
         """
-        known = np.isfinite(self.late)
-        if known.sum() < LEAST:
+        known = np.isfinite(self.late) & np.isfinite(self.sigma)
+        if known.sum() < LEAST or not math.isfinite(floor):
             return 0.0
         chance = self.sigma[known] ** 2 + floor**2
-        excess = np.minimum(self.late[known] ** 2, WILD**2 * chance) - chance
+        usual = max(1.0, float(np.median(self.late[known] ** 2 / chance)))
+        excess = np.minimum(self.late[known] ** 2, WILD**2 * usual * chance) - chance
         return math.sqrt(max(float(np.average(excess, weights=1 / chance)), 0.0))
 
     def untold(self) -> float:

@@ -94,7 +94,7 @@ class SplineRefine(Refiner):
     neighbourhoods of matches or blocks of one second (wider where these are few), the ``spread`` of the answers with
     the other windows (the largest difference, so its square counts half), and what blur predicts: errors of the model
     that no residual shows. It holds at both ends of the overlap: the uncertainty of the rate grows with the distance
-    from the middle, and it is no less than what all seconds are off by beyond chance.
+    from the middle. What all seconds are off by beyond chance counts like errors in common, whichever is more.
 
     Args:
         windows: half windows of detrending in seconds: the answer's, and those that it is compared with.
@@ -129,14 +129,14 @@ class SplineRefine(Refiner):
         shared = spread**2 / 2 + (fit.blur**2 / COMMON_ERRORS) ** 2 + LEAST_SIGMA**2
         together = neighbours(curves[0].mean + curves[1].mean, GROUPS)
         common = common_error(*curves, fit.clock, fit.weights, together, self.windows[0])
-        shared += max(0.0, common**2 - float(fit.covariance[0, 0]))
-        long = overlap_seconds(*curves, fit.clock) >= LONG - 1e-9
-        unsettled = unsettled_rate(rate_stats, fit.clock.rate, UNSETTLED if long else UNSETTLED_SHORT)
         seconds = Seconds.of(*curves, fit.clock, self.windows[0], weight)
         floor = self._wanders(fit.blur)
-        even = self._ends(curves, fit, free, shared, unsettled, rate_stats.get("rate_sigma"))
-        sways = seconds.beyond(floor)
-        ends = max(even[0], sways), max(even[1], sways)  # errors in common make single seconds differ, too
+        sway = seconds.sway(floor)
+        # three estimates of one thing: what tracks have in common makes seconds differ, too
+        shared += max(0.0, max(common, sway) ** 2 - float(fit.covariance[0, 0]))
+        long = overlap_seconds(*curves, fit.clock) >= LONG - 1e-9
+        unsettled = unsettled_rate(rate_stats, fit.clock.rate, UNSETTLED if long else UNSETTLED_SHORT)
+        ends = self._ends(curves, fit, free, shared, unsettled, rate_stats.get("rate_sigma"))
         stats = (
             alignment.stats
             | rate_stats
@@ -152,6 +152,7 @@ class SplineRefine(Refiner):
                 "untold": seconds.untold(),
                 "settled": float(fit.settled),
                 "common_error": common,
+                "sway": sway,
                 "scatter": math.sqrt(max(float(fit.covariance[0, 0]), 0.0)),
                 "correlation": velocity_correlation(*curves, fit, VELOCITY),
                 "overlap": overlap_seconds(*curves, fit.clock),
@@ -230,7 +231,7 @@ class SplineRefine(Refiner):
         unsettled: float,
         measured: float | None,
     ) -> tuple[float, float]:
-        """One sigma at the beginning and at the end of the overlap, of a clock that runs evenly.
+        """One sigma at the beginning and at the end of the overlap.
 
         shared: variance of errors that both ends have; unsettled: what the rate may be off by; measured: one sigma of
         the rate where it was fitted.

@@ -39,7 +39,7 @@ class Trust:
             at most.
         wander: BROKEN_CLOCK when the offsets of single seconds differ by more than this share of ``blur``: of noise
             they differ by .08 of it at most (16 pairs each, mid to brutal), in two takes of one choreography by .12 to
-            .46.
+            .46. Sigma counts what they differ by beyond it.
         unsteady: BROKEN_CLOCK when single seconds, each fitted by itself, are off by more than this, rms, in units of
             how well each is known. Of 320 right answers (mid to brutal, few tracks, like people, drifts; seeds
             41000-41029) none has more than 1.65; two takes that were trusted 2.3 to 4.

@@ -171,8 +171,8 @@ def rated(seed: int, *, rate: float, frames: int, preset: str = "mid") -> World:
     return plain(seed, rates=[1.0, float(up)], frames=frames, preset=preset)
 
 
-def speeds_up(seed: int) -> World:
-    """One video's clock speeds up, or slows down, by 1 to 4 % within its 5 s."""
+def bending(seed: int) -> World:
+    """The rate of one video's clock changes by 1 to 4 % within its 5 s."""
     rng = np.random.default_rng([seed, 904])
     change = float(rng.choice([-1, 1]) * rng.uniform(0.01, 0.04))
     return plain(seed, first=(In(1, ClockRamp(change)),))
@@ -248,7 +248,7 @@ CLASSES: dict[str, Callable[[int], World]] = {
     "rate .1 %, 20 s": partial(rated, rate=0.001, frames=600),
     "rate .1 %, 30 s": partial(rated, rate=0.001, frames=900),
     "rate 1 %, 5 s": partial(rated, rate=0.01, frames=150),
-    "clock speeds up": speeds_up,
+    "clock bends": bending,
     "clock sways": partial(plain, first=(In(1, ClockSway()),)),
     "tracks that lag": partial(plain, first=(In(1, Lag(3 / 30)),)),
     "tracks that lag, hard": partial(plain, preset="hard", first=(In(1, Lag(3 / 30)),)),

@@ -113,13 +113,17 @@ class ClockDrift:
 
 @dataclass(frozen=True)
 class ClockRamp:
-    """The video's clock speeds up evenly: from its first frame to its last one its rate grows by ``change``.
+    """The video's clock bends: from its first frame to its last one its rate grows evenly by ``change``, -1 to 1.
 
-    The file tells times of the mean rate. ``Truth.shown`` tells the true ones: at both ends ``change`` · length / 8
-    later than those told, or earlier where ``change`` is negative.
+    A rate is seconds of the world in a second of the clock: where it grows, the file plays ever faster. The file tells
+    times of the mean rate. ``Truth.shown`` tells the true ones: at both ends ``change`` · length / 8 later than those
+    told, or earlier where ``change`` is negative.
     """
 
     change: float = 0.02
+
+    def __post_init__(self) -> None:
+        check_number("ClockRamp.change", self.change, -1.0, 1.0)
 
     def __call__(self, obs: Observation, rng: np.random.Generator) -> Observation:
         t = obs.times - (obs.times[0] + obs.times[-1]) / 2
@@ -128,13 +132,17 @@ class ClockRamp:
 
 @dataclass(frozen=True)
 class ClockSway:
-    """The video's clock runs ahead and falls behind in turn, by ``size`` s, once in ``period`` s."""
+    """The video's clock runs ahead and falls behind in turn, by ``size`` s at most, once in ``period`` s.
+
+    Every video begins at a moment of its own in this period. ``Truth.shown`` tells when frames were exposed.
+    """
 
     size: float = 0.5 / 30
     period: float = 2.0
 
     def __post_init__(self) -> None:
         check_number("ClockSway.period", self.period)
+        check_number("ClockSway.size", self.size, -1e-12, self.period / (2 * np.pi))  # or time would run backwards
 
     def __call__(self, obs: Observation, rng: np.random.Generator) -> Observation:
         turn = 2 * np.pi * (obs.times / self.period + rng.random())

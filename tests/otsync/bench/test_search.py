@@ -11,7 +11,20 @@ from otsync import synchronize
 from otsync.bench.sync_acceptance import WRONG
 from otsync.bench.sync_worlds import FPS, MOVING
 from otsync.bench.trust.worlds import plain
-from otsync.simulate.effects import ClockDrift, Cut, Drop, Freeze, In, Lag, LimbDrift, Repeats, SharedDrift, SlowMotion
+from otsync.simulate.effects import (
+    ClockDrift,
+    ClockRamp,
+    ClockSway,
+    Cut,
+    Drop,
+    Freeze,
+    In,
+    Lag,
+    LimbDrift,
+    Repeats,
+    SharedDrift,
+    SlowMotion,
+)
 
 WORLDS = 400
 """Ten minutes on one core. The worlds are the same in every run, so that the verdict is, too."""
@@ -23,6 +36,8 @@ FAULTS = st.one_of(
     st.sampled_from([15.0, 20.0, 24.0, 25.0]).map(Repeats),
     st.floats(1.3, 4.0).map(SlowMotion),
     st.floats(0.02, 0.3).map(ClockDrift),
+    st.floats(-0.1, 0.1).map(ClockRamp),
+    st.floats(0.002, 0.1).map(ClockSway),
     st.floats(0.005, 0.05).map(LimbDrift),
     st.floats(0.01, 0.2).map(Lag),
     st.floats(0.02, 0.3).map(SharedDrift),

@@ -125,7 +125,7 @@ def test_the_refiner_says_no_less():
     """Two videos whose tracks all err alike: neighbourhoods and seconds may scatter less than that by chance."""
     clip, matches = np.arange(FRAMES) / FPS, Matches(np.stack([np.arange(30)] * 2, 1), np.ones(30))
     below = 0
-    for seed in range(6):
+    for seed in range(12):
         rng = np.random.default_rng(seed)
         x = smooth(rng, 30, FRAMES, 3) + smooth(rng, 1, FRAMES, 3)
         a = TrackSet(x, timestamps=clip, frame="world")
@@ -155,5 +155,5 @@ def test_pixels_say_no_less():
         problem = refiner.scan.residuals(a, b, matches, 0.0, FPS)
         step = problem.solve(0.0, refiner.windows[0], 12, refiner.reach)[1]
         assert found.sigma >= found.stats["common_error"] >= 0 or Status.MOVED in found.flags
-        below += Status.MOVED not in found.flags and problem.scatter(step) < 0.8 * found.stats["common_error"]
+        below += Status.MOVED not in found.flags and problem.scatter(step) < 0.65 * found.stats["common_error"]
     assert below

@@ -6,7 +6,19 @@ import numpy as np
 import pytest
 
 from otsync.simulate import ADVERSARIES, simulate
-from otsync.simulate.effects import ClockDrift, Cut, Drop, Freeze, In, Loop, Repeats, Reverse, SlowMotion
+from otsync.simulate.effects import (
+    ClockDrift,
+    ClockRamp,
+    ClockSway,
+    Cut,
+    Drop,
+    Freeze,
+    In,
+    Loop,
+    Repeats,
+    Reverse,
+    SlowMotion,
+)
 
 
 def filmed(*effects, seed: int = 2):
@@ -26,6 +38,8 @@ def filmed(*effects, seed: int = 2):
         (Reverse(),),
         (SlowMotion(),),
         (ClockDrift(0.1),),
+        (ClockRamp(0.04), Drop(0.4)),
+        (ClockSway(), Freeze(12)),
         (ClockDrift(0.1), Freeze(12)),
         (Freeze(12, at=0.3), Drop(0.4)),
         (Drop(0.4), Cut(), Repeats(24)),
