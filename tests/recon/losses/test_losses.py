@@ -52,8 +52,13 @@ def test_ssim_is_its_definition():
 
 @pytest.mark.parametrize("window", [SMALL, STANDARD], ids=["small", "standard"])
 def test_a_gpus_windows_are_those_of_the_cpu(window):
-    image = torch.from_numpy(np.random.default_rng(2).random((9, 23, 15)))
-    torch.testing.assert_close(_convolved(image, window), _shifted_sums(image, window), rtol=0, atol=1e-14)
+    image = torch.from_numpy(np.random.default_rng(2).random((9, 23, 15))).requires_grad_()
+    weight = torch.linspace(0.5, 2, image.numel(), dtype=image.dtype).reshape(image.shape)
+    found, told = _convolved(image, window), _shifted_sums(image, window)
+    torch.testing.assert_close(found, told, rtol=0, atol=1e-14)
+    gradients = [torch.autograd.grad((x * weight).sum(), image)[0] for x in (found, told)]
+    torch.testing.assert_close(*gradients, rtol=0, atol=1e-13)
+    torch.testing.assert_close(_convolved(image.float(), window), told.float(), rtol=0, atol=1e-6)
 
 
 def test_ssim_of_flat_images_compares_means_only():
