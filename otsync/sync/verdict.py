@@ -123,7 +123,7 @@ class Network:
             sigma = pair.sigma if math.isfinite(pair.sigma) else UNKNOWN_SIGMA
             scale = 1.0 if pair.status.ok else FLAGGED
             offset = float(self.rates[a] * pair.offset)
-            common = max(pair.stats.get(what, 0.0) for what in ("common_error", "sway"))  # of a video, in all its pairs
+            common = pair.stats.get("common_error", 0.0)
             edges.append(Edge(a, b, offset, scale * sigma, pair.status.ok, link.scanned.curve, common))
         return edges
 
