@@ -29,6 +29,11 @@ OFF = 6
 BESIDE = 3
 """Steps on either side of a pause that tell whether things move there."""
 
+RHYTHM = 6
+"""Frames on either side of all these in which a single still step says that the file repeats frames, as 24 pictures a
+second in a file of 30 do. One of them beside a pause cannot be told from it (75016 of "24 as 30, frozen" was trusted, a
+frame off behind it)."""
+
 CORE = 4
 """Fewest steps of a pause that tell how large steps are that show nothing but noise."""
 
@@ -91,7 +96,8 @@ def pause(
     """
     # only what is asked about: of an hour all steps would take gigabytes
     low, high = (int(k) for k in np.searchsorted(times, [start, start + length]))
-    begin, end = max(0, low - OFF - BESIDE), min(len(times), high + OFF + BESIDE + 1)
+    wide = OFF + BESIDE + RHYTHM
+    begin, end = max(0, low - wide), min(len(times), high + wide + 1)
     times, steps, low, high = times[begin:end], mean_steps(x[:, begin:end]), low - begin, high - begin
     core = max(CORE, (high - low) // 2)
     begins = range(max(0, low - OFF), min(len(steps) - core, high + OFF - core) + 1)
@@ -118,9 +124,19 @@ def pause(
     clear = (
         beside >= max(MOVES * usual, usual + CLEAR * spread) and min(steps[i - 1], steps[j]) >= usual + EDGE * margin
     )
-    # what turns right there begins slowly, and may have begun before
-    clear &= all(steps[one] - usual >= SHARP * (steps[two] - usual) for one, two in ((i - 1, i - 2), (j, j + 1)))
-    return (float(times[i]), float(times[j])) if clear and beside > 0 else None
+
+    def sharp(one: int, two: int) -> bool:
+        """Whether motion is there at once: what turns begins slowly."""
+        return bool(steps[one] - usual >= SHARP * (steps[two] - usual))
+
+    # what turns right there may have begun before
+    clear &= sharp(i - 1, i - 2) and sharp(j, j + 1)
+    alone = [k for k in np.flatnonzero(still).tolist() if 2 <= k < i - 2 or j + 2 <= k < len(steps) - 2]
+    rhythm = any(
+        sharp(k - 1, k - 2) and sharp(k + 1, k + 2) and min(steps[k - 1], steps[k + 1]) >= usual + EDGE * margin
+        for k in alone
+    )
+    return (float(times[i]), float(times[j])) if clear and not rhythm and beside > 0 else None
 
 
 def mean_steps(x: Float[np.ndarray, "M T 3"]) -> Float[np.ndarray, " T-1"]:

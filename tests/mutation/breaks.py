@@ -1008,6 +1008,14 @@ BREAKS = (
         "an offset that most matches of a part contradict stays",
     ),
     Break(
+        "breaks-repeats-counted",
+        "otsync/clocks/stillness.py",
+        "if clear and not rhythm and beside > 0 else None",
+        "if clear and beside > 0 else None",
+        ("tests/otsync/sync/test_breaks.py",),
+        "a frame that the file shows twice is counted with the pause beside it",
+    ),
+    Break(
         "breaks-rest-of-all",
         "otsync/clocks/stillness.py",
         "fast = known & (usual >= np.quantile(usual[known], FASTEST))",

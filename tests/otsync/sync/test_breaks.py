@@ -221,6 +221,18 @@ def test_a_pause_beside_which_a_swing_turns_is_not_counted_with_the_turn(first, 
     assert pause(t, x, t[first - 1] + off / 30, (count - off) / 30) is None
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_a_pause_of_a_file_that_repeats_frames_is_not_counted(noise):
+    """24 pictures a second in a file of 30: the frame beside the pause may be one of those that are shown twice."""
+    twice = [k for k in range(4, 90, 5) if not 29 < k < 45]
+    t, x = swinging(range(30, 45), noise)
+    assert pause(t, x, 29 / 30, 0.5) is not None
+    rng = np.random.default_rng(3)
+    for k in twice:
+        x[:, k] = x[:, k - 1] + noise * rng.normal(size=x[:, k].shape)
+    assert pause(t, x, 29 / 30, 0.5) is None
+
+
 def test_a_pause_that_noise_hides_is_not_counted():
     t, x = swinging(range(30, 45), 0.3)
     assert pause(t, x, 29 / 30, 0.5) is None
