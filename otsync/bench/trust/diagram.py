@@ -12,6 +12,9 @@ from ..record import Row
 
 BINS = 8
 
+LEAST = 1e-4
+"""Frames; answers that are off by less are drawn there."""
+
 
 def at_both_ends(rows: Sequence[Row]) -> tuple[np.ndarray, np.ndarray]:
     """(N,2) errors of answers at the beginning and at the end of what two videos share, and the sigmas that they say
@@ -63,26 +66,30 @@ def draw(rows: Sequence[Row], path: Path) -> None:
     import matplotlib.pyplot as plt
 
     ours = [r for r in rows if r["method"] == "default"]
-    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 6.5), layout="constrained", width_ratios=(1, 1.1))
+    names = list(dict.fromkeys(r["class"] for r in ours))[::-1]
+    size = 11, max(6.5, 1.5 + 0.13 * len(names))  # a line for every name
+    figure, (left, right) = plt.subplots(1, 2, figsize=size, layout="constrained", width_ratios=(1, 1.1))
     told = reliability(ours)
     if told:
         claimed, found = (np.array([r[k] for r in told]) for k in ("claimed rms", "found rms"))
         ok = [r for r in ours if r["trusted"] and np.isfinite(r["error"])]
         error, sigma = at_both_ends(ok)
-        left.scatter(sigma.ravel(), error.ravel(), s=6, color="#9db7c9", label="answers, at either end")
+        left.scatter(
+            sigma.ravel(), np.maximum(error.ravel(), LEAST), s=6, color="#9db7c9", label="answers, at either end"
+        )
         left.plot(claimed, found, "o-", color="#00527a", label="rms in eighths")
         ends = np.array([0.5 * min(claimed), 2 * max(claimed)])
         left.plot(ends, ends, color="#777", lw=0.8, ls="--", label="claimed = found")
         left.set(xscale="log", yscale="log", xlabel="sigma that is claimed, frames", ylabel="error, frames")
+        left.set_ylim(bottom=0.8 * LEAST)
         left.legend(fontsize=8)
-    names = list(dict.fromkeys(r["class"] for r in ours))[::-1]
     trusted = [float(np.mean([r["trusted"] for r in ours if r["class"] == n])) for n in names]
     bad = [float(np.mean([r["trusted"] and not r["error"] <= 1 for r in ours if r["class"] == n])) for n in names]
     right.barh(names, trusted, color="#7fb58a", label="trusted")
     right.barh(names, bad, color="#b3261e", label="trusted and wrong by over a frame")
-    right.set(xlim=(0, 1), xlabel="share of answers")
+    right.set(xlim=(0, 1), ylim=(-0.8, len(names) - 0.2), xlabel="share of answers")
     right.tick_params(axis="y", labelsize=7)
-    right.legend(fontsize=8, loc="lower right")
+    right.legend(fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False)
     with atomic_write(path, "wb") as stream:
         figure.savefig(stream, format="png", dpi=130)
     plt.close(figure)
