@@ -1026,7 +1026,7 @@ BREAKS = (
     Break(
         "pause-begins-slowly",
         "otsync/clocks/stillness.py",
-        "clear &= all(steps[one] - usual >= SHARP * (steps[two] - usual) for one, two in ((i - 1, i - 2), (j, j + 1)))",
+        "clear &= sharp(i - 1, i - 2) and sharp(j, j + 1)",
         "pass",
         ("tests/otsync/sync/test_breaks.py",),
         "a pause beside which a swing turns is counted one frame too long",
