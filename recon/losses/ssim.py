@@ -44,11 +44,9 @@ def _convolved(image: Tensor, window: Window) -> Tensor:
     In full precision: variances are small differences of large means. Of channels that lie apart in memory torch's own
     kernel does that; where colours lie together it is cuDNN's, in TF32.
     """
-    channels = image.shape[-1]
-    kernel = _kernel(window, image.dtype, image.device).expand(channels, 1, -1, -1)
-    return F.conv2d(image.permute(2, 0, 1).contiguous()[None], kernel, padding=window.radius, groups=channels)[
-        0
-    ].permute(1, 2, 0)
+    layers = image.permute(2, 0, 1).contiguous()
+    kernel = _kernel(window, image.dtype, image.device).expand(len(layers), 1, -1, -1)
+    return F.conv2d(layers, kernel, padding=window.radius, groups=len(layers)).permute(1, 2, 0)
 
 
 @lru_cache(maxsize=8)

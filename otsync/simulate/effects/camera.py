@@ -132,7 +132,7 @@ class ClockRamp:
 
 @dataclass(frozen=True)
 class ClockSway:
-    """The video's clock runs ahead and falls behind in turn, by ``size`` s at most, once in ``period`` s.
+    """The video's clock falls behind and runs ahead in turn, by ``size`` s at most, once in ``period`` s.
 
     Every video begins at a moment of its own in this period. ``Truth.shown`` tells when frames were exposed.
     """
@@ -142,7 +142,8 @@ class ClockSway:
 
     def __post_init__(self) -> None:
         check_number("ClockSway.period", self.period)
-        check_number("ClockSway.size", self.size, -1e-12, self.period / (2 * np.pi))  # or time would run backwards
+        most = float(self.period / (2 * np.pi))  # of more, time would run backwards
+        check_number("ClockSway.size", self.size, -most, most)
 
     def __call__(self, obs: Observation, rng: np.random.Generator) -> Observation:
         turn = 2 * np.pi * (obs.times / self.period + rng.random())
