@@ -29,10 +29,10 @@ OFF = 6
 BESIDE = 3
 """Steps on either side of a pause that tell whether things move there."""
 
-RHYTHM = 6
-"""Frames on either side of all these in which a single still step says that the file repeats frames, as 24 pictures a
-second in a file of 30 do. One of them beside a pause cannot be told from it (75016 of "24 as 30, frozen" was trusted, a
-frame off behind it)."""
+RHYTHM = 30
+"""Frames on either side of all these in which a single still step says that the file repeats frames: 24 pictures a
+second in a file of 30 repeat every fifth, 29 one a second. One of them beside a pause cannot be told from it (75016 of
+"24 as 30, frozen" was trusted, a frame off behind it)."""
 
 CORE = 4
 """Fewest steps of a pause that tell how large steps are that show nothing but noise."""
