@@ -103,7 +103,9 @@ class Fit:
     """Where the iteration ended.
 
     Args:
-        clock: the answer. covariance: (P,P) of offset (and rate), jackknifed over matches or over time, the larger.
+        clock: the answer. covariance: (P,P) of offset (and rate), jackknifed over matches or over time, the larger: too
+            large rather than too small, for tests. unbiased: (P,P) of the same, the jackknife's excess taken out, for
+            sigma.
         weights: (M,) of the matches. iterations: done. settled: whether the last step was next to nothing. Where noise
             is as large as the motion, each step goes but a small part of the way, and the answer is where it stopped.
         blur: rms residual over rms speed, s: how far off a single sample of a typical match tells the time.
@@ -115,6 +117,7 @@ class Fit:
 
     clock: Clock
     covariance: Float[np.ndarray, "P P"]
+    unbiased: Float[np.ndarray, "P P"]
     weights: Float[np.ndarray, " M"]
     iterations: int
     blur: float
@@ -182,14 +185,14 @@ def fit_clock(
         settled = abs(shift) < CONVERGED and abs(turn) < CONVERGED / 30
         if n >= iterations or (settled and n > 3):
             break
-    covariance = system.covariance()
+    covariances = system.covariance(jackknife), system.covariance(bias_reduced)
     if fit_rate:
         # from the offset at the centre of the overlap to that at b's time zero
         move = np.array([[1.0, -centre], [0.0, 1.0]])
-        covariance = move @ covariance @ move.T
+        covariances = tuple(move @ c @ move.T for c in covariances)
     moving = float(system.H[0, 0])
     shares = [equal_shares(by[0][:, 0, 0]) for by in (system.by_match, system.by_time)]
-    return Fit(clock, covariance, system.match_weights, n, system.blur, system.wander(), settled, moving, *shares)
+    return Fit(clock, *covariances, system.match_weights, n, system.blur, system.wander(), settled, moving, *shares)
 
 
 def _centre(a: TrackSplines, b: TrackSplines, clock: Clock) -> float:
@@ -217,15 +220,9 @@ class System:
     def step(self) -> Float[np.ndarray, " P"]:
         return -np.linalg.solve(_regular(self.H), self.g)
 
-    def covariance(self) -> Float[np.ndarray, "P P"]:
-        """The larger of two jackknives, over groups of matches and over blocks of time (Bell and McCaffrey 2002).
-
-        Leaving a cluster out moves the answer by (H - H_c)⁻¹ g_c: a block that holds most of the motion, a single
-        swing, cannot pass for many independent ones. The scatter of few clusters says little: as in that paper, the
-        answer is taken to follow Student's distribution with their degrees of freedom, and one sigma is what holds 68 %
-        of it.
-        """
-        found = [jackknife(*by) for by in (self.by_match, self.by_time)]
+    def covariance(self, scatter: Scatter) -> Float[np.ndarray, "P P"]:
+        """The larger of the scatter between groups of matches and that between blocks of time."""
+        found = [scatter(*by) for by in (self.by_match, self.by_time)]
         return max(found, key=lambda c: float(c[0, 0]))
 
     def wander(self) -> float:
@@ -240,8 +237,16 @@ def equal_shares(information: Float[np.ndarray, " C"]) -> float:
     return float(information.sum() ** 2 / max(float((information**2).sum()), 1e-300))
 
 
+Scatter = Callable[[Float[np.ndarray, "C P P"], Float[np.ndarray, "C P"]], Float[np.ndarray, "P P"]]
+"""Covariance of an answer from the normal equations of its clusters."""
+
+
 def jackknife(H: Float[np.ndarray, "C P P"], g: Float[np.ndarray, "C P"]) -> Float[np.ndarray, "P P"]:
-    """Covariance of the answer by leaving out one cluster after another: see :meth:`System.covariance`.
+    """Covariance of the answer by leaving out one cluster after another (Bell and McCaffrey 2002).
+
+    Leaving a cluster out moves the answer by (H - H_c)⁻¹ g_c: a block that holds most of the motion, a single swing,
+    cannot pass for many independent ones. Of C alike clusters the variance is C / (C - 1) times too large. The scatter
+    of few clusters says little: the answer is taken to follow Student's distribution, see :func:`wider`.
 
     Args:
         H, g: normal equations of every cluster.
@@ -255,8 +260,24 @@ def jackknife(H: Float[np.ndarray, "C P P"], g: Float[np.ndarray, "C P"]) -> Flo
     return moved.T @ moved * wider(H[:, 0, 0]) ** 2
 
 
+def bias_reduced(H: Float[np.ndarray, "C P P"], g: Float[np.ndarray, "C P"]) -> Float[np.ndarray, "P P"]:
+    """As :func:`jackknife`, without its bias where the errors of samples are alike and clusters independent.
+
+    The fit has taken its part of every cluster's error out, the larger the more the cluster holds. This puts back just
+    that: "CR2" of Bell and McCaffrey (2002), (I - H⁻¹ᐟ² H_c H⁻¹ᐟ²)⁻¹ᐟ² on each cluster's whitened score. No cluster is
+    said to hold more than :data:`MOST_LEVERAGE`.
+    """
+    root = np.linalg.inv(np.linalg.cholesky(_regular(H.sum(0))))
+    share, turn = np.linalg.eigh(root @ H @ root.T)
+    score = np.einsum("cqp,qr,cr->cp", turn, root, g) / np.sqrt(1 - np.clip(share, 0.0, MOST_LEVERAGE))
+    moved = np.einsum("qp,cqr,cr->cp", root, turn, score)
+    return moved.T @ moved * wider(H[:, 0, 0]) ** 2
+
+
 def wider(information: Float[np.ndarray, " C"]) -> float:
-    """One sigma of Student's distribution over that of a normal one, for clusters that hold so much information."""
+    """One sigma of Student's distribution, what holds 68 % of it, over that of a normal one, for clusters that hold so
+    much information.
+    """
     return float(stdtrit(max(1.0, equal_shares(information) - 1), ONE_SIGMA))
 
 

@@ -11,7 +11,7 @@ from otsync import Alignment, Matches, Refused, SplineRefine, Status, TrackSet, 
 from otsync.clocks.splines import TrackSplines
 from otsync.compute.indices import blocks
 from otsync.refine import gauss_newton
-from otsync.refine.gauss_newton import Side, System, _linearise, fit_clock, jackknife, neighbours, wider
+from otsync.refine.gauss_newton import Side, System, _linearise, bias_reduced, fit_clock, jackknife, neighbours, wider
 from otsync.refine.splines import COMMON_ERRORS, LEAST_SIGMA, unsettled_rate
 from otsync.simulate import simulate
 from otsync.types import Clock
@@ -307,24 +307,71 @@ def test_sigma_never_falls_below_what_blur_predicts():
     a, b, m = films(n=300, noise=0.8)
     found = refine(a, b, m, near(0.3), SplineRefine(windows=(14 / 30,)), throw=False)
     shared = found.stats["blur"] ** 2 / COMMON_ERRORS
-    rest = max(fit_clock(*curves_of(a, b), Clock(found.offset), 14 / 30).covariance[0, 0], 0)
+    rest = max(fit_clock(*curves_of(a, b), Clock(found.offset), 14 / 30).unbiased[0, 0], 0)
     assert found.sigma == pytest.approx(np.sqrt(shared**2 + rest + LEAST_SIGMA**2), rel=0.1)
     assert shared > 0.3 * found.sigma
 
 
 def test_one_sigma_of_few_clusters_holds_68_percent():
-    """The score of a common error of whole clusters: the jackknife over C of them, made wider, covers what it says."""
+    """Clusters whose errors are their own: their scatter, made wider, covers what it says."""
     rng = np.random.default_rng(0)
     for count in (2, 3, 4, 10):
-        scores = rng.standard_normal((20_000, count))
-        error = scores.mean(1)
-        sigma = np.sqrt(((scores - error[:, None]) ** 2).sum(1) / (count - 1) / count)
-        within = (np.abs(error) < sigma * wider(np.ones(count))).mean()
-        assert within == pytest.approx(0.683, abs=0.012)
-        assert (np.abs(error) < sigma).mean() < within
+        H = np.ones((count, 1, 1))
+        error, sigma = np.empty((2, 4000))
+        for k, scores in enumerate(rng.standard_normal((4000, count))):
+            error[k] = scores.mean()
+            sigma[k] = np.sqrt(bias_reduced(H, (scores - error[k])[:, None])[0, 0])
+        within = (np.abs(error) < sigma).mean()
+        assert within == pytest.approx(0.683, abs=0.025)
+        assert (np.abs(error) < sigma / wider(np.ones(count))).mean() < within
     assert wider(np.ones(400)) == pytest.approx(1, abs=0.005)
     # one cluster that holds nearly everything: as little is known as of two
     assert wider(np.array([1.0, 1e-3, 1e-3])) == pytest.approx(wider(np.ones(2)))
+
+
+@pytest.mark.parametrize("P", [1, 2])
+def test_scatter_of_unlike_clusters_has_no_bias(P):
+    """Alike errors of samples: the inverse of the information. The jackknife is above it."""
+    rng = np.random.default_rng(P)
+    J = [rng.standard_normal((n, P)) for n in (4, 8, 8, 12, 20)]
+    H = np.stack([j.T @ j for j in J])
+    true = np.linalg.inv(H.sum(0))
+    found, cautious = np.zeros((2, P, P))
+    turn = np.array([[1.0, 3.0], [0.0, 0.5]])[:P, :P]
+    for _ in range(3000):
+        e = [rng.standard_normal(len(j)) for j in J]
+        moved = true @ sum(j.T @ x for j, x in zip(J, e, strict=True))
+        g = np.stack([j.T @ (x - j @ moved) for j, x in zip(J, e, strict=True)])
+        one = bias_reduced(H, g)
+        found += one / 3000
+        cautious += jackknife(H, g) / 3000
+    # in other units of offset and rate: the same answer
+    np.testing.assert_allclose(bias_reduced(turn.T @ H @ turn, g @ turn), _in_units(one, turn, H), rtol=1e-6)
+    np.testing.assert_allclose(found / wider(H[:, 0, 0]) ** 2, true, atol=0.06 * np.trace(true))
+    assert np.all(np.diag(cautious) > 1.15 * np.diag(found))
+
+
+def _in_units(covariance, turn, H):
+    """A covariance after x = turn y; what is wider goes with the information on the first of them."""
+    back = np.linalg.inv(turn)
+    ratio = wider((turn.T @ H @ turn)[:, 0, 0]) / wider(H[:, 0, 0])
+    return back @ covariance @ back.T * ratio**2
+
+
+def test_windows_that_know_less_may_differ_by_what_they_know_less():
+    """Hausman: of two answers apart by less than the worse one's excess variance, nothing is the model's."""
+    a, b, _ = films()
+    curves = curves_of(a, b)
+    fit = fit_clock(*curves, Clock(0.3), 14 / 30)
+    refiner = SplineRefine()
+
+    def other(late, excess):
+        return dataclasses.replace(fit, clock=Clock(fit.clock.offset + late), unbiased=fit.unbiased + excess)
+
+    assert refiner._beyond_noise(other(0.01, 0.011**2), fit, curves) == 0
+    assert refiner._beyond_noise(other(0.01, 0.006**2), fit, curves) == pytest.approx(0.008**2)
+    assert refiner._beyond_noise(other(0.01, -1e-6), fit, curves) == pytest.approx(0.01**2)
+    assert refiner._beyond_noise(None, fit, curves) == pytest.approx(curves[0].frame ** 2)
 
 
 @pytest.mark.parametrize("fit_rate", [False, True])
@@ -340,6 +387,7 @@ def test_a_fit_of_few_matches_at_a_time_is_the_same(fit_rate, monkeypatch):
     assert whole.clock.offset == pytest.approx(0.11, abs=0.01)
     np.testing.assert_allclose(parts.clock.offset, whole.clock.offset, atol=1e-12)
     np.testing.assert_allclose(parts.covariance, whole.covariance, rtol=1e-8)
+    np.testing.assert_allclose(parts.unbiased, whole.unbiased, rtol=1e-8)
     np.testing.assert_allclose(parts.weights, whole.weights, rtol=1e-9)
     assert (parts.blur, parts.wander) == pytest.approx((whole.blur, whole.wander), rel=1e-9)
 
@@ -350,5 +398,6 @@ def test_sigma_is_that_of_the_worse_witness():
     wild, calm = (H, 5 * g), (H, g)
     for by_match, by_time in ((wild, calm), (calm, wild)):
         system = System(H.sum(0), np.zeros(1), by_match, by_time, np.ones(8), 0.0)
-        np.testing.assert_allclose(system.covariance(), jackknife(*wild))
+        for scatter in (jackknife, bias_reduced):
+            np.testing.assert_allclose(system.covariance(scatter), scatter(*wild))
     assert jackknife(*wild)[0, 0] > 20 * jackknife(*calm)[0, 0]
