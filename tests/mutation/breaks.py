@@ -1217,6 +1217,14 @@ BREAKS = (
         "sigma from pixels does not know of common errors",
     ),
     Break(
+        "epipolar-blur-unpaid",
+        "otsync/epipolar/refine.py",
+        ", spread, blur**2 / COMMON_ERRORS)",
+        ", spread)",
+        EPIPOLAR,
+        "sigma from pixels forgets the errors that blur predicts",
+    ),
+    Break(
         "graph-curve-end-sign",
         "otsync/sync/graph.py",
         "else x[e.b] - t[[-1, 0]]",

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from otsync import Alignment, Matches, Status, TrackSet, synchronize
 from otsync.align.peaks import separate_peaks
 from otsync.costs.positions import CurveDistance, MedianPosition, SynchronousDistance, capped, scene_scale
-from otsync.epipolar.refine import EpipolarRefine
+from otsync.epipolar.refine import COMMON_ERRORS, EpipolarRefine
 from otsync.epipolar.residuals import Residuals, Step, detrended
 from otsync.epipolar.scan import TRACK_CAP, EpipolarScan, Told, mixture, residuals_by_lag
 from otsync.geometry import common_target, fundamental, fundamentals, sampson, undistort, view_angle
@@ -386,6 +386,17 @@ def test_tracks_of_one_limb_are_not_independent():
         wrong.append(residual.sum() / ones.sum())
         asked.append(problem.scatter(Step(residual, ones, ones)))
     assert 0.6 < np.sqrt(np.mean(np.square(wrong))) / np.sqrt(np.mean(np.square(asked))) < 1.1
+
+
+def test_sigma_never_falls_below_what_blur_predicts():
+    """However many candidates agree: what whole videos err by is in no residual."""
+    a, b = world(7.0)
+    rng = np.random.default_rng(4)
+    a, b = (replace(x, uv=x.uv + rng.normal(0, 8, x.uv.shape)) for x in (a, b))
+    matches = Matches(np.stack([np.arange(40)] * 2, 1))
+    found = EpipolarRefine()(a, b, matches, Alignment(7.0 / FPS, fps=FPS))
+    predicted = found.stats["blur"] ** 2 / COMMON_ERRORS
+    assert found.sigma > predicted > 0.5 * found.sigma
 
 
 def seconds_apart(late: np.ndarray) -> tuple[TrackSet, TrackSet, Matches]:
