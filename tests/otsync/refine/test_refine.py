@@ -12,7 +12,7 @@ from otsync.clocks.splines import TrackSplines
 from otsync.compute.indices import blocks
 from otsync.refine import gauss_newton
 from otsync.refine.gauss_newton import Side, System, _linearise, bias_reduced, fit_clock, jackknife, neighbours, wider
-from otsync.refine.splines import COMMON_ERRORS, LEAST_SIGMA, unsettled_rate
+from otsync.refine.splines import COMMON_ERRORS, FORGOTTEN, LEAST_SIGMA, SHORT, unsettled_rate
 from otsync.simulate import simulate
 from otsync.types import Clock
 
@@ -308,6 +308,7 @@ def test_sigma_never_falls_below_what_blur_predicts():
     found = refine(a, b, m, near(0.3), SplineRefine(windows=(14 / 30,)), throw=False)
     shared = found.stats["blur"] ** 2 / COMMON_ERRORS
     rest = max(fit_clock(*curves_of(a, b), Clock(found.offset), 14 / 30).unbiased[0, 0], 0)
+    rest *= 1 + SHORT * (FORGOTTEN / found.stats["overlap"]) ** 2
     assert found.sigma == pytest.approx(np.sqrt(shared**2 + rest + LEAST_SIGMA**2), rel=0.1)
     assert shared > 0.3 * found.sigma
 
