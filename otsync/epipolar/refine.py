@@ -92,6 +92,7 @@ class EpipolarRefine(Refiner):
             "moved": abs(offset - alignment.offset),
             "spread": spread,
             "common_error": common,
+            "tentative": 1.0,
             "wander": wander,
             "blur": blur,
             "fitted_matches": float(len(problem.weight)),

@@ -124,7 +124,8 @@ class Network:
             scale = 1.0 if pair.status.ok else FLAGGED
             offset = float(self.rates[a] * pair.offset)
             common = pair.stats.get("common_error", 0.0)
-            edges.append(Edge(a, b, offset, scale * sigma, pair.status.ok, link.scanned.curve, common))
+            tentative = pair.stats.get("tentative", 0.0) > 0
+            edges.append(Edge(a, b, offset, scale * sigma, pair.status.ok, link.scanned.curve, common, tentative))
         return edges
 
     @cached_property

@@ -1225,6 +1225,14 @@ BREAKS = (
         "sigma from pixels forgets the errors that blur predicts",
     ),
     Break(
+        "graph-cycles-unheard",
+        "otsync/sync/graph.py",
+        "sigma[free] *= judged_by_cycles((A @ y - d) / s, len(free))",
+        "sigma[free] *= judged_by_cycles(0 * (A @ y - d) / s, len(free))",
+        SYNC,
+        "tentative sigmas do not know by how much cycles stay open",
+    ),
+    Break(
         "graph-curve-end-sign",
         "otsync/sync/graph.py",
         "else x[e.b] - t[[-1, 0]]",

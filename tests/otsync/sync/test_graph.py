@@ -11,7 +11,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from otsync import Graph
-from otsync.sync.graph import CurveSum, Edge, agreeing, components, cycle_errors, solve, spanning_trees
+from otsync.sync.graph import (
+    SAID,
+    CurveSum,
+    Edge,
+    agreeing,
+    components,
+    cycle_errors,
+    judged_by_cycles,
+    solve,
+    spanning_trees,
+)
 
 
 def edges_of(x, pairs, sigma=0.01, noise=None):
@@ -182,6 +192,41 @@ def test_shared_errors_change_sigma_and_nothing_else_and_nothing_of_a_single_pai
     assert solve(2, one, 0, shared=0.5).sigma[1] == pytest.approx(0.02)
     hanging = [*edges_of(np.zeros(4), all_pairs(3), 0.01), Edge(0, 3, 0.0, 0.2, True)]
     assert solve(4, hanging, 0, shared=0.5).sigma[3] == pytest.approx(0.2)  # no less than its only edge says
+
+
+@pytest.mark.parametrize("scale", [0.5, 1.0, 2.0])
+def test_tentative_sigmas_are_judged_by_how_cycles_close(scale):
+    """Half of each edge's variance is its videos' own, the cycles show the other half: sigma becomes what is true, but
+    for what was taken before they were seen.
+    """
+    rng, n = np.random.default_rng(3), 12
+    pairs = list(itertools.combinations(range(n), 2))
+    ratios = []
+    for _ in range(40):
+        own, edge = rng.normal(0, 0.5, n), rng.normal(0, 0.5**0.5, len(pairs))
+        edges = [
+            Edge(a, b, 0.01 * scale * (own[b] - own[a] + e), 0.01, True) for (a, b), e in zip(pairs, edge, strict=True)
+        ]
+        said = solve(n, edges, 0, shared=0.5)
+        judged = solve(n, [replace(e, tentative=True) for e in edges], 0, shared=0.5)
+        np.testing.assert_array_equal(judged.x, said.x)
+        ratios.append(judged.sigma[1:] / said.sigma[1:])
+        mixed = solve(n, [replace(e, tentative=k > 0) for k, e in enumerate(edges)], 0, shared=0.5)
+        np.testing.assert_array_equal(mixed.sigma, said.sigma)
+    assert np.mean(ratios) == pytest.approx(np.sqrt((4 * 1.6 + 55 * scale**2) / 59), rel=0.06)
+
+
+def test_a_tentative_pair_without_cycles_says_more_than_it_knows():
+    edge = Edge(0, 1, 0.3, 0.01, True, tentative=True)
+    assert solve(2, [edge], 0).sigma[1] == pytest.approx(0.01 * SAID**0.5)
+    # one edge that is wrong by far is not all: sigma grows, but not without end
+    edges = [
+        Edge(0, 1, 0.0, 0.01, True, tentative=True),
+        replace(edge, b=2),
+        Edge(1, 2, 9.0, 0.01, True, tentative=True),
+    ]
+    assert judged_by_cycles(np.array([0.0, 0.0, 900.0]), 2) == pytest.approx(((4 * SAID + 2 * 4) / 5) ** 0.5)
+    assert np.isfinite(solve(3, edges, 0).sigma).all()
 
 
 def test_lags_without_overlap_say_nothing():
