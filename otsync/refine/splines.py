@@ -51,10 +51,10 @@ LEAST_WANDER = 0.05 / 30
 and :attr:`otsync.Trust.wander` make, 460 right answers (mid to brutal, few tracks, breaks; seeds 500-699) have .96 at
 most; two takes of one choreography that were trusted 1.06 to 1.14."""
 
-SHORT = 2.0
-"""Times (FORGOTTEN / overlap)² by which the scatter's variance grows: of a short overlap the fit takes in much of an
-error that is forgotten slowly, and the rest of it is no measure. Forty clips of 2.5 s (75000 to 75019 and 79000 to
-79019) lay within one and two sigmas in 51 and 79 % without it."""
+SHORT = 7.0
+"""Times (FORGOTTEN / overlap)⁴ by which the scatter's variance grows: of an overlap that is not much longer than such an
+error lasts the fit takes in much of it, and the rest is no measure. Forty clips of 2.5 s (75000 to 75019 and 79000 to
+79019) had 51 and 79 % of their ends within one and two sigmas without it; over five seconds it is nothing."""
 
 LEAST_DRIFT = 0.1 / 30
 """Seconds by which a rate must move the ends of the overlap to be worth telling."""
@@ -295,7 +295,7 @@ class SplineRefine(Refiner):
 
 def _of_short(fit: Fit, overlap: float) -> Fit:
     """See :data:`SHORT`."""
-    grown = 1 + SHORT * (FORGOTTEN / max(overlap, 1e-9)) ** 2
+    grown = 1 + SHORT * (FORGOTTEN / max(overlap, 1e-9)) ** 4
     return replace(fit, unbiased=grown * fit.unbiased)
 
 

@@ -308,7 +308,7 @@ def test_sigma_never_falls_below_what_blur_predicts():
     found = refine(a, b, m, near(0.3), SplineRefine(windows=(14 / 30,)), throw=False)
     shared = found.stats["blur"] ** 2 / COMMON_ERRORS
     rest = max(fit_clock(*curves_of(a, b), Clock(found.offset), 14 / 30).unbiased[0, 0], 0)
-    rest *= 1 + SHORT * (FORGOTTEN / found.stats["overlap"]) ** 2
+    rest *= 1 + SHORT * (FORGOTTEN / found.stats["overlap"]) ** 4
     assert found.sigma == pytest.approx(np.sqrt(shared**2 + rest + LEAST_SIGMA**2), rel=0.1)
     assert shared > 0.3 * found.sigma
 
