@@ -52,9 +52,9 @@ and :attr:`otsync.Trust.wander` make, 460 right answers (mid to brutal, few trac
 most; two takes of one choreography that were trusted 1.06 to 1.14."""
 
 SHORT = 7.0
-"""Times (FORGOTTEN / overlap)⁴ by which the scatter's variance grows: of an overlap that is not much longer than such an
-error lasts the fit takes in much of it, and the rest is no measure. Forty clips of 2.5 s (75000 to 75019 and 79000 to
-79019) had 51 and 79 % of their ends within one and two sigmas without it; over five seconds it is nothing."""
+"""Times (FORGOTTEN / overlap)⁴ by which the scatter's variance grows: of an overlap that is not much longer than such
+an error lasts the fit takes in much of it, and the rest is no measure. Forty clips of 2.5 s (75000 to 75019 and 79000
+to 79019) had 51 and 79 % of their ends within one and two sigmas without it; over five seconds it is nothing."""
 
 LEAST_DRIFT = 0.1 / 30
 """Seconds by which a rate must move the ends of the overlap to be worth telling."""

@@ -12,7 +12,7 @@ from otsync.clocks.splines import TrackSplines
 from otsync.compute.indices import blocks
 from otsync.refine import gauss_newton
 from otsync.refine.gauss_newton import Side, System, _linearise, bias_reduced, fit_clock, jackknife, neighbours, wider
-from otsync.refine.splines import COMMON_ERRORS, FORGOTTEN, LEAST_SIGMA, SHORT, unsettled_rate
+from otsync.refine.splines import COMMON_ERRORS, FORGOTTEN, LEAST_SIGMA, SHORT, _of_short, unsettled_rate
 from otsync.simulate import simulate
 from otsync.types import Clock
 
@@ -311,6 +311,12 @@ def test_sigma_never_falls_below_what_blur_predicts():
     rest *= 1 + SHORT * (FORGOTTEN / found.stats["overlap"]) ** 4
     assert found.sigma == pytest.approx(np.sqrt(shared**2 + rest + LEAST_SIGMA**2), rel=0.1)
     assert shared > 0.3 * found.sigma
+
+
+def test_the_scatter_of_a_short_overlap_says_less():
+    fit = fit_clock(*curves_of(*films()[:2]), Clock(0.3), 14 / 30)
+    two, eight = (_of_short(fit, seconds).unbiased[0, 0] / fit.unbiased[0, 0] for seconds in (2.0, 8.0))
+    assert 1.5 < two < 2.5 and eight == pytest.approx(1, abs=0.01)
 
 
 def test_one_sigma_of_few_clusters_holds_68_percent():
