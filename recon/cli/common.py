@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from otsync.types import Offsets
     from recon.pipeline.plan import Plan
 
-BUDGET = 260.0
+BUDGET = 300.0
 """Seconds of a fit that the shell is told no length of."""
 
 

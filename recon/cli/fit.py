@@ -39,7 +39,7 @@ class Fit:
     truth: Path | None = None
     """truth.json of a simulated world: adds errors to table and report."""
     plan: Annotated[Plan, tyro.conf.arg(name="")] = field(default_factory=Plan)
-    """How it is reconstructed: without --steps and --budget the fit takes 260 seconds."""
+    """How it is reconstructed: without --steps and --budget the fit takes 300 seconds."""
     recording: PriorOptions = field(default_factory=PriorOptions)
     """What finds masks and tracks in the images."""
     view: bool = False

@@ -43,7 +43,7 @@ class Run:
     reference: str | None = None
     """Name of the video whose clock is the world's; default: the first."""
     plan: Annotated[Plan, tyro.conf.arg(name="")] = field(default_factory=Plan)
-    """How it is reconstructed: without --steps and --budget the fit takes 260 seconds."""
+    """How it is reconstructed: without --steps and --budget the fit takes 300 seconds."""
     truth: Path | None = None
     """True offsets, where they are known: adds errors to tables and reports."""
     json: bool = False
