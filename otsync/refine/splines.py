@@ -144,7 +144,7 @@ class SplineRefine(Refiner):
         seconds = Seconds.of(*curves, fit.clock, self.windows[0], weight)
         floor = self._wanders(fit.blur)
         sway = seconds.sway(floor)
-        fit, free = _of_short(fit, overlap), None if free is None else _of_short(free, overlap)
+        fit = _of_short(fit, overlap)
         # three estimates of one thing: what tracks have in common makes seconds differ, too
         shared += max(0.0, max(common, sway) ** 2 - float(fit.unbiased[0, 0]))
         long = overlap >= LONG - 1e-9
@@ -264,7 +264,8 @@ class SplineRefine(Refiner):
         fitted = free is not None and (len(fit.covariance) > 1 or fit.clock.rate != 1.0)
         if fitted:
             assert free is not None
-            C = free.unbiased
+            # the ends hang on the outer seconds, whose errors are not independent: the cautious one
+            C = free.covariance
             variance = [float(C[0, 0] + 2 * t * C[0, 1] + t * t * C[1, 1]) for t in (begin, end)]
         else:
             # a free fit that agrees with the declared rate knows it better over a long overlap
