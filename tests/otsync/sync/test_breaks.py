@@ -381,6 +381,7 @@ def fitted(seconds: float, information: float, wander: float = 0.0, sigma: float
     return Fit(
         Clock(0.0),
         np.array([[sigma**2]]),
+        np.array([[sigma**2]]),
         np.ones(9),
         5,
         blur=0.1,
