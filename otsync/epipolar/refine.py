@@ -25,7 +25,8 @@ COMMON_ERRORS = 0.33
 that turn slide beneath their tracks: a sample tells the time to 1.9 frames, and offsets are .5 frame off; textured
 balls, whose samples tell it to .27 frame, .03. What residuals have in common differs by less. Of 72 offsets of 18 films
 (seeds 77000 to 77017) 67 and 94 % lie within one and two sigmas, 62 and 92 without it. Real people, whose samples tell
-it to 1 to 2 frames, are off by .05: there sigma, .2, is too careful."""
+it to 1 to 2 frames, are off by .05; so how cycles close has the last word (:func:`otsync.sync.graph.judged_by_cycles`,
+which ``tentative`` asks for)."""
 
 LEAST_SIGMA = 0.03
 """Frames added to sigma in squares: what is left on clean tracks, from splines and calibration."""

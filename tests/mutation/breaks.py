@@ -1225,6 +1225,22 @@ BREAKS = (
         "sigma from pixels forgets the errors that blur predicts",
     ),
     Break(
+        "epipolar-not-tentative",
+        "otsync/epipolar/refine.py",
+        '"tentative": 1.0,',
+        '"tentative": 0.0,',
+        EPIPOLAR,
+        "sigma from pixels is not judged by how cycles close",
+    ),
+    Break(
+        "refine-short-as-long",
+        "otsync/refine/splines.py",
+        "grown = 1 + SHORT *",
+        "grown = 1 + 0 * SHORT *",
+        REFINE,
+        "the scatter of a short overlap counts like that of a long one",
+    ),
+    Break(
         "graph-cycles-unheard",
         "otsync/sync/graph.py",
         "sigma[free] *= judged_by_cycles((A @ y - d) / s, len(free))",
