@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -13,6 +13,14 @@ from otsync.cli.method import MethodOptions
 from otsync.cli.recordings import RecordingOptions
 from otsync.compute.threads import pool_of
 from recon.pipeline.plan import Plan
+
+if TYPE_CHECKING:
+    from otsync.files.cache import Cache
+    from otsync.io.scene import Scene
+    from otsync.progress import Deadline, Progress
+    from otsync.recordings.routes import Synchronized
+    from otsync.recordings.stages import Stages
+    from otsync.sync.method import Method
 
 WORTH_TELLING = 1.0
 """Seconds of a budget from which on it is said where they went."""
@@ -61,25 +69,18 @@ class Run:
 
     def _run(self) -> int:
         from otsync.cli.calibrate import prepared
-        from otsync.cli.tables import table, true_offsets
-        from otsync.files.arrays import write_json
         from otsync.files.cache import Cache
-        from otsync.io.mend import cut
-        from otsync.priors.stereo import EmptyHull
         from otsync.progress import Progress, tell
-        from otsync.recordings.routes import synchronize_scene
-        from otsync.recordings.stages import with_method
-        from otsync.report.frames import write_recording_report
-        from recon.cli.common import deadline_of, opened, reconstructed, with_length
-        from recon.fit.run import Diverged
-        from recon.pipeline.dense_tracks import NoDenseTracks, synchronized_by_features
-        from recon.pipeline.feature_maps import maps_from
-        from recon.pipeline.intake import given_clocks, readable
-        from recon.pipeline.stages import NoDepth
-        from recon.pipeline.verb import check_effects_of
+        from recon.cli.common import deadline_of
 
-        stages = self.recording.stages()  # before the work, not after it
-        threads, method, deadline = self.recording.threads(), self.slots.chosen(), deadline_of(self.plan)
+        work = Work(
+            stages=self.recording.stages(),  # before the work, not after it
+            threads=self.recording.threads(),
+            method=self.slots.chosen(),
+            deadline=deadline_of(self.plan),
+            cache=Cache(self.recording.cache or self.out / "stages"),
+            progress=Progress(tell),
+        )
         doubts = prepared(
             self.scene,
             allow_outside=self.allow_outside or self.recording.allow_outside,
@@ -90,9 +91,20 @@ class Run:
             },
             truth=self.truth,
         )
-        if deadline is not None and deadline.seconds - deadline.left > WORTH_TELLING:
-            spent = f"finding cameras took {deadline.seconds - deadline.left:.0f} s of the budget"
-            tell(f"{spent} of {deadline.seconds:g} s; {deadline.left:.0f} s are left for all else")
+        work.tell_what_is_spent()
+        scene = self._chosen()
+        train, coarse = self._synchronised(scene, work)
+        self._told(train, coarse)
+        if not self._linked(coarse):
+            return 1
+        return self._reconstructed(scene, coarse, work, doubts)
+
+    def _chosen(self) -> Scene:
+        """The scene's videos that are asked for; ValueError for options that do not fit it, before any work."""
+        from otsync.cli.tables import true_offsets
+        from recon.cli.common import opened
+        from recon.pipeline.verb import check_effects_of
+
         scene = opened(self.scene, self.allow_outside or self.recording.allow_outside)
         if self.recording.cameras:
             scene = scene.take(
@@ -109,11 +121,25 @@ class Run:
         if self.truth is not None:
             true_offsets(self.truth, tuple(names))  # names the videos that it lacks
         check_effects_of(self.plan, [v.camera.readout for v in scene.videos if v.name in names])
-        cache, progress = Cache(self.recording.cache or self.out / "stages"), Progress(tell)
-        with pool_of(threads) as pool:
+        return scene
+
+    def _synchronised(self, scene: Scene, work: Work) -> tuple[Scene, Synchronized]:
+        """The videos that are not held out, and their clocks from motion alone."""
+        from otsync.io.mend import cut
+        from otsync.priors.stereo import EmptyHull
+        from otsync.progress import tell
+        from otsync.recordings.routes import synchronize_scene
+        from otsync.recordings.stages import with_method
+        from recon.pipeline.dense_tracks import NoDenseTracks, synchronized_by_features
+        from recon.pipeline.feature_maps import maps_from
+        from recon.pipeline.intake import readable
+        from recon.pipeline.stages import NoDepth
+
+        stages, method, progress = work.stages, work.method, work.progress
+        with pool_of(work.threads) as pool:
             part = scene if self.plan.frames is None else cut(scene, *self.plan.frames)
             with progress.stage("reading"):  # the reconstruction cuts and reads again, from what is kept
-                part = readable(part, cache, pool.map, progress)
+                part = readable(part, work.cache, pool.map, progress)
             train = part.take([n for n in part.names if n not in self.held_out])
             reference = 0 if self.reference is None else train.names.index(self.reference)
             coarse = synchronize_scene(
@@ -122,30 +148,40 @@ class Run:
                 method=method,
                 stages=stages,
                 reference=reference,
-                cache=cache,
+                cache=work.cache,
                 map=pool.map,
-                processes=threads,
+                processes=work.threads,
                 tell=tell,
-                deadline=deadline,
+                deadline=work.deadline,
             )
             progress.seconds |= {f"synchronise: {stage}": s for stage, s in coarse.seconds.items()}
-            if self.plan.features is not None:
-                try:
-                    coarse = synchronized_by_features(
-                        train,
-                        coarse,
-                        maps_from(self.plan.features),
-                        width=self.plan.width,
-                        reference=reference,
-                        stages=stages if method is None else with_method(stages, "tracks", method),
-                        cache=cache,
-                        map=pool.map,
-                        progress=progress,
-                    )
-                except (NoDepth, NoDenseTracks, EmptyHull) as error:
-                    if method is not None and method.slots():
-                        raise
-                    progress.note(f"no dense tracks: {error} The answer of sparse ones stands")
+            if self.plan.features is None:
+                return train, coarse
+            try:
+                dense = synchronized_by_features(
+                    train,
+                    coarse,
+                    maps_from(self.plan.features),
+                    width=self.plan.width,
+                    reference=reference,
+                    stages=stages if method is None else with_method(stages, "tracks", method),
+                    cache=work.cache,
+                    map=pool.map,
+                    progress=progress,
+                )
+            except (NoDepth, NoDenseTracks, EmptyHull) as error:
+                if method is not None and method.slots():
+                    raise
+                progress.note(f"no dense tracks: {error} The answer of sparse ones stands")
+                return train, coarse
+        return train, dense
+
+    def _told(self, train: Scene, coarse: Synchronized) -> None:
+        """The clocks from motion alone are printed and kept: whatever comes, they stand."""
+        from otsync.cli.tables import table
+        from otsync.files.arrays import write_json
+        from otsync.report.frames import write_recording_report
+
         if not self.json:
             print(table(coarse.offsets))
         coarse.offsets.save(self.out / "offsets_coarse.json")
@@ -154,14 +190,26 @@ class Run:
         for name, flags in zip(coarse.offsets.names, coarse.offsets.flags, strict=True):
             for flag in flags:
                 print(f"{name}: {flag.code}: {flag}", file=sys.stderr)
-        linked = sorted(given_clocks(coarse.offsets))
+
+    def _linked(self, coarse: Synchronized) -> bool:
+        """Whether two videos share a clock; where not, a line says so."""
+        from recon.pipeline.intake import given_clocks
+
+        linked = given_clocks(coarse.offsets)
         if len(linked) < 2:
             print(
                 f"otsync: expected two videos and more on one clock; found {len(linked)} of {len(coarse.offsets)}, so "
                 f"nothing is reconstructed. Look at {self.out / 'sync.html'}; otsync check may find the cause.",
                 file=sys.stderr,
             )
-            return 1
+        return len(linked) >= 2
+
+    def _reconstructed(self, scene: Scene, coarse: Synchronized, work: Work, doubts: int) -> int:
+        """The exit code: ``doubts``, or 1 where the reconstruction has some of its own or fails."""
+        from otsync.priors.stereo import EmptyHull
+        from recon.cli.common import reconstructed, with_length
+        from recon.fit.run import Diverged
+
         try:
             code = reconstructed(
                 scene,
@@ -174,8 +222,8 @@ class Run:
                 cache=self.recording.cache,
                 workers=self.recording.workers,
                 as_json=self.json,
-                progress=progress,
-                deadline=deadline,
+                progress=work.progress,
+                deadline=work.deadline,
             )
             return max(code, doubts)
         except EmptyHull as error:
@@ -183,7 +231,29 @@ class Run:
                 f"otsync: nothing is reconstructed: {error} The offsets stand: {self.out / 'offsets_coarse.json'}.",
                 file=sys.stderr,
             )
-            return 1
         except (Diverged, FloatingPointError) as error:
             print(f"otsync: {error}", file=sys.stderr)
-            return 1
+        return 1
+
+
+@dataclass(frozen=True)
+class Work:
+    """What the stages of one run share."""
+
+    stages: Stages
+    threads: int
+    method: Method | None
+    deadline: Deadline | None
+    cache: Cache
+    progress: Progress
+
+    def tell_what_is_spent(self) -> None:
+        """Of the budget, by what came before the stages: cameras that were not given."""
+        from otsync.progress import tell
+
+        if self.deadline is None:
+            return
+        total, left = self.deadline.seconds, self.deadline.left
+        if total - left > WORTH_TELLING:
+            spent = f"finding cameras took {total - left:.0f} s of the budget"
+            tell(f"{spent} of {total:g} s; {left:.0f} s are left for all else")
