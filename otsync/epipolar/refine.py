@@ -28,6 +28,9 @@ balls, whose samples tell it to .27 frame, .03. What residuals have in common di
 it to 1 to 2 frames, are off by .05; so how cycles close has the last word (:func:`otsync.sync.graph.judged_by_cycles`,
 which ``tentative`` asks for)."""
 
+ALONE = 1.6**0.5
+"""Times sigma, of a pair that no cycle judges."""
+
 LEAST_SIGMA = 0.03
 """Frames added to sigma in squares: what is left on clean tracks, from splines and calibration."""
 
@@ -82,7 +85,7 @@ class EpipolarRefine(Refiner):
         ]
         spread = max((abs(o - offset) for o in others if np.isfinite(o)), default=0.0)
         wander, blur = problem.wander(found)
-        sigma = math.hypot(max(problem.scatter(found), common), spread, blur**2 / COMMON_ERRORS)
+        sigma = ALONE * math.hypot(max(problem.scatter(found), common), spread, blur**2 / COMMON_ERRORS)
         raised = list(alignment.flags)
         if not np.isfinite(offset) or abs(offset - alignment.offset) > self.reach:
             offset, sigma = alignment.offset, UNKNOWN_SIGMA / fps
@@ -92,7 +95,7 @@ class EpipolarRefine(Refiner):
         stats = alignment.stats | {
             "moved": abs(offset - alignment.offset),
             "spread": spread,
-            "common_error": common,
+            "common_error": ALONE * common,
             "tentative": 1.0,
             "wander": wander,
             "blur": blur,

@@ -138,7 +138,8 @@ class SplineRefine(Refiner):
         spread = max((self._apart(o, fit, curves) for o in others), default=0.0)
         model = max((self._beyond_noise(o, fit, curves) for o in others), default=0.0)
         fps = min(nominal_fps(a), nominal_fps(b))
-        shared = model / 2 + (fit.blur**2 / COMMON_ERRORS) ** 2 + LEAST_SIGMA**2
+        unseen = (fit.blur**2 / COMMON_ERRORS) ** 2
+        shared = model / 2 + unseen + LEAST_SIGMA**2
         together = neighbours(curves[0].mean + curves[1].mean, GROUPS)
         common = common_error(*curves, fit.clock, fit.weights, together, self.windows[0])
         seconds = Seconds.of(*curves, fit.clock, self.windows[0], weight)
@@ -147,6 +148,7 @@ class SplineRefine(Refiner):
         fit = _of_short(fit, overlap)
         # three estimates of one thing: what tracks have in common makes seconds differ, too
         shared += max(0.0, max(common, sway) ** 2 - float(fit.unbiased[0, 0]))
+        guessed = unseen + max(0.0, common**2 - float(fit.unbiased[0, 0]))
         long = overlap >= LONG - 1e-9
         unsettled = unsettled_rate(rate_stats, fit.clock.rate, UNSETTLED if long else UNSETTLED_SHORT)
         ends = self._ends(curves, fit, free, shared, unsettled, rate_stats.get("rate_sigma"))
@@ -165,6 +167,7 @@ class SplineRefine(Refiner):
                 "untold": seconds.untold(),
                 "settled": float(fit.settled),
                 "common_error": common,
+                "tentative": min(1.0, guessed / max(ends) ** 2),
                 "sway": sway,
                 "scatter": math.sqrt(max(float(fit.covariance[0, 0]), 0.0)),
                 "correlation": velocity_correlation(*curves, fit, VELOCITY),

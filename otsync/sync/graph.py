@@ -19,14 +19,13 @@ Pair = tuple[int, int]
 CAUCHY = 2.5
 """Residuals beyond this many sigmas count for less."""
 
-SAID, WORTH = 1.6, 4.0
-"""Times the variance that a tentative edge is taken to have before the cycles are seen, and the degrees of freedom that
-this counts for beside them."""
+WORTH = 4.0
+"""Degrees of freedom that the variances of edges count for, as they are said, beside what the cycles show."""
 
 UNSEEN = 2.0
 """Times the variance that cycles show, of all: what is a video's own fits into every cycle."""
 
-OPEN = 4.0
+OPEN = 2.5
 """Most that the cycles can show, in squares of sigma a degree of freedom: one wrong edge is not all."""
 
 L1_FLOOR = 0.3
@@ -86,7 +85,7 @@ class Edge:
         trusted: whether the pair itself vouches for it.
         curve: (K,2) offset in seconds and score, or None.
         common: seconds, the part of sigma that is known to be the two videos' own, as far as the pair tells.
-        tentative: whether sigma is for the cycles to judge: see :func:`judged_by_cycles`.
+        tentative: share of the variance that is for the cycles to judge: see :func:`judged_by_cycles`.
     """
 
     a: int
@@ -96,7 +95,7 @@ class Edge:
     trusted: bool
     curve: Float[np.ndarray, "K 2"] | None = None
     common: float = 0.0
-    tentative: bool = False
+    tentative: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,25 +161,26 @@ def solve(n: int, edges: Sequence[Edge], anchor: int, start: np.ndarray | None =
     told = float(np.median([min(e.common / e.sigma, 1.0) ** 2 for e in used]))
     together = (1 - max(shared, told)) * alone + own[free] + own[anchor]
     sigma[free] = np.sqrt(np.maximum(alone, together))
-    if all(e.tentative for e in used):
-        sigma[free] *= judged_by_cycles((A @ y - d) / s, len(free))
+    judged = judged_by_cycles((A @ y - d) / s, len(free))
+    sigma[free] *= np.sqrt(1 + float(np.average([e.tentative for e in used], weights=s**-2)) * (judged**2 - 1))
     return Solution(x, sigma, np.array([x[e.b] - x[e.a] - e.offset for e in edges]))
 
 
 def judged_by_cycles(residual: Float[np.ndarray, " E"], free: int) -> float:
     """By how much sigmas are to be multiplied, by what the edges contradict each other (Birge's ratio).
 
-    What lines tell of time is off by more (smooth bodies that turn beneath their tracks) or less (real people) than the
-    residuals of a pair show. Cycles show it, the surer the more there are. Without this, 36 films of the first (seeds
-    77000 to 77017 and 79500 to 79517) had 59 and 90 % of their offsets within one and two sigmas, with it 65 and 94;
-    fifteen cameras of the second were off by a quarter of theirs.
+    A part of an edge's variance is no scatter that was measured but what errors in common are taken to be, which no
+    residual of a pair shows: smooth bodies that turn beneath their tracks are off by more, real people by less. Cycles
+    show it, the surer the more there are; so they judge that part. From pixels, 36 films of the first (seeds 77000 to
+    77017 and 79500 to 79517) had 59 and 90 % of their offsets within one and two sigmas without this, with it 65 and
+    94; fifteen cameras of the second were off by a quarter of their sigmas.
 
     Args:
         residual: of each edge, in its sigmas. free: number of offsets that were solved for.
     """
     cycles = len(residual) - free
     shown = min(float(np.square(residual).sum()), OPEN * cycles)
-    return float(np.sqrt((WORTH * SAID + UNSEEN * shown) / (WORTH + cycles)))
+    return float(np.sqrt((WORTH + UNSEEN * shown) / (WORTH + cycles)))
 
 
 def _halves(

@@ -124,7 +124,8 @@ class Network:
             scale = 1.0 if pair.status.ok else FLAGGED
             offset = float(self.rates[a] * pair.offset)
             common = pair.stats.get("common_error", 0.0)
-            tentative = pair.stats.get("tentative", 0.0) > 0
+            # so is that a flag makes it three times as large
+            tentative = 1 - (1 - pair.stats.get("tentative", 0.0)) / scale**2
             edges.append(Edge(a, b, offset, scale * sigma, pair.status.ok, link.scanned.curve, common, tentative))
         return edges
 

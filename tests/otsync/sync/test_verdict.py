@@ -9,7 +9,7 @@ import pytest
 
 from otsync import Graph, LikelihoodScan, Matches, SplineRefine, Status, TrackSet
 from otsync.sync.pairs import Job, run
-from otsync.sync.verdict import Answer, Verdict, judge
+from otsync.sync.verdict import FLAGGED, Answer, Network, Verdict, judge
 from otsync.types import Alignment
 from otsync.types.trust import Trust
 from tests.conftest import wiggle
@@ -46,6 +46,20 @@ def test_clocks_of_any_rate_are_told_on_the_reference_s(reference):
     np.testing.assert_allclose(found.rates, RATES / of, atol=1e-9)
     np.testing.assert_allclose(found.x, (X - X[found.reference]) / of, atol=1e-6)
     assert not any(found.flags)
+
+
+def test_what_a_flag_makes_of_a_sigma_is_for_the_cycles_to_judge():
+    """Of a variance that a flag makes nine times as large, eight ninths and the tentative share of the ninth."""
+
+    def edge(*flags: Status):
+        told = Alignment(0.5, sigma=0.01, fps=30.0, flags=flags, stats={"tentative": 0.25})
+        network = Network(2, (Answer((0, 1), NONE, told, told),), np.ones(2), 0, Graph(), Trust())
+        return network.edges[0]
+
+    assert (edge().sigma, edge().tentative) == (0.01, 0.25)
+    flagged = edge(Status.SPREAD)
+    assert flagged.sigma == pytest.approx(FLAGGED * 0.01)
+    assert flagged.tentative == pytest.approx(1 - 0.75 / FLAGGED**2)
 
 
 def test_a_pair_astray_is_fitted_anew_at_its_own_rate_from_where_the_others_put_it():
