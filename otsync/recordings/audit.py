@@ -33,7 +33,7 @@ from ..files.cache import Cache
 from ..io.scene import Scene
 from ..progress import Tell
 from ..sync.graph import CAUCHY, CurveSum, Edge
-from ..sync.verdict import FLAGGED, FRAME, SHARED, STANDING_MARGIN, UNKNOWN_SIGMA
+from ..sync.verdict import FRAME, SHARED, STANDING_MARGIN
 from ..types import Offsets, Status, in_order
 from ..types.results import COARSE_FRAMES
 from .routes import synchronize_scene
@@ -235,11 +235,8 @@ def _links(offsets: Offsets, linked: np.ndarray) -> list[_Link]:
     for (a, b), pair in sorted(offsets.alignments.items()):
         if not (linked[a] and linked[b] and np.isfinite(pair.offset) and pair.stats.get("used", 1.0)):
             continue
-        vouches = pair.status.ok
-        sigma = (pair.sigma if np.isfinite(pair.sigma) else UNKNOWN_SIGMA) * (1.0 if vouches else FLAGGED)
-        offset = float(offsets.rates[a] * pair.offset)
-        edge = Edge(a, b, offset, sigma, vouches, pair.curve, min(pair.stats.get("common_error", 0.0), sigma))
-        out.append(_Link(edge, float(seconds[b] - seconds[a]) - offset, vouches))
+        edge = Edge.of(a, b, float(offsets.rates[a] * pair.offset), pair, pair.curve)
+        out.append(_Link(edge, float(seconds[b] - seconds[a]) - edge.offset, edge.trusted))
     return out
 
 

@@ -5,6 +5,7 @@ Offsets here are world seconds: an edge (a, b) measures ``x[b] - x[a]``.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -12,9 +13,16 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from ..types import Alignment
 from ..types.checks import check_whole
 
 Pair = tuple[int, int]
+
+UNKNOWN_SIGMA = 0.5 / 30
+"""Seconds, of a pair whose algorithm gives none: an answer on the frame grid."""
+
+FLAGGED = 3.0
+"""Factor on the sigma of a pair that does not vouch for its answer."""
 
 CAUCHY = 2.5
 """Residuals beyond this many sigmas count for less."""
@@ -85,7 +93,9 @@ class Edge:
         trusted: whether the pair itself vouches for it.
         curve: (K,2) offset in seconds and score, or None.
         common: seconds, the part of sigma that is known to be the two videos' own, as far as the pair tells.
-        tentative: share of the variance that is for the cycles to judge: see :func:`judged_by_cycles`.
+        tentative: share of the pair's own variance that is for the cycles to judge: see :func:`judged_by_cycles`.
+        doubt: factor that sigma holds because the pair does not vouch for itself: a suspicion, which is for the
+            cycles to judge.
     """
 
     a: int
@@ -96,6 +106,29 @@ class Edge:
     curve: Float[np.ndarray, "K 2"] | None = None
     common: float = 0.0
     tentative: float = 0.0
+    doubt: float = 1.0
+
+    @classmethod
+    def of(cls, a: int, b: int, offset: float, pair: Alignment, curve: np.ndarray | None = None) -> Edge:
+        """Of a pair's answer; ``offset`` in world seconds. One that does not vouch for itself has FLAGGED its sigma."""
+        sigma = pair.sigma if math.isfinite(pair.sigma) and pair.sigma > 0 else UNKNOWN_SIGMA
+        doubt = 1.0 if pair.status.ok else FLAGGED
+        return cls(
+            a,
+            b,
+            offset,
+            sigma=doubt * sigma,
+            trusted=pair.status.ok,
+            curve=curve,
+            common=min(pair.stats.get("common_error", 0.0), sigma),
+            tentative=pair.stats.get("tentative", 0.0),
+            doubt=doubt,
+        )
+
+    @property
+    def measured(self) -> float:
+        """Share of sigma² that is neither tentative nor doubt."""
+        return (1 - self.tentative) / self.doubt**2
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +195,7 @@ def solve(n: int, edges: Sequence[Edge], anchor: int, start: np.ndarray | None =
     together = (1 - max(shared, told)) * alone + own[free] + own[anchor]
     sigma[free] = np.sqrt(np.maximum(alone, together))
     judged = judged_by_cycles((A @ y - d) / s, len(free))
-    sigma[free] *= np.sqrt(1 + float(np.average([e.tentative for e in used], weights=s**-2)) * (judged**2 - 1))
+    sigma[free] *= np.sqrt(1 + float(np.average([1 - e.measured for e in used], weights=s**-2)) * (judged**2 - 1))
     return Solution(x, sigma, np.array([x[e.b] - x[e.a] - e.offset for e in edges]))
 
 

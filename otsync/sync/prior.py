@@ -10,7 +10,7 @@ import numpy as np
 
 from ..types import Offsets, Status, in_order
 from .graph import Edge, components, solve
-from .verdict import FLAGGED, SHARED, UNKNOWN_SIGMA
+from .verdict import SHARED
 
 SIGMAS = 3.0
 """Standard deviations apart at which two answers contradict each other."""
@@ -92,8 +92,7 @@ def with_told(offsets: Offsets, told: Sequence[Told]) -> tuple[Offsets, list[Con
             continue
         if not pair.status.ok and any(not clean[v] and v in linked for v in (a, b)):
             continue  # many doubtful pairs of one wrong peak would outvote the one who knows
-        sigma = pair.sigma if np.isfinite(pair.sigma) and pair.sigma > 0 else UNKNOWN_SIGMA
-        edges.append(Edge(a, b, seconds, sigma * (1.0 if pair.status.ok else FLAGGED), pair.status.ok))
+        edges.append(Edge.of(a, b, seconds, pair))
     answer, more = _solved(offsets.names, offsets.fps, edges, used, offsets)
     flags = tuple(
         in_order((*flags, *((Status.INCONSISTENT,) if v in doubted and v != offsets.reference else ())))

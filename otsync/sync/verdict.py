@@ -17,12 +17,6 @@ from .graph import CurveSum, Edge, Graph, Pair, agreeing, components, cycle_erro
 FRAME = 1 / 30
 """The frame, s, that tolerances of this module are multiples of."""
 
-UNKNOWN_SIGMA = 0.5 * FRAME
-"""Of a pair whose algorithm gives none: an answer on the frame grid."""
-
-FLAGGED = 3.0
-"""Factor on the sigma of a pair that does not vouch for its answer."""
-
 MOVED = 1.5 * FRAME
 """A video that the summed curves put further than this from the robust solution has moved."""
 
@@ -120,13 +114,7 @@ class Network:
         edges = []
         for link in self.links:
             (a, b), pair = link.pair, link.refined
-            sigma = pair.sigma if math.isfinite(pair.sigma) else UNKNOWN_SIGMA
-            scale = 1.0 if pair.status.ok else FLAGGED
-            offset = float(self.rates[a] * pair.offset)
-            common = pair.stats.get("common_error", 0.0)
-            # so is that a flag makes it three times as large
-            tentative = 1 - (1 - pair.stats.get("tentative", 0.0)) / scale**2
-            edges.append(Edge(a, b, offset, scale * sigma, pair.status.ok, link.scanned.curve, common, tentative))
+            edges.append(Edge.of(a, b, float(self.rates[a] * pair.offset), pair, link.scanned.curve))
         return edges
 
     @cached_property

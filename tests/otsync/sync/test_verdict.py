@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from otsync import Graph, LikelihoodScan, Matches, SplineRefine, Status, TrackSet
+from otsync.sync.graph import FLAGGED
 from otsync.sync.pairs import Job, run
-from otsync.sync.verdict import FLAGGED, Answer, Network, Verdict, judge
+from otsync.sync.verdict import Answer, Network, Verdict, judge
 from otsync.types import Alignment
 from otsync.types.trust import Trust
 from tests.conftest import wiggle
@@ -56,10 +57,11 @@ def test_what_a_flag_makes_of_a_sigma_is_for_the_cycles_to_judge():
         network = Network(2, (Answer((0, 1), NONE, told, told),), np.ones(2), 0, Graph(), Trust())
         return network.edges[0]
 
-    assert (edge().sigma, edge().tentative) == (0.01, 0.25)
+    assert (edge().sigma, edge().measured) == (0.01, 0.75)
     flagged = edge(Status.SPREAD)
     assert flagged.sigma == pytest.approx(FLAGGED * 0.01)
-    assert flagged.tentative == pytest.approx(1 - 0.75 / FLAGGED**2)
+    assert flagged.measured == pytest.approx(0.75 / FLAGGED**2)
+    assert flagged.sigma / flagged.doubt == pytest.approx(0.01)
 
 
 def test_a_pair_astray_is_fitted_anew_at_its_own_rate_from_where_the_others_put_it():
