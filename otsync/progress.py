@@ -6,7 +6,10 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
+
+if TYPE_CHECKING:
+    from tqdm import tqdm
 
 T = TypeVar("T")
 
@@ -19,11 +22,6 @@ def be_quiet(quiet: bool) -> None:
     _quiet = quiet
 
 
-def is_quiet() -> bool:
-    """Whether progress is not to be shown."""
-    return _quiet
-
-
 def tell(text: str) -> None:
     """A line of progress on stderr, unless progress is not to be shown."""
     if not _quiet:
@@ -34,11 +32,47 @@ PATIENCE = 2.0
 """Seconds before a bar shows: what ends sooner needs none."""
 
 
+EVERY = 30.0
+"""Seconds between lines of progress where stderr is no terminal but a log or a pipe."""
+
+
 def counted(items: Iterable[T], what: str, unit: str, total: int | None = None) -> Iterable[T]:
-    """The items, counted on stderr while it is a terminal; total: how many, where they do not tell."""
+    """The items, counted as :func:`bar` counts; total: how many, where they do not tell."""
+    return bar(what, unit, total, items=items)
+
+
+def bar(
+    what: str,
+    unit: str,
+    total: int | None = None,
+    *,
+    items: Iterable[Any] | None = None,
+    initial: int = 0,
+    shown: bool = True,
+) -> tqdm:
+    """A bar on stderr where it is a terminal; a line now and then where it is a log or a pipe."""
     from tqdm import tqdm
 
-    return tqdm(items, desc=what, unit=unit, total=total, disable=True if _quiet else None, leave=False, delay=PATIENCE)
+    known: dict[str, Any] = {"desc": what, "unit": unit, "total": total, "initial": initial, "leave": False}
+    if _quiet or not shown:
+        return tqdm(items, disable=True, **known)
+    if sys.stderr.isatty():
+        return tqdm(items, delay=PATIENCE, **known)
+    # miniters: else a thread of tqdm's own would draw between
+    return tqdm(items, delay=EVERY, mininterval=EVERY, miniters=1, ncols=0, file=Lines(), **known)
+
+
+class Lines:
+    """A file for a bar where nothing can be drawn over: each of its states is a line on stderr."""
+
+    def write(self, text: str) -> int:
+        state = text.strip("\r\n ")
+        if state:
+            print(state, file=sys.stderr, flush=True)
+        return len(text)
+
+    def flush(self) -> None:
+        """Each line is flushed as it is written."""
 
 
 def say(text: str) -> None:

@@ -17,9 +17,9 @@ import torch
 from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
-from tqdm import tqdm
 
 from otsync.compute.indices import evenly
+from otsync.progress import bar
 from recon.backdrop.seeds import seed_discs, surface_of
 from recon.backdrop.stills import Still, stills_of
 from recon.backdrop.surroundings import Floor, Lookup, surroundings
@@ -308,20 +308,20 @@ class _BackdropFit:
         order: list[int] = []
         recent: list[float] = []
         began = time.perf_counter()
-        with tqdm(total=total, desc="backdrop", unit="step", disable=None if progress else True) as bar:
+        with bar("backdrop", "step", total, shown=progress) as told:
             while total is None or self.step < total:
                 if not order:
                     order = rng.permutation(len(self.views)).tolist()
                 recent.append(self.one_step(order.pop(), 0.0 if total is None else self.step / total))
-                bar.update()
+                told.update()
                 if self.step == WARM:
                     began = time.perf_counter()  # the steps before compile and warm up
                 if budget is not None and self.step == TIMED:
                     affordable = max(TIMED, int((TIMED - WARM) * budget / (time.perf_counter() - began)))
                     total = affordable if total is None else min(total, affordable)
-                    bar.total = total
+                    told.total = total
                 if self.step % 50 == 0:
-                    bar.set_postfix_str(f"loss {np.mean(recent[-50:]):.4f}", refresh=False)
+                    told.set_postfix_str(f"loss {np.mean(recent[-50:]):.4f}", refresh=False)
         return float(np.mean(recent[-max(1, len(recent) // 10) :])) if recent else math.nan
 
     def one_step(self, i: int, progress: float) -> float:

@@ -20,11 +20,10 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from otsync.compute.interrupts import uninterrupted
 from otsync.compute.threads import MapLike, pool_of
-from otsync.progress import Deadline, is_quiet
+from otsync.progress import Deadline, bar
 from otsync.types import Offsets, Status
 from otsync.types.status import in_order
 from recon.fit.checkpoint import Checkpoint
@@ -156,20 +155,19 @@ def fit(
         if problem.device.type == "cpu":  # a GPU is fed by one thread: more would only wait for each other
             each = stack.enter_context(pool_of(options.batch + 1, "recon.fit")).map
         stack.enter_context(one_thread_each(options.batch))
-        hidden = True if is_quiet() else None  # None: hidden where there is no terminal
-        bar = stack.enter_context(tqdm(total=run.total, initial=run.step, desc="fit", unit="step", disable=hidden))
+        shown = stack.enter_context(bar("fit", "step", run.total, initial=run.step))
         calibrate = Calibration(options.budget, deadline, run.steps_after()) if run.total is None else None
         try:
             while run.total is None or run.step < run.total:
                 with uninterrupted():
                     run.advance(each, options.densify)
                     row = run.record(time.perf_counter() - started) if run.record_due() else None
-                bar.update()
+                shown.update()
                 if calibrate is not None:
                     run.expected, run.total = calibrate(run.step)
-                    bar.total = run.expected
+                    shown.total = run.expected
                 if row is not None:
-                    bar.set_postfix_str(f"PSNR {row[3]:.1f}, offsets moved {_moved(problem, row[4:])} frames", False)
+                    shown.set_postfix_str(f"PSNR {row[3]:.1f}, offsets moved {_moved(problem, row[4:])} frames", False)
                 if watch is not None and row is not None:
                     values = {n: v.detach().clone() for n, v in run.values().items()}
                     watch(assemble(run.scene, values).to("cpu"), f"step {run.step}, PSNR {row[3]:.1f} dB")

@@ -1,4 +1,4 @@
-"""Bars on a terminal and nowhere else, which change nothing; notes and times of stages."""
+"""Bars on a terminal, lines in a log, which change nothing; notes and times of stages."""
 
 from __future__ import annotations
 
@@ -43,6 +43,33 @@ def test_a_short_run_and_a_pipe_are_left_alone(attach, stream, patience):
     attach(stream, patience)
     assert list(progress.counted(range(3), "worlds", "world")) == [0, 1, 2]
     assert stream.getvalue() == ""
+
+
+def test_a_long_run_tells_a_log_in_lines_now_and_then(attach, monkeypatch):
+    log = attach(io.StringIO())
+    monkeypatch.setattr(progress, "EVERY", 0.0)
+    with progress.bar("fit", "step", 3, initial=1) as shown:
+        shown.set_postfix_str("PSNR 20.1", refresh=False)
+        shown.update()
+        shown.total = 5
+        shown.update()
+    lines = log.getvalue().splitlines()
+    assert "2/3" in lines[-2] and "PSNR 20.1" in lines[-2] and "3/5" in lines[-1]
+    assert all(line.startswith("fit:") for line in lines) and "\r" not in log.getvalue()
+    monkeypatch.setattr(progress, "EVERY", 3600.0)
+    assert list(progress.counted(range(9), "worlds", "world")) == list(range(9))
+    assert log.getvalue().splitlines() == lines
+
+
+def test_what_is_quiet_or_not_to_be_shown_tells_nobody(attach, monkeypatch):
+    monkeypatch.setattr(progress, "EVERY", 0.0)
+    for stream in (Terminal(), io.StringIO()):
+        attach(stream)
+        assert list(progress.bar("worlds", "world", items=range(3), shown=False)) == [0, 1, 2]
+        monkeypatch.setattr(progress, "_quiet", True)
+        assert list(progress.counted(range(3), "worlds", "world")) == [0, 1, 2]
+        monkeypatch.setattr(progress, "_quiet", False)
+        assert stream.getvalue() == ""
 
 
 def test_lines_go_to_standard_output_between_bars(attach, capsys):
