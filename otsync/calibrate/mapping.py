@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..files.digest import content_key
+from ..progress import bar
 from .clips import Lens
 from .stills import Picture
 
@@ -289,7 +290,12 @@ def _incremental(
     mapper.abs_pose_min_num_inliers, mapper.abs_pose_min_inlier_ratio = thresholds.pose, thresholds.share
     mapper.abs_pose_max_error = 8.0
     mapper.init_min_num_inliers, mapper.init_min_tri_angle = thresholds.first, thresholds.angle
-    return pycolmap.incremental_mapping(path, work, work, options)
+    with bar("mapping", "picture") as shown:
+
+        def placed() -> None:
+            shown.update()
+
+        return pycolmap.incremental_mapping(path, work, work, options, next_image_callback=placed)
 
 
 def _global(
