@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 import os
 from dataclasses import replace
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -29,6 +30,7 @@ from ..types import Offsets
 from ..types.checks import check_whole
 from .kept_pairs import KeptPairs
 from .routes import Synchronized, lift_given, track_all, without_times
+from .silent import of_those_that_move
 from .stages import Stages
 
 
@@ -70,7 +72,7 @@ def synchronize_own_scene(
 
     ``method``: the matcher of first matches and the graph; ValueError names a slot that own frames have no use for. It
     also names the videos without depth: pixels alone have no distances that could be compared. ``processes``: as of
-    :func:`~otsync.recordings.routes.synchronize_scene`.
+    :func:`~otsync.recordings.routes.synchronize_scene`, and so is what becomes of a video in which nothing moves.
     """
     check_whole("processes", processes, 1)
     if stages is not None and stages.depth is not None:
@@ -88,6 +90,25 @@ def synchronize_own_scene(
         raise ValueError(f"scene: expected at least two videos; found {len(scene.videos)}.")
     for video in scene.videos:
         check_within_a_frame(video.camera.readout, video.times, f"camera.readout of {video.name!r}")
+    solve = partial(
+        _synchronized, method=method, stages=stages, solver=solver, cache=cache, map=map, processes=processes, tell=tell
+    )
+    return of_those_that_move(scene, reference, solve, tell)
+
+
+def _synchronized(
+    scene: Scene,
+    *,
+    reference: int | Literal["auto"],
+    method: Method | None,
+    stages: Stages | None,
+    solver: OwnFrames | None,
+    cache: Cache | None,
+    map: MapLike,
+    processes: int,
+    tell: Tell,
+) -> Synchronized:
+    """:func:`synchronize_own_scene` of videos that all have something to follow; NothingToFollow names others."""
     stages, cache = stages or Stages(), cache or Cache()
     progress = Progress(tell)
     with progress.stage("tracks"):

@@ -21,6 +21,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -45,6 +46,7 @@ from .kept_pairs import KeptPairs
 from .learned_depth import remedy, with_depth
 from .lift import depth_at
 from .placement import misplaced, with_doubts
+from .silent import NothingToFollow, followed, of_those_that_move, tried
 from .stages import Stages, with_labels, with_method
 from .tracking import pixel_tracks, track_labels
 
@@ -99,8 +101,39 @@ def synchronize_scene(
             alone. Programs that use more need Python's usual ``if __name__ == "__main__"``.
         tell: receives one line per stage.
         deadline: of the job that this is a part of: stereo is left out where it would take more than its share.
+
+    A video in which nothing can be followed is ``static``, with a clock of its own, where two others are left and it is
+    not the reference; NothingToFollow otherwise.
     """
     check_whole("processes", processes, 1)
+    solve = partial(
+        _synchronized,
+        route=route,
+        method=method,
+        stages=stages,
+        cache=cache,
+        map=map,
+        processes=processes,
+        tell=tell,
+        deadline=deadline,
+    )
+    return of_those_that_move(scene, reference, solve, tell)
+
+
+def _synchronized(
+    scene: Scene,
+    *,
+    route: Route,
+    reference: int | Literal["auto"],
+    method: Method | None,
+    stages: Stages | None,
+    cache: Cache | None,
+    map: MapLike,
+    processes: int,
+    tell: Tell,
+    deadline: Deadline | None,
+) -> Synchronized:
+    """:func:`synchronize_scene` of videos that all have something to follow; NothingToFollow names others."""
     for video in scene.videos:
         check_within_a_frame(video.camera.readout, video.times, f"camera.readout of {video.name!r}")
     stages, cache = with_labels(stages or Stages(), scene), cache or Cache()
@@ -125,7 +158,10 @@ def synchronize_scene(
             offsets = with_doubts(offsets, scene.doubtful)
         return Synchronized(without_times(offsets), tuple(lifted), chosen, why, None, progress.seconds)
     with progress.stage("tracks"):
-        flat = track_all(scene, stages, cache, map, tell, lambda video, one: select(video, one, stages, scene.frame))
+        chosen_tracks = track_all(
+            scene, stages, cache, map, tell, lambda video, one: tried(select, video, one, stages, scene.frame)
+        )
+        flat = followed(chosen_tracks)
     with progress.stage("epipolar"):
         first = without_times(pairs_in_pixels(flat, reference, stages, cache, map, processes))
         astray = misplaced(first) | set(scene.doubtful)
@@ -268,15 +304,16 @@ def track_all(
 
 
 def select(video: Video, raw: dict[str, np.ndarray], stages: Stages, frame: str) -> TrackSet:
-    """The tracks of one video that are worth keeping, in undistorted pixels."""
+    """The tracks of one video that are worth keeping, in undistorted pixels; NothingToFollow where there is none."""
     chosen = stages.selection(raw["uv"], video.camera.width, video.fps or 30.0)
     if len(chosen) == 0:
-        raise ValueError(
+        why = (
             f"video {video.name}: expected moving foreground to track; found no track that lives and moves enough: "
             f"{stages.selection.told(raw['uv'], video.camera.width, video.fps or 30.0)}. Check the masks, choose a "
             "part of the clip with motion, lower the limit (--recording.selection, --recording.masks), raise "
             "--recording.width where things are small, or leave this video out."
         )
+        raise NothingToFollow({video.name: why})
     tracks = pixel_tracks(
         raw["uv"][chosen],
         raw["features"][chosen],
@@ -331,13 +368,14 @@ def lift_given(
         lifted = stages.lift(flat, depth)
         best = lifted.take(stages.selection(seen_pixels(lifted), video.camera.width, video.fps or 30.0))
         if len(best) == 0:
-            raise ValueError(
+            why = (
                 f"video {video.name}: expected depth where things move; no track could be lifted. Check the depth "
                 "maps' scale and holes (otsync check), or use --recording.route epipolar."
             )
+            raise NothingToFollow({video.name: why})
         return best
 
-    return list(map(one, list(zip(scene.videos, raw, strict=True))))
+    return followed(list(map(partial(tried, one), list(zip(scene.videos, raw, strict=True)))))
 
 
 def stereo_depth(
