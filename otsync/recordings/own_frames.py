@@ -121,7 +121,7 @@ def _synchronized(
     why = ["route own frames: as asked; depth is given, poses are not used across videos"]
     if method is not None and method.slots():
         why.append(method.told())
-    if scene.labels:
+    if any(labels is not None for labels in scene.labels):
         why.append("labels are given; without a common frame they are not used")
     for line in why:
         tell(line)

@@ -42,6 +42,7 @@ def test_clock_and_cameras_of_a_recording_without_poses(tmp_path, capsys):
     printed = json.loads(capsys.readouterr().out)
     assert code == 0, printed["videos"]
     assert printed["route"] == "own frames"
+    assert not any("labels" in line for line in json.loads((out / "sync.json").read_text())["why"])  # there are none
     assert "Frames of reference" in (out / "report.html").read_text()
     offsets = Offsets.load(out / "offsets.json")
     assert abs(offsets.frames[1] - (SHIFTS[1] - SHIFTS[0])) < 0.3
