@@ -87,10 +87,25 @@ class Seconds:
         Args:
             floor: seconds by which single seconds may be off whatever their sigma says: errors that all tracks share.
         """
+        off = self._off(floor)
+        return float(np.sqrt((off**2).mean())) if len(off) else 0.0
+
+    def astray(self, floor: float) -> float:
+        """The part that is off by most, in the same units; 0 where few can tell.
+
+        Of two takes one second may be off alone, which many others hide in a mean.
+
+        Args:
+            floor: as of :meth:`unsteady`.
+        """
+        return float(self._off(floor).max(initial=0.0))
+
+    def _off(self, floor: float) -> Float[np.ndarray, " N"]:
+        """What the parts that can tell are off by; none where they are few."""
         known = np.isfinite(self.late)
         if known.sum() < LEAST:
-            return 0.0
-        return float(np.sqrt((self.late[known] ** 2 / (self.sigma[known] ** 2 + floor**2)).mean()))
+            return np.zeros(0)
+        return np.abs(self.late[known]) / np.hypot(self.sigma[known], floor)
 
     def sway(self, floor: float) -> float:
         """By how much an even clock is off at any moment, one sigma, s, as far as chance does not explain it; 0 where

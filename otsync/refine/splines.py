@@ -83,6 +83,7 @@ READS = (
     "common",
     "wander",
     "unsteady",
+    "astray",
     "untold",
     "parted",
     "overlap",
@@ -164,6 +165,7 @@ class SplineRefine(Refiner):
                 "common_motion": common_motion(*curves, fit.clock, fit.weights, self.windows[0]),
                 "wander": fit.wander,
                 "unsteady": seconds.unsteady(floor),
+                "astray": seconds.astray(floor),
                 "untold": seconds.untold(),
                 "settled": float(fit.settled),
                 "common_error": common,
@@ -289,6 +291,7 @@ class SplineRefine(Refiner):
             Status.SPREAD: stats["spread"] > t.spread,
             Status.BROKEN_CLOCK: stats["wander"] > self._wanders(stats["blur"])
             or stats["unsteady"] > t.unsteady
+            or stats["astray"] > t.astray
             or stats["untold"] > t.untold,
             Status.SHORT_OVERLAP: stats["overlap"] < t.overlap - 1e-9,
             Status.FEW_MATCHES: stats["effective_matches"] < t.matches,

@@ -14,6 +14,7 @@ from typing import Protocol
 import numpy as np
 
 from ..clocks.common import nominal_fps
+from ..clocks.cuts import cuts, unexplained
 from ..compute.threads import MapLike
 from ..refine.verb import refine
 from ..types import Break, Clock, Status, TrackSet, in_order
@@ -327,6 +328,30 @@ def doubted(answer: Answer) -> Answer:
     return dataclasses.replace(
         answer, refined=dataclasses.replace(refined, flags=in_order((*refined.flags, Status.BROKEN_CLOCK)))
     )
+
+
+def cut_where_it_holds(
+    answers: Sequence[Answer], tracks: Sequence[TrackSet], broken: Mapping[int, tuple[Break, ...]]
+) -> set[Pair]:
+    """The pairs in whose overlap a video shows a cut that no break of its clock explains.
+
+    Args:
+        tracks: as they were filmed, on their videos' own clocks.
+    """
+    left = [unexplained(cuts(t), broken.get(v, ())) for v, t in enumerate(tracks)]
+    found = set()
+    for answer in answers:
+        if not answer.finite or not any(len(left[v]) for v in answer.pair):
+            continue
+        clock = Clock(answer.refined.offset, answer.refined.rate)
+        a, b = answer.pair
+        for there, ends in (
+            (left[a], clock.world(tracks[b].times[[0, -1]])),
+            (left[b], clock.own(tracks[a].times[[0, -1]])),
+        ):
+            if ((there > ends[0]) & (there < ends[1])).any():
+                found.add(answer.pair)
+    return found
 
 
 def steady_beside(fresh: Mapping[Pair, Answer], tracks: Sequence[TrackSet], v: int, found: Break) -> bool:

@@ -24,7 +24,7 @@ from ..types import Alignment, Break, Matches, Offsets, Status, TrackSet
 from ..types.checks import check_whole
 from .graph import Graph, Pair
 from .lags import Lag, lag_of, lagging, with_lags
-from .mending import ByMotion, doubted, mend_by_windows, mend_clocks
+from .mending import ByMotion, cut_where_it_holds, doubted, mend_by_windows, mend_clocks
 from .method import Method
 from .own_frames import Frames, refuse_common, solver_from, synchronize_own
 from .pairs import Job, Refit, run, run_refit, with_rate
@@ -140,6 +140,9 @@ def synchronize(
             verdict = with_witnesses_heard(
                 verdict, jobs, broken, bool(times) and matches is None, refining.trust.parted, judged, map
             )
+        cut = cut_where_it_holds(verdict.answers, tracks, broken)
+        if cut:
+            verdict = judged([doubted(a) if a.pair in cut else a for a in verdict.answers])
         lags = list(map(lag_of, tracks))
         lagged = with_lags(verdict.answers, lags, refining.trust.lag)
         if lagged is not None:

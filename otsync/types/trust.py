@@ -43,6 +43,9 @@ class Trust:
         unsteady: BROKEN_CLOCK when single seconds, each fitted by itself, are off by more than this, rms, in units of
             how well each is known. Of 320 right answers (mid to brutal, few tracks, like people, drifts; seeds
             41000-41029) none has more than 1.65; two takes that were trusted 2.3 to 4.
+        astray: BROKEN_CLOCK when one of these seconds is off by more than this, in the same units, which many others
+            hide in a mean. Of 18 right answers to hard and brutal worlds none has more than 2.2 (seeds 79100-79113);
+            two takes have 5.6 and more there, and one that was trusted 4.0 (80113).
         untold: BROKEN_CLOCK when things move in the first or the last second, and their offset there, fitted by itself,
             is not known to this many seconds, while single seconds usually know theirs three times better. Of the same
             right answers three of 210 have more; brutal tracks that froze behind their first second, 15 frames off
@@ -75,6 +78,7 @@ class Trust:
     common: float = 0.18
     wander: float = 0.1
     unsteady: float = 2.0
+    astray: float = 3.5
     untold: float = 1 / 30
     lag: float = 0.6 / 30
     parted: float = 7.0

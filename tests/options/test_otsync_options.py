@@ -117,6 +117,7 @@ REFINER_OPTIONS = slot("refiner", "SplineRefine", windows="0.3 0.2", smoothing=3
         "common": "2",
         "wander": "-9",
         "unsteady": "-1",
+        "astray": "-1",
         "untold": "-1",
         "lag": "-1",
         "parted": "-1",
@@ -154,6 +155,7 @@ NOT_READ = {
             "common",
             "wander",
             "unsteady",
+            "astray",
             "untold",
             "parted",
             "overlap",
@@ -167,7 +169,18 @@ NOT_READ = {
     **{
         f"{SCAN}.trust.{name}": "aligner"
         for name in (
-            *("moved", "spread", "correlation", "blur", "common", "wander", "unsteady", "untold", "rate_sigmas"),
+            *(
+                "moved",
+                "spread",
+                "correlation",
+                "blur",
+                "common",
+                "wander",
+                "unsteady",
+                "astray",
+                "untold",
+                "rate_sigmas",
+            ),
             "lag",
             "parted",
         )

@@ -8,7 +8,8 @@ from functools import partial
 import numpy as np
 import pytest
 
-from otsync import SplineRefine, Status, TrackSet, refine
+from otsync import SplineRefine, Status, TrackSet, refine, synchronize
+from otsync.bench.trust.worlds import CLASSES
 from otsync.clocks.splines import TrackSplines
 from otsync.refine.gauss_newton import fit_clock
 from otsync.refine.seconds import LEAST, LENGTH, MOST, STEP, Seconds
@@ -90,6 +91,27 @@ def test_a_clock_that_wanders_is_unsteady_and_one_that_runs_evenly_is_not():
     limit = SplineRefine().trust.unsteady
     assert told["even"].stats["unsteady"] < 0.5 * limit and told["even"].status.ok
     assert told["wanders"].stats["unsteady"] > limit and Status.BROKEN_CLOCK in told["wanders"].flags
+
+
+def test_one_second_of_many_is_not_hidden_by_the_others():
+    late = np.zeros(12)
+    late[3] = 0.05
+    told = Seconds(np.arange(12.0), late, np.full(12, 0.01), np.ones(12))
+    assert told.astray(0.0) == pytest.approx(5.0) and told.unsteady(0.0) == pytest.approx(5 / 12**0.5)
+    assert told.astray(0.01) == pytest.approx(5 / 2**0.5)
+    few = Seconds(np.arange(12.0), np.where(np.arange(12) < 5, late, np.nan), np.full(12, 0.01), np.ones(12))
+    assert few.astray(0.0) == pytest.approx(5.0)
+    fewer = Seconds(np.arange(12.0), np.where(np.abs(np.arange(12) - 3) < 1, late, np.nan), few.sigma, few.moving)
+    assert fewer.astray(0.0) == fewer.unsteady(0.0) == 0.0
+
+
+@pytest.mark.parametrize("seed", [80113])
+def test_two_takes_that_differ_in_one_second_are_not_trusted(seed):
+    """Its first second is 1.4 frames off, the other seven agree: it was trusted."""
+    found = synchronize(list(CLASSES["two takes"](seed).tracks))
+    pair = found.alignments[0, 1]
+    assert pair.stats["unsteady"] < SplineRefine().trust.unsteady < SplineRefine().trust.astray < pair.stats["astray"]
+    assert Status.BROKEN_CLOCK in found.flags[1]
 
 
 @pytest.mark.parametrize("alone", [True, False])
