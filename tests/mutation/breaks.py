@@ -1363,8 +1363,8 @@ BREAKS = (
     Break(
         "verdict-offset-rate",
         "otsync/sync/verdict.py",
-        "offset = float(self.rates[a] * pair.offset)",
-        "offset = float(self.rates[b] * pair.offset)",
+        "Edge.of(a, b, float(self.rates[a] * pair.offset)",
+        "Edge.of(a, b, float(self.rates[b] * pair.offset)",
         SYNC,
         "a pair's offset is turned into world seconds by the other video's rate",
     ),
