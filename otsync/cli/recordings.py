@@ -19,8 +19,8 @@ from ..progress import tell
 from .slots import one_of
 
 if TYPE_CHECKING:
-    from ..recordings.routes import Synchronized
     from ..recordings.stages import Stages
+    from ..recordings.synchronized import Synchronized
     from ..sync.method import Method
     from ..sync.own_frames import Frames
 

@@ -17,8 +17,9 @@ from .audit import audit_scene
 from .check import check_scene
 from .dense_depth import depth_maps
 from .learned_depth import with_depth
-from .routes import Synchronized, synchronize_scene
+from .routes import synchronize_scene
 from .stages import Stages, stages_from
+from .synchronized import Synchronized
 
 __all__ = [
     "Stages",

@@ -29,9 +29,10 @@ from ..sync.verb import synchronize
 from ..types import Offsets
 from ..types.checks import check_whole
 from .kept_pairs import KeptPairs
-from .routes import Synchronized, lift_given, track_all, without_times
+from .routes import lift_given, track_all, without_times
 from .silent import of_those_that_move
 from .stages import Stages
+from .synchronized import Synchronized
 
 
 def open_without_poses(path: str | os.PathLike[str], *, allow_outside: bool = False) -> tuple[Scene, dict[str, Any]]:

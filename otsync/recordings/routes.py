@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any, Literal
 
@@ -48,28 +48,10 @@ from .lift import depth_at
 from .placement import misplaced, with_doubts
 from .silent import NothingToFollow, followed, of_those_that_move, tried
 from .stages import Stages, with_labels, with_method
+from .synchronized import Synchronized
 from .tracking import pixel_tracks, track_labels
 
 Route = Literal["auto", "tracks", "epipolar", "stereo"]
-
-
-@dataclass(frozen=True, eq=False)
-class Synchronized:
-    """The outcome of :func:`synchronize_scene`.
-
-    Args:
-        offsets: the answer. tracks: what it was made from.
-        route, why: which way was taken, and the reasons in words.
-        first: offsets of the epipolar route where the stereo route went on from them.
-        seconds: wall time per stage.
-    """
-
-    offsets: Offsets
-    tracks: tuple[TrackSet, ...]
-    route: str
-    why: tuple[str, ...]
-    first: Offsets | None = None
-    seconds: dict[str, float] = field(default_factory=dict)
 
 
 def synchronize_scene(

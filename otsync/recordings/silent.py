@@ -13,7 +13,7 @@ from ..types import Offsets, Status, TrackSet, Video
 
 if TYPE_CHECKING:
     from ..io.scene import Scene
-    from .routes import Synchronized
+    from .synchronized import Synchronized
 
 T = TypeVar("T")
 

@@ -13,7 +13,7 @@ from .page import stage_bars, write_report
 
 if TYPE_CHECKING:
     from ..io.scene import Scene
-    from ..recordings.routes import Synchronized
+    from ..recordings.synchronized import Synchronized
     from ..types import Offsets
 
 

@@ -140,7 +140,7 @@ def synchronize(
             verdict = with_witnesses_heard(
                 verdict, jobs, broken, bool(times) and matches is None, refining.trust.parted, judged, map
             )
-        cut = cut_where_it_holds(verdict.answers, tracks, broken)
+        cut = cut_where_it_holds(verdict.answers, original, broken)
         if cut:
             verdict = judged([doubted(a) if a.pair in cut else a for a in verdict.answers])
         lags = list(map(lag_of, tracks))

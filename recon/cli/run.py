@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from otsync.files.cache import Cache
     from otsync.io.scene import Scene
     from otsync.progress import Deadline, Progress
-    from otsync.recordings.routes import Synchronized
     from otsync.recordings.stages import Stages
+    from otsync.recordings.synchronized import Synchronized
     from otsync.sync.method import Method
 
 WORTH_TELLING = 1.0

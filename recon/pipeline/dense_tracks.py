@@ -20,8 +20,9 @@ from otsync.io import Scene
 from otsync.progress import Progress
 from otsync.recordings.dense_depth import depth_maps
 from otsync.recordings.placement import misplaced, with_doubts
-from otsync.recordings.routes import Synchronized, inheriting, pairs_in_space, without_times
+from otsync.recordings.routes import inheriting, pairs_in_space, without_times
 from otsync.recordings.stages import Stages
+from otsync.recordings.synchronized import Synchronized
 from otsync.recordings.tracking import Selection
 from otsync.types import Offsets, TrackSet, Video
 from recon.features.tracks import Alone, FeatureMaps, feature_tracks, own_clock

@@ -1273,6 +1273,14 @@ BREAKS = (
         "a clock that is mended elsewhere than its video is cut is trusted",
     ),
     Break(
+        "cuts-on-the-mended-clock",
+        "otsync/sync/verb.py",
+        "cut_where_it_holds(verdict.answers, original, broken)",
+        "cut_where_it_holds(verdict.answers, tracks, broken)",
+        ("tests/otsync/clocks/test_cuts.py",),
+        "cuts are sought on clocks that were mended, where no break explains them",
+    ),
+    Break(
         "cuts-anywhere",
         "otsync/sync/mending.py",
         "((there > ends[0]) & (there < ends[1])).any()",

@@ -64,6 +64,14 @@ def test_a_clock_that_is_mended_elsewhere_than_its_video_is_cut_is_not_trusted()
     assert Status.BROKEN_CLOCK in synchronize(list(world.tracks)).flags[1]
 
 
+@pytest.mark.parametrize("name", ["ten frames dropped", "a second missing"])
+def test_a_clock_that_is_mended_where_its_video_is_cut_is_trusted(name):
+    world = CLASSES[name](80103)
+    found = synchronize(list(world.tracks))
+    assert len(cuts(world.tracks[1])) == 1 and found.ok and len(found.breaks[1]) == 1
+    assert world.errors(found)[1].max() < 0.2
+
+
 def test_a_cut_speaks_where_both_videos_were_filming_and_no_break_explains_it():
     x = moving()
     even, cut = TrackSet(x, fps=FPS), TrackSet(np.delete(x, np.arange(50, 65), axis=1), fps=FPS)

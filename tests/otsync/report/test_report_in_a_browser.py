@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from otsync import Camera, ConstantShift, Status, TrackSet, Video, synchronize
-from otsync.recordings.routes import Synchronized
+from otsync.recordings.synchronized import Synchronized
 from otsync.report.frames import write_recording_report
 from tests.browser import Opened, chromium
 from tests.otsync.align.test_align import films

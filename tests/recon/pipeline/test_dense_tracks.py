@@ -12,8 +12,9 @@ import torch
 from otsync.cli import main as otsync
 from otsync.files.cache import Cache
 from otsync.io import open_scene
-from otsync.recordings.routes import INHERITED, Synchronized
+from otsync.recordings.routes import INHERITED
 from otsync.recordings.stages import Stages
+from otsync.recordings.synchronized import Synchronized
 from otsync.recordings.tracking import Selection
 from otsync.types import Offsets, Status
 from recon.features.maps import Backbone, DaisyMaps, KeptMaps, LabMaps
