@@ -20,6 +20,12 @@ two of one; whoever moves fast comes from slower, and goes on."""
 LEAST = 5
 """Tracks that must be seen on both sides of a step."""
 
+RHYTHM = 30
+"""Frames that a cut must be worth: where more steps are sudden, pictures repeat (6 a second in a file of 30)."""
+
+BLOCK = 4096
+"""Frames at a time: all steps of an hour would take a gigabyte."""
+
 
 def cuts(tracks: TrackSet) -> Float[np.ndarray, " K"]:
     """The moments, s of the video's own clock, of the frames behind its cuts; none where there are no positions.
@@ -29,17 +35,24 @@ def cuts(tracks: TrackSet) -> Float[np.ndarray, " K"]:
     """
     if tracks.xyz is None or tracks.n_frames < 2 * BESIDE + 2:
         return np.zeros(0)
-    x = tracks.positions()
-    step = np.sqrt(np.square(np.diff(x, axis=1)).sum(2))
-    count = np.isfinite(step).sum(0)
-    step = np.where(count >= LEAST, step, np.nan)
-    told = np.full(step.shape[1], np.nan)
-    known = count >= LEAST
-    told[known] = np.nanmedian(step[:, known], 0)
+    told = _median_steps(tracks)
     around = sliding_window_view(told, 2 * BESIDE + 1)
     largest = np.delete(around, BESIDE, 1).max(1)  # nan beside what is not seen: nothing is said there
     sudden = np.flatnonzero(around[:, BESIDE] > SUDDEN * largest) + BESIDE
+    if len(sudden) * RHYTHM > len(told):
+        return np.zeros(0)
     return tracks.times[sudden + 1]
+
+
+def _median_steps(tracks: TrackSet) -> Float[np.ndarray, " T-1"]:
+    """How far the tracks go from each frame to the next, in the middle; nan where few are seen."""
+    told = np.full(tracks.n_frames - 1, np.nan)
+    for first in range(0, len(told), BLOCK):
+        x = tracks.positions(frames=slice(first, first + BLOCK + 1))
+        step = np.sqrt(np.square(np.diff(x, axis=1)).sum(2))
+        known = np.flatnonzero(np.isfinite(step).sum(0) >= LEAST)
+        told[first + known] = np.nanmedian(step[:, known], 0)
+    return told
 
 
 EXPLAINED = 0.2

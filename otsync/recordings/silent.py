@@ -57,7 +57,10 @@ def of_those_that_move(
     except NothingToFollow as error:
         rest = [name for name in scene.names if name not in error.why]
         centre = None if reference == "auto" else scene.names[reference]
-        if len(rest) < 2 or centre in error.why:
+        if centre in error.why and len(rest) > 1:
+            other = f"It is the reference: name another one (--reference {rest[0]})."
+            raise NothingToFollow(error.why | {centre: f"{error.why[centre]} {other}"}) from None
+        if len(rest) < 2:
             raise
         for line in error.why.values():
             tell(f"note: {line}")

@@ -7,7 +7,7 @@ import pytest
 
 from otsync import Matches, Status, synchronize
 from otsync.bench.trust.worlds import CLASSES
-from otsync.clocks.cuts import cuts, unexplained
+from otsync.clocks.cuts import BLOCK, cuts, unexplained
 from otsync.sync.mending import cut_where_it_holds
 from otsync.sync.verdict import Answer
 from otsync.types import Alignment, Break, TrackSet
@@ -48,6 +48,15 @@ def test_one_thing_that_jumps_and_what_is_not_seen_are_no_cuts():
     assert len(cuts(TrackSet(x, np.isfinite(x[..., 0]), fps=FPS))) == 0
     assert len(cuts(TrackSet(x[:4], np.isfinite(x[:4, :, 0]), fps=FPS))) == 0
     assert len(cuts(TrackSet(x[:, :5], fps=FPS))) == 0
+
+
+def test_pictures_that_repeat_are_no_cuts_and_long_videos_are_read_in_parts():
+    x = moving(150, noise=0.0)
+    assert len(cuts(TrackSet(np.repeat(x[:, ::5], 5, axis=1), fps=FPS))) == 0  # six pictures a second in a file of 30
+    long = moving(BLOCK + 60)
+    for lost in (BLOCK - 1, BLOCK, BLOCK + 1):
+        without = np.delete(long, np.arange(lost, lost + 15), axis=1)
+        np.testing.assert_allclose(cuts(TrackSet(without, fps=FPS)), [lost / FPS])
 
 
 def test_a_break_explains_the_cut_beside_it_alone():

@@ -57,7 +57,8 @@ def test_the_last_of_many_as_reference_keeps_its_place(recording):
 
 def test_where_it_is_the_reference_or_nothing_is_left_it_is_an_error(recording, tmp_path, capsys):
     assert main(["sync", str(recording), "--out", str(tmp_path / "a"), "--reference", "cam2"]) == 2
-    assert "video cam2" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert "video cam2" in told and "--reference cam0" in told
     two = ["--recording.cameras", "cam0", "cam2"]
     assert main(["sync", str(recording), "--out", str(tmp_path / "b"), *two]) == 2
     assert "video cam2" in capsys.readouterr().err
