@@ -29,8 +29,8 @@ it to 1 to 2 frames, are off by .05; so how cycles close has the last word (:fun
 which ``tentative`` asks for)."""
 
 ALONE = 1.6**0.5
-"""Times sigma: what the films above are off by more than their pairs say, before any cycle is seen (seeds 77000 to 77017
-and 79500 to 79517)."""
+"""Times sigma: what films are off by more than their pairs say, before any cycle is seen (seeds 77000 to 77017 and
+79500 to 79517)."""
 
 LEAST_SIGMA = 0.03
 """Frames added to sigma in squares: what is left on clean tracks, from splines and calibration."""
