@@ -8,7 +8,8 @@ from typing import Annotated
 
 import tyro
 
-from ..clocks.common import narrowed
+from ..clocks.common import LONG, narrowed
+from ..compute.memory import give_back_large_arrays
 from ..files.claim import claimed
 from ..io.footage import VIDEO_SUFFIXES
 from ..sync.graph import Graph
@@ -103,6 +104,8 @@ class Sync:
                 "video file. Put the videos into a folder, and run otsync sync FOLDER."
             )
         tracks = [narrowed(TrackSet.load(path)) for path in self.tracks]
+        if max(t.n_frames for t in tracks) >= LONG:
+            give_back_large_arrays()
         names = unique_names(tracks)
         reference = reference_among(names, self.reference)
         known = None if self.truth is None else true_offsets(self.truth, names)

@@ -7,21 +7,22 @@ each frame of the pause is one moment, so that steps from frame to frame are noi
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float
-
-from .splines import TrackSplines
+from jaxtyping import Float, Int
 
 STILL = 0.35
-"""A video stands still where its speed is below this share of what it is around, and moves around."""
+"""A video stands still where its tracks wander less than by this share of how far they do beside it."""
 
 FASTEST = 0.75
-"""Quantile of the speeds around from which on tracks are asked."""
+"""Quantile of these distances from which on tracks are asked."""
+
+FEWEST = 4
+"""Frames of a pause, at least."""
+
+MOVING = 0.1
+"""Share of the furthest that they wander near the pause, from which on they move."""
 
 AROUND = 20 / 30
-"""Seconds on either side of a pause that tell the usual speed."""
-
-MARGIN = 3 / 30
-"""Seconds at either end of a pause, at most, that are not asked: curves are smoothed across it."""
+"""Seconds within which a pause may begin elsewhere than where the pair has it."""
 
 OFF = 6
 """Frames by which a pause may begin and end elsewhere than where the pair has it."""
@@ -55,35 +56,61 @@ and the next cannot be both so large and so alike. (Of swings under noise 62 of 
 long while the first step had to be 1.5 times the usual mean square alone; now none of 3359 is.)"""
 
 
-def stood_still(curves: TrackSplines, start: float, length: float) -> bool:
-    """Whether tracks rest from ``start`` on for ``length`` s, and move before and behind: the fastest quarter of them,
-    since noise has a speed, too, and what hardly moves has no other.
+def stood_still(
+    times: Float[np.ndarray, " T"], x: Float[np.ndarray, "M T 3"], start: float, length: float
+) -> float | None:
+    """When a pause of ``length`` s began, near ``start``; None where tracks did not rest, or not move on both sides.
+
+    How far a track wanders within a span is its mean square distance from its mean there, less half the mean square of
+    its steps: of noise about one place both are the same (von Neumann 1941), so noise adds nothing to it. The tracks
+    that wander furthest around are asked, since what rests anyway tells nothing.
+
+    Args:
+        times: (T,) s. x: (M,T,3) where its tracks are seen, as they are; nan where not seen.
     """
-    inner = min(0.25 * length, MARGIN)
-    during = _speeds(curves, start + inner, start + length - inner)
-    around = np.stack(
-        [
-            _speeds(curves, start - AROUND, start - MARGIN),
-            _speeds(curves, start + length + MARGIN, start + length + AROUND),
-        ]
-    )
-    sides = np.isfinite(around)
-    usual = np.where(sides, around, 0.0).sum(0) / np.maximum(sides.sum(0), 1)
-    known = np.isfinite(during) & sides.any(0)
-    if not known.any():
-        return False
-    fast = known & (usual >= np.quantile(usual[known], FASTEST))
-    return float(np.median(during[fast])) < STILL * float(np.median(usual[fast]))
+    frame = float(np.median(np.diff(times)))
+    frames = round(length / frame) + 1  # all that show the moment at which it began
+    near, lead = int(np.searchsorted(times, start - frame / 2)), round(AROUND / frame)
+    begins = np.arange(near - lead - frames, near + lead + frames + 1)
+    if frames < FEWEST:
+        return None
+    wander = _wander(x, begins, frames)
+    moves = np.isfinite(wander).any(1)
+    if not moves.any():
+        return None
+    most = np.nanmax(wander[moves], 1)
+    wander = wander[moves][most >= np.quantile(most, FASTEST)]
+    told = np.full(len(begins), np.nan)
+    enough = np.isfinite(wander).sum(0) >= len(wander) / 2
+    told[enough] = np.nanmedian(wander[:, enough], 0)
+    if not enough.any():
+        return None
+    before, inside, behind = told[: -2 * frames], told[frames:-frames], told[2 * frames :]
+    beside = np.fmin(before, behind)
+    # beside a pause things move; within its neighbour, or where all rest, noise alone decides
+    asked = np.isfinite(inside) & (beside > MOVING * float(np.nanmax(told)))
+    share = np.divide(inside, beside, out=np.full(len(inside), np.inf), where=asked)
+    best = int(np.argmin(share))
+    return float(times[begins[frames + best]]) if share[best] < STILL**2 else None
 
 
-def _speeds(curves: TrackSplines, begin: float, end: float) -> np.ndarray:
-    """(M,) rms speed of every track within a span; nan where it is not seen."""
-    t = curves.times[(curves.times >= begin) & (curves.times <= end)]
-    if len(t) == 0:
-        return np.full(len(curves.mean), np.nan)
-    seen = curves.support(t)
-    power = np.where(seen, (curves.velocity(t) ** 2).sum(2), 0.0).sum(1)
-    return np.where(seen.any(1), np.sqrt(power / np.maximum(seen.sum(1), 1)), np.nan)
+def _wander(x: Float[np.ndarray, "M T 3"], begins: Int[np.ndarray, " B"], frames: int) -> Float[np.ndarray, "M B"]:
+    """See :func:`stood_still`, of every track in the ``frames`` from each begin on; nan where it is seen in few."""
+    out = np.full((len(x), len(begins)), np.nan)
+    for k, begin in enumerate(begins):
+        if begin < 0 or begin + frames > x.shape[1]:
+            continue
+        part = x[:, begin : begin + frames]
+        seen = np.isfinite(part[..., 0])
+        pairs = seen[:, 1:] & seen[:, :-1]
+        use = (seen.sum(1) >= max(FEWEST, frames / 2)) & pairs.any(1)
+        part = np.where(seen[..., None], part, 0.0)
+        count = np.maximum(seen.sum(1), 2)
+        mean = part.sum(1) / count[:, None]
+        apart = np.where(seen, np.square(part - mean[:, None]).sum(2), 0.0).sum(1) / (count - 1)
+        steps = np.where(pairs, np.square(np.diff(part, axis=1)).sum(2), 0.0).sum(1) / np.maximum(pairs.sum(1), 1)
+        out[use, k] = (apart - 0.5 * steps)[use]
+    return out
 
 
 def pause(

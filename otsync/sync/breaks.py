@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..clocks.common import readable, strongest
+from ..clocks.cuts import Steps
 from ..clocks.splines import TrackSplines
 from ..clocks.stillness import AROUND, pause, stood_still
 from ..refine.gauss_newton import Fit, fit_clock
@@ -97,12 +98,13 @@ def suspects(answer: Answer, a: TrackSet, b: TrackSet, fps: Sequence[float], wit
     matches = strongest(answer.matches, readable(LIMIT, a, b))
     curves = SplineRefine().splines(a, b, matches)
     raw = Raw.of(a, matches.pairs[:, 0]), Raw.of(b, matches.pairs[:, 1])
+    steps = Steps.of(a), Steps.of(b)
     found = []
     parts = answer.scanned.parts
     for k in range(len(parts) - 1):
         begin = parts[k][0] if k else -math.inf
         end = parts[k + 2][0] if k + 2 < len(parts) else math.inf
-        found += _readings(answer, curves, raw, parts[k][1], parts[k + 1], (begin, end), fps, within)
+        found += _readings(answer, curves, raw, steps, parts[k][1], parts[k + 1], (begin, end), fps, within)
     return found
 
 
@@ -110,6 +112,7 @@ def _readings(
     answer: Answer,
     curves: tuple[TrackSplines, TrackSplines],
     raw: tuple[Raw, Raw],
+    steps: tuple[Steps, Steps],
     before: float,
     after: np.ndarray,
     limits: tuple[float, float],
@@ -127,23 +130,32 @@ def _readings(
         (first, second), sigmas = _offsets(a, b, sides, within)
         when, gap = _moment(*raw, first, second, when, limits)
     jump, sigma = second - first, math.hypot(*sigmas)
-    i, j = answer.pair
     if jump > 0 and gap == 0:  # a's frames run on, b's go back: its parts are in the other order
-        return [Suspect(j, jumping(_turn(*raw, second, first), -jump, sigma, 1 / fps[j]), 1.0)]
+        j, turn = answer.pair[1], _turn(*raw, second, first)
+        cut = steps[1].cut_near(turn, AROUND)
+        return [Suspect(j, jumping(turn if cut is None else cut, -jump, sigma, 1 / fps[j]), 1.0)]
     at_b = when - first
     if jump > 0:  # a's frames from `when` on for `jump` s have no partner: a stood still, or b lost them
-        froze, lost = (i, when, a, raw[0]), (j, at_b)
+        (froze, start), (lost, gone) = (0, when), (1, at_b)
     else:
-        froze, lost = (j, at_b, b, raw[1]), (i, when)
-    video, start, own, shown = froze
-    stands = stood_still(own, start, abs(jump))
-    frame = 1 / fps[video]
-    back = jumping(start, -abs(jump), sigma, frame)
-    if stands:
-        back = _counted(shown, start, abs(jump), sigma, frame) or lasting(start, abs(jump), sigma, frame)
-    gone = jumping(lost[1], abs(jump), sigma, 1 / fps[lost[0]])
-    votes = (1.0, 0.0) if stands else (RESTING, MOVING)
-    return [Suspect(video, back, votes[0]), Suspect(lost[0], gone, votes[1])]
+        (froze, start), (lost, gone) = (1, at_b), (0, when)
+    length, frame = abs(jump), 1 / fps[answer.pair[froze]]
+    shown = raw[froze]
+    stands = stood_still(shown.times, shown.x, start, length)
+    cut, back = steps[lost].cut_near(gone, AROUND), steps[froze].cut_near(start, AROUND)
+    if stands is not None:
+        repeats = _counted(shown, stands, length, sigma, frame) or lasting(stands, length, sigma, frame)
+    else:
+        repeats = jumping(start if back is None else back, -length, sigma, frame)
+    misses = jumping(gone if cut is None else cut, length, sigma, 1 / fps[answer.pair[lost]])
+    # what one video shows by itself decides
+    votes = RESTING, MOVING
+    if (cut is None) != (stands is None and back is None):
+        votes = (1.0, 0.0) if cut is None else (0.0, 1.0)
+    return [
+        Suspect(answer.pair[froze], repeats, votes[0]),
+        Suspect(answer.pair[lost], misses, votes[1]),
+    ]
 
 
 def _counted(shown: Raw, start: float, length: float, sigma: float, frame: float) -> Break | None:

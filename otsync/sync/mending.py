@@ -14,10 +14,10 @@ from typing import Protocol
 import numpy as np
 
 from ..clocks.common import nominal_fps
-from ..clocks.cuts import cuts, unexplained
+from ..clocks.cuts import Steps, alone, calm, unexplained
 from ..compute.threads import MapLike
 from ..refine.verb import refine
-from ..types import Break, Clock, Status, TrackSet, in_order
+from ..types import Break, Clock, Status, TrackSet, in_order, mended_times
 from .breaks import (
     AROUND,
     MOST,
@@ -37,7 +37,7 @@ from .pairs import Job, run, without_answered_doubt
 from .places import NONE, parts_by_place
 from .rematching import NOISY, asks, at_each, at_peaks, evidence_of, winner
 from .verdict import NOTHING_COMMON, Answer, Verdict
-from .windows import EVERY, NEAR, Split, Windows, matches_of_parts
+from .windows import EVERY, NEAR, Split, Windows, in_pieces, matches_of_parts
 
 log = logging.getLogger("otsync")
 
@@ -128,6 +128,34 @@ class ByWindows:
         return float(parts[0, 1] if len(parts) else answer.refined.offset)
 
 
+class ByCuts:
+    """Parts that pieces of videos tell of, which look cut.
+
+    Args:
+        told: of every pair that is looked at so, its answer with its parts.
+    """
+
+    within = AROUND
+
+    def __init__(self, told: Mapping[Pair, Answer]) -> None:
+        self.told = dict(told)
+
+    def doubtful(self, answers: Sequence[Answer], tracks: Sequence[TrackSet]) -> list[Answer]:
+        return list(self.told.values())
+
+    def anew(self, jobs: Sequence[Job], map: MapLike) -> dict[Pair, Answer]:
+        return _on_mended_clocks(jobs, map)
+
+    def kept(self, fresh: Iterable[Answer]) -> None:
+        for answer in fresh:
+            self.told.pop(answer.pair, None)
+
+    def refused(self, pairs: Iterable[Pair]) -> bool:
+        for pair in pairs:
+            self.told.pop(pair, None)
+        return bool(self.told)
+
+
 def mend_clocks(
     jobs: list[Job],
     verdict: Verdict,
@@ -174,6 +202,25 @@ def mend_clocks(
     if doubtful_mends:
         verdict = judged([doubted(a) if doubtful_mends & set(a.pair) else a for a in verdict.answers])
     return jobs, verdict
+
+
+def mend_by_cuts(
+    jobs: list[Job],
+    verdict: Verdict,
+    tracks: list[TrackSet],
+    judged: Callable[[Sequence[Answer]], Verdict],
+    map: MapLike,
+    broken: dict[int, tuple[Break, ...]],
+) -> tuple[list[Job], Verdict]:
+    """:func:`mend_clocks` by pieces, of doubtful pairs whose videos look cut and were not mended."""
+    doubtful = {a.pair for a in verdict.answers if not a.refined.status.ok}
+    asked = [job for job in jobs if job.pair in doubtful and not broken.keys() & set(job.pair)]
+    told = {answer.pair: doubted(answer) for answer in map(in_pieces, asked) if answer is not None} if asked else {}
+    if not told:
+        return jobs, verdict
+    known = len(broken)
+    mended_jobs, found = mend_clocks(jobs, verdict, tracks, judged, map, ByCuts(told), broken)
+    return (mended_jobs, found) if len(broken) > known else (jobs, verdict)
 
 
 def mend_by_windows(
@@ -233,7 +280,9 @@ def _told(task: tuple[Job, list[Answer], Answer]) -> list[Answer]:
     explained = [best.refined.offset + split.late for split in breaks]
     if winner(several, explained) is None or not (breaks or windows.steady):
         return []
-    return _by(windows, best, job, *(a.scanned.stats for a in (untimed, best)))
+    # of matches that were made without a time half are wrong: they are heard where a video may be cut
+    heard = (best,) if calm(Steps.of(job.a)) and calm(Steps.of(job.b)) else (untimed, best)
+    return _by(windows, best, job, *(a.scanned.stats for a in heard))
 
 
 def _at_time(task: tuple[Job, float]) -> list[Answer]:
@@ -333,23 +382,24 @@ def doubted(answer: Answer) -> Answer:
 def cut_where_it_holds(
     answers: Sequence[Answer], tracks: Sequence[TrackSet], broken: Mapping[int, tuple[Break, ...]]
 ) -> set[Pair]:
-    """The pairs in whose overlap a video shows a cut that no break of its clock explains.
+    """The pairs in whose overlap one video alone shows a cut, and no break of its clock explains it.
 
     Args:
         tracks: as they were filmed, on their videos' own clocks.
     """
-    left = [unexplained(cuts(t), broken.get(v, ())) for v, t in enumerate(tracks)]
+    own = [Steps.of(t) for t in tracks]
+    left = [unexplained(steps, broken.get(v, ())) for v, steps in enumerate(own)]
+    steps = [
+        dataclasses.replace(steps, times=mended_times(steps.times, broken.get(v, ()))[0]) for v, steps in enumerate(own)
+    ]
     found = set()
     for answer in answers:
         if not answer.finite or not any(len(left[v]) for v in answer.pair):
             continue
         clock = Clock(answer.refined.offset, answer.refined.rate)
         a, b = answer.pair
-        for there, ends in (
-            (left[a], clock.world(tracks[b].times[[0, -1]])),
-            (left[b], clock.own(tracks[a].times[[0, -1]])),
-        ):
-            if ((there > ends[0]) & (there < ends[1])).any():
+        for one, other, there in (a, b, clock.own), (b, a, clock.world):
+            if any(alone(steps[other], there(float(steps[one].times[k]))) for k in left[one]):
                 found.add(answer.pair)
     return found
 

@@ -24,7 +24,7 @@ from ..types import Alignment, Break, Matches, Offsets, Status, TrackSet
 from ..types.checks import check_whole
 from .graph import Graph, Pair
 from .lags import Lag, lag_of, lagging, with_lags
-from .mending import ByMotion, cut_where_it_holds, doubted, mend_by_windows, mend_clocks
+from .mending import ByMotion, cut_where_it_holds, doubted, mend_by_cuts, mend_by_windows, mend_clocks
 from .method import Method
 from .own_frames import Frames, refuse_common, solver_from, synchronize_own
 from .pairs import Job, Refit, run, run_refit, with_rate
@@ -118,6 +118,7 @@ def synchronize(
         verdict = judged(list(map(run, jobs)))
         broken: dict[int, tuple[Break, ...]] = {}
         jobs, verdict = mend_clocks(jobs, verdict, tracks, judged, map, ByMotion(), broken)
+        jobs, verdict = mend_by_cuts(jobs, verdict, tracks, judged, map, broken)
         timed: set[Pair] = set()
         if times and matches is None:
             jobs, verdict, timed = mend_by_windows(jobs, verdict, tracks, judged, map, broken)

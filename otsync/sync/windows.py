@@ -17,14 +17,16 @@ from jaxtyping import Bool, Float
 
 from ..align.likelihood import evidence
 from ..clocks.common import CommonClock, nominal_fps
+from ..clocks.cuts import CALM, Steps
 from ..clocks.splines import sampled
 from ..costs.linear import Cosine
 from ..match.synchronous import MOMENTS as MOST_MOMENTS
 from ..match.synchronous import SynchronousMatching, apart, joined, longest_seen, mutual, placed, rms_extent
 from ..match.verb import match
-from ..types import Clock, Matches, TrackSet
-from .pairs import Job
-from .rematching import at_known_times
+from ..types import Clock, Matches, Status, TrackSet
+from .pairs import Job, run
+from .rematching import at_known_times, evidence_of
+from .verdict import Answer
 
 LENGTH, STEP = 24 / 30, 12 / 30
 """Seconds of a window, and from one to the next."""
@@ -68,6 +70,12 @@ RIVAL, TRIED = 0.5, 4
 
 STEADY, SUPPORTED = 0.1, 0.3
 """Up to which gain a clock does not break, where every window has at least this share of what one usually has."""
+
+OF_PIECES = frozenset({Status.SHORT_OVERLAP, Status.RATE_MISMATCH, Status.COARSE})
+"""Doubts that a piece of a clip may have: it is short."""
+
+LEAST_JUMP = 3 / 30
+"""Seconds between the offsets of two pieces, at least."""
 
 WHOLE = 0.9
 """Share of a window's moments that both videos must have frames of, for it to be asked so: a mended clock has gaps."""
@@ -305,3 +313,33 @@ def within(tracks: TrackSet, begin: float, end: float) -> TrackSet:
     """The tracks, seen only from ``begin`` to ``end`` s of their clock."""
     inside = (tracks.times >= begin) & (tracks.times < end)
     return dataclasses.replace(tracks, visible=tracks.seen & inside)
+
+
+def in_pieces(job: Job) -> Answer | None:
+    """What a pair tells where one of its videos may be cut: both pieces of that video are matched and aligned, each by
+    itself, and are the parts of the answer. None where none may be cut, or a piece alone leaves any doubt.
+
+    One offset does not suit a video that is cut, and under noise no peak of its scan stands out.
+    """
+    sharpest = [Steps.of(tracks).sharpest() for tracks in (job.a, job.b)]
+    k = int(np.argmax([size for _, size in sharpest]))
+    cut, size = sharpest[k]
+    if size < CALM:
+        return None
+    told = []
+    for begin, end in (-np.inf, cut), (cut, np.inf):
+        a, b = (within(tracks, begin, end) if n == k else tracks for n, tracks in enumerate((job.a, job.b)))
+        told.append(run(dataclasses.replace(job, a=a, b=b)))
+        if not told[-1].finite or not set(told[-1].refined.flags) <= OF_PIECES:
+            return None
+    first, second = (answer.refined.offset for answer in told)
+    if abs(second - first) < LEAST_JUMP:
+        return None
+    begin, turn = float(job.a.times[0]), cut if k == 0 else cut + first
+    (earliest, latest) = job.b.times[[0, -1]]
+    if k == 1 and latest - earliest < 2 * (first - second):  # b goes back so far that a shows the later piece first
+        first, second, turn = second, first, float(earliest) + first
+    parts = np.array([[begin, first], [turn, second]])
+    best = max(told, key=evidence_of)
+    scanned = dataclasses.replace(best.scanned, parts=parts)
+    return dataclasses.replace(best, matches=matches_of_parts(job, parts, 1.0), scanned=scanned)

@@ -6,14 +6,24 @@ import numpy as np
 import pytest
 
 from otsync import Matches, Status, synchronize
+from otsync.align.likelihood import LikelihoodScan
 from otsync.bench.trust.worlds import CLASSES
-from otsync.clocks.cuts import BLOCK, cuts, unexplained
+from otsync.clocks.cuts import BLOCK, Steps, alone, calm, unexplained
+from otsync.refine.splines import SplineRefine
 from otsync.sync.mending import cut_where_it_holds
+from otsync.sync.pairs import Job
 from otsync.sync.verdict import Answer
+from otsync.sync.windows import in_pieces
 from otsync.types import Alignment, Break, TrackSet
 from tests.otsync.refine.test_common_error import smooth
 
 FPS = 30.0
+
+
+def cuts(tracks: TrackSet) -> np.ndarray:
+    """The moments of the frames behind the cuts."""
+    steps = Steps.of(tracks)
+    return steps.times[steps.cuts()]
 
 
 def moving(frames: int = 120, n: int = 12, noise: float = 0.002, seed: int = 0) -> np.ndarray:
@@ -59,12 +69,50 @@ def test_pictures_that_repeat_are_no_cuts_and_long_videos_are_read_in_parts():
         np.testing.assert_allclose(cuts(TrackSet(without, fps=FPS)), [lost / FPS])
 
 
+def steps_of(frames: int, *jolts: tuple[int, float]) -> Steps:
+    """Steps of a video in which nothing but these happens."""
+    told = np.ones(frames - 1)
+    for before, size in jolts:
+        told[before - 1] = size
+    return Steps(np.arange(frames) / FPS, told)
+
+
 def test_a_break_explains_the_cut_beside_it_alone():
-    at = np.array([1.0, 2.0])
-    np.testing.assert_array_equal(unexplained(at, ()), at)
-    np.testing.assert_array_equal(unexplained(at, [Break(1.1, 0.5)]), [2.0])
-    assert len(unexplained(at, [Break(1.1, 0.5), Break(1.9, 0.2)])) == 0
-    assert len(unexplained(np.zeros(0), ())) == 0
+    steps = steps_of(90, (30, 4.0), (60, 3.0))
+    np.testing.assert_array_equal(unexplained(steps, ()), [30, 60])
+    np.testing.assert_array_equal(unexplained(steps, [Break(1.1, 0.5)]), [60])
+    assert len(unexplained(steps, [Break(1.1, 0.5), Break(1.9, 0.2)])) == 0
+    assert len(unexplained(steps_of(90), ())) == 0
+
+
+def test_what_jumps_for_another_video_too_is_no_cut():
+    assert alone(steps_of(90), 1.5)
+    assert alone(steps_of(90, (45, 1.2)), 1.5)  # noise
+    assert not alone(steps_of(90, (45, 1.6)), 1.5)
+    assert not alone(steps_of(90, (48, 3.0)), 1.5)  # a tenth of a second later
+    assert alone(steps_of(90, (60, 3.0)), 1.5)
+    assert not alone(steps_of(90), 5.0)  # it does not film then
+
+
+def test_the_sharpest_and_the_nearest_cut():
+    steps = steps_of(300, (60, 1.7), (75, 4.0))
+    assert steps.sharpest() == (75 / FPS, 4.0)
+    assert steps.cut_near(2.0, 0.2) == 2.0 and steps.cut_near(2.2, 0.5) == 2.5 and steps.cut_near(1.0, 0.5) is None
+    assert calm(steps_of(90)) and calm(steps_of(90, (40, 1.2))) and not calm(steps_of(90, (40, 1.35)))
+    nothing = Steps.of(TrackSet(moving(90)[:2], fps=FPS))
+    assert nothing.sharpest() == (0.0, 0.0) and calm(nothing) and len(nothing.cuts()) == 0
+    assert nothing.largest(0.0, 9.0) == 0.0 and not alone(nothing, 1.5)
+
+
+@pytest.mark.parametrize("noise", [0.002, 0.01])
+def test_a_jolt_has_no_unit_and_noise_alone_is_calm(noise):
+    x = moving(noise=noise, seed=3)
+    steps = Steps.of(TrackSet(np.delete(x, np.arange(50, 65), axis=1), fps=FPS))
+    scaled = Steps.of(TrackSet(1e3 * np.delete(x, np.arange(50, 65), axis=1), fps=FPS))
+    np.testing.assert_allclose(steps.jolts, scaled.jolts)
+    assert calm(Steps.of(TrackSet(x, fps=FPS))) and steps.sharpest()[1] > 2
+    whole = Steps.of(TrackSet(x, fps=FPS)).jolts
+    assert np.isnan(whole[[0, 3, -1, -4]]).all() and np.isfinite(whole[4:-4]).all()
 
 
 def test_a_clock_that_is_mended_elsewhere_than_its_video_is_cut_is_not_trusted():
@@ -95,3 +143,58 @@ def test_a_cut_speaks_where_both_videos_were_filming_and_no_break_explains_it():
     assert said(0.0, (cut, even)) and not said(1.7, (cut, even))
     assert not said(0.0, broken={1: (Break(50 / FPS, 0.5),)}) and said(0.0, broken={0: (Break(50 / FPS, 0.5),)})
     assert not said(float("nan"))
+
+
+def jobs_of(name: str, seed: int) -> Job:
+    """The work on the first two videos of a world."""
+    a, b = CLASSES[name](seed).tracks[:2]
+    return Job((0, 1), a, b, None, LikelihoodScan(), SplineRefine(), None)
+
+
+def test_the_pieces_of_a_video_that_is_cut_tell_an_offset_each():
+    told = in_pieces(jobs_of("ten frames dropped", 80101))
+    assert told is not None
+    (_, before), (at, behind) = told.scanned.parts
+    assert behind - before == pytest.approx(10 / FPS, abs=0.5 / FPS)
+    assert at == pytest.approx(64 / FPS + before, abs=0.05)
+
+
+def test_halves_that_were_exchanged_are_told_in_the_order_of_what_they_show():
+    told = in_pieces(jobs_of("halves exchanged", 80108))
+    assert told is not None
+    (_, before), (_, behind) = told.scanned.parts
+    assert behind - before == pytest.approx(5.0, abs=0.5 / FPS)
+
+
+@pytest.mark.parametrize(("name", "seed"), [("mid", 80100), ("a second missing", 80102)])
+def test_a_video_without_a_cut_has_no_pieces_nor_one_whose_pieces_tell_nothing(name, seed):
+    assert in_pieces(jobs_of(name, seed)) is None
+
+
+def test_things_that_jump_by_themselves_are_no_cut():
+    for seed in range(80100, 80104):
+        for tracks in CLASSES["things that jump"](seed).tracks:
+            assert calm(Steps.of(tracks))
+
+
+@pytest.mark.parametrize(
+    ("name", "seed", "video", "still"),
+    [
+        ("freeze of 15", 80101, 1, True),  # the other one was said to lack frames
+        ("ten frames dropped, hard", 80104, 1, False),  # by a length that nobody knew
+        ("ten frames dropped, hard", 80117, 1, False),  # told by its pieces alone
+    ],
+)
+def test_what_a_video_shows_by_itself_says_which_clock_broke_and_where(name, seed, video, still):
+    world = CLASSES[name](seed)
+    found = synchronize(list(world.tracks))
+    assert found.ok and not found.breaks[1 - video]
+    (broke,) = found.breaks[video]
+    assert (broke.still > 0) == still and world.errors(found)[1].max() < 0.15
+
+
+def test_a_cut_that_holds_is_heard_whatever_else_says(monkeypatch):
+    tracks = list(CLASSES["mid"](80100).tracks)
+    assert synchronize(tracks).ok
+    monkeypatch.setattr("otsync.sync.verb.cut_where_it_holds", lambda answers, tracks, broken: {(0, 1)})
+    assert Status.BROKEN_CLOCK in synchronize(tracks).flags[1]

@@ -11,14 +11,15 @@ from hypothesis import strategies as st
 
 from otsync import synchronize
 from otsync.align.breaks import by_chance, partners
+from otsync.align.likelihood import LikelihoodScan
 from otsync.align.peaks import likely
 from otsync.align.returns import beside_returns, like_itself, return_is_liked
 from otsync.align.windows import local_curves
 from otsync.bench.trust.worlds import CLASSES
 from otsync.clocks.common import CommonClock
-from otsync.clocks.splines import TrackSplines
 from otsync.clocks.stillness import pause, stood_still
 from otsync.refine.gauss_newton import Fit
+from otsync.refine.splines import SplineRefine
 from otsync.simulate import simulate
 from otsync.simulate.effects import Drop, Freeze, In, SlowMotion
 from otsync.sync.breaks import (
@@ -32,8 +33,10 @@ from otsync.sync.breaks import (
     mended,
     sigma_of_part,
 )
-from otsync.sync.mending import confirmed
+from otsync.sync.mending import _by, confirmed
+from otsync.sync.pairs import Job, run
 from otsync.sync.verb import jump_sigma
+from otsync.sync.windows import Windows
 from otsync.types import Break, Clock, Offsets, Status, TrackSet, mended_frames, mended_times
 
 
@@ -170,18 +173,33 @@ def test_of_likely_offsets_no_two_are_near():
     assert likely(evidence, 2) == [3, 5, 7]
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.03])
-def test_what_rests_is_told_by_what_moves_otherwise(noise):
-    """A third of the tracks moves; the others have nothing but noise."""
+@pytest.mark.parametrize("noise", [0.0, 0.03, 0.1])
+@pytest.mark.parametrize("off", [-15, 0, 4, 15])
+def test_what_rests_is_told_by_what_moves_otherwise(noise, off):
+    """A third of the tracks moves; the others have nothing but noise. The pair may have the pause half a second off."""
     rng = np.random.default_rng(0)
     t = np.arange(90) / 30
     shown = np.where(t < 1, t, np.maximum(1.0, t - 20 / 30))
     x = np.zeros((30, 90, 3))
     x[:10, :, 0] = np.sin(4 * shown)
     x += noise * rng.normal(size=x.shape)
-    assert stood_still(TrackSplines(t, x), 1.0, 20 / 30)
+    assert stood_still(t, x, 1.0 + off / 30, 20 / 30) == pytest.approx(1.0, abs=0.0 if noise == 0 else 2.1 / 30)
     x[:10, :, 0] = np.sin(4 * t) + noise * rng.normal(size=(10, 90))
-    assert not stood_still(TrackSplines(t, x), 1.0, 20 / 30)
+    assert stood_still(t, x, 1.0 + off / 30, 20 / 30) is None
+
+
+def test_where_nothing_moves_or_little_is_seen_nothing_stood_still():
+    rng = np.random.default_rng(1)
+    t = np.arange(90) / 30
+    x = 0.1 * rng.normal(size=(30, 90, 3))
+    assert stood_still(t, 0 * x, 1.0, 0.5) is None
+    assert stood_still(t, np.full_like(x, np.nan), 1.0, 0.5) is None
+    x[:, :, 0] += np.sin(4 * np.where(t < 1, t, np.maximum(1.0, t - 0.5)))
+    assert stood_still(t, x, 1.0, 0.5) is not None
+    assert stood_still(t, x, 1.0, 0.05) is None  # of a frame and a half nobody can tell
+    assert stood_still(t, x, 1.0, 5.0) is None  # longer than the clip
+    x[:, 25:52] = np.nan
+    assert stood_still(t, x, 1.0, 0.5) is None
 
 
 def swinging(frozen: range, noise: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -488,3 +506,17 @@ def test_sigma_of_a_likely_length_is_what_it_is_off_by(whole, sigma, share):
     off = float(np.sqrt(np.mean((told - true) ** 2)))
     assert off == pytest.approx(float(np.sqrt(np.mean(known**2))), rel=0.1)
     assert off < share * sigma
+
+
+@pytest.mark.parametrize("returns", [0.0, 1.0])
+def test_windows_that_are_steady_lift_no_doubt_whether_motion_comes_back(returns):
+    a, b = CLASSES["mid"](80100).tracks
+    job = Job((0, 1), a, b, None, LikelihoodScan(), SplineRefine(), None)
+    answer = run(job)
+    even = Windows(
+        Clock(answer.refined.offset), np.arange(5.0), np.arange(-3.0, 4.0), np.eye(7)[[3] * 5], np.ones(5, bool)
+    )
+    assert even.steady
+    (said,) = _by(even, answer, job, {"returns": 0.0}, {"returns": returns})
+    assert (Status.BROKEN_CLOCK in said.refined.flags) == bool(returns)
+    assert said.scanned.stats["returns"] == returns
