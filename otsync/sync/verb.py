@@ -114,33 +114,14 @@ def synchronize(
     def judged(answers: Sequence[Answer]) -> Verdict:
         return judge(len(tracks), answers, chosen, centre, graph, refining.trust, refit)
 
+    rematched = times if matches is None else 0
     with blas_for(max(len(t) for t in tracks)):
-        verdict = judged(list(map(run, jobs)))
-        broken: dict[int, tuple[Break, ...]] = {}
-        jobs, verdict = mend_clocks(jobs, verdict, tracks, judged, map, ByMotion(), broken)
-        jobs, verdict = mend_by_cuts(jobs, verdict, tracks, judged, map, broken)
-        timed: set[Pair] = set()
-        if times and matches is None:
-            jobs, verdict, timed = mend_by_windows(jobs, verdict, tracks, judged, map, broken)
-            settled = contested(jobs, verdict, map)
-            if settled:
-                verdict = judged([settled.get(a.pair, a) for a in verdict.answers])
-        for _ in range(times if matches is None else 0):
-            again = [job for job in rematching(jobs, verdict) if job.pair not in timed]
-            if not again:
-                break
-            fresh = {answer.pair: answer for answer in map(run, again)}
-            verdict = judged([_still_broken(fresh.get(a.pair, a), a) for a in verdict.answers])
+        jobs, verdict, broken = _answered(jobs, tracks, judged, map, rematched)
         if isinstance(aligning, EpipolarScan):
-            sound = {a.pair: a.matches for a in verdict.answers if a.sound}
-            breaking = set(unsteady(aligning, tracks, sound, verdict.x))
-            if breaking:
-                verdict = judged([doubted(a) if breaking & set(a.pair) else a for a in verdict.answers])
+            verdict = _without_unsteady(verdict, tracks, aligning, judged)
         else:
             verdict = with_parts_checked(verdict, tracks, judged)
-            verdict = with_witnesses_heard(
-                verdict, jobs, broken, bool(times) and matches is None, refining.trust.parted, judged, map
-            )
+            verdict = with_witnesses_heard(verdict, jobs, broken, rematched > 0, refining.trust.parted, judged, map)
         cut = cut_where_it_holds(verdict.answers, original, broken)
         if cut:
             verdict = judged([doubted(a) if a.pair in cut else a for a in verdict.answers])
@@ -149,6 +130,52 @@ def synchronize(
         if lagged is not None:
             verdict = judged(lagged)
         return to_offsets(original, verdict, time.perf_counter() - started, broken, lags)
+
+
+def _answered(
+    jobs: list[Job],
+    tracks: list[TrackSet],
+    judged: Callable[[Sequence[Answer]], Verdict],
+    map: MapLike,
+    times: int,
+) -> tuple[list[Job], Verdict, dict[int, tuple[Break, ...]]]:
+    """All pairs answered, clocks that break put right (``tracks`` in place), and pairs matched once more at the times
+    that were found, so often.
+
+    Returns:
+        The work on the pairs as it is then, the verdict, and the breaks of each video that was mended.
+    """
+    broken: dict[int, tuple[Break, ...]] = {}
+    verdict = judged(list(map(run, jobs)))
+    jobs, verdict = mend_clocks(jobs, verdict, tracks, judged, map, ByMotion(), broken)
+    jobs, verdict = mend_by_cuts(jobs, verdict, tracks, judged, map, broken)
+    if not times:
+        return jobs, verdict, broken
+    jobs, verdict, timed = mend_by_windows(jobs, verdict, tracks, judged, map, broken)
+    settled = contested(jobs, verdict, map)
+    if settled:
+        verdict = judged([settled.get(a.pair, a) for a in verdict.answers])
+    for _ in range(times):
+        again = [job for job in rematching(jobs, verdict) if job.pair not in timed]
+        if not again:
+            break
+        fresh = {answer.pair: answer for answer in map(run, again)}
+        verdict = judged([_still_broken(fresh.get(a.pair, a), a) for a in verdict.answers])
+    return jobs, verdict, broken
+
+
+def _without_unsteady(
+    verdict: Verdict,
+    tracks: Sequence[TrackSet],
+    aligner: EpipolarScan,
+    judged: Callable[[Sequence[Answer]], Verdict],
+) -> Verdict:
+    """The verdict, with all pairs of videos doubted whose windows are off against all others alike."""
+    sound = {a.pair: a.matches for a in verdict.answers if a.sound}
+    breaking = set(unsteady(aligner, tracks, sound, verdict.x))
+    if not breaking:
+        return verdict
+    return judged([doubted(a) if breaking & set(a.pair) else a for a in verdict.answers])
 
 
 def with_parts_checked(
