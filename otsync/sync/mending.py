@@ -37,7 +37,7 @@ from .pairs import Job, run, without_answered_doubt
 from .places import NONE, parts_by_place
 from .rematching import NOISY, asks, at_each, at_peaks, evidence_of, winner
 from .verdict import NOTHING_COMMON, Answer, Verdict
-from .windows import EVERY, NEAR, Split, Windows, in_pieces, matches_of_parts
+from .windows import EVERY, NEAR, Pieces, Split, Windows, matches_of_parts
 
 log = logging.getLogger("otsync")
 
@@ -215,12 +215,15 @@ def mend_by_cuts(
     """:func:`mend_clocks` by pieces, of doubtful pairs whose videos look cut and were not mended."""
     doubtful = {a.pair for a in verdict.answers if not a.refined.status.ok}
     asked = [job for job in jobs if job.pair in doubtful and not broken.keys() & set(job.pair)]
-    told = {answer.pair: doubted(answer) for answer in map(in_pieces, asked) if answer is not None} if asked else {}
+    pieces = [found for job in asked if (found := Pieces.of(job)) is not None]
+    answers = list(map(run, [job for found in pieces for job in found.jobs])) if pieces else []
+    joined = [p.joined(before, behind) for p, before, behind in zip(pieces, answers[::2], answers[1::2], strict=True)]
+    told = {answer.pair: doubted(answer) for answer in joined if answer is not None}
     if not told:
         return jobs, verdict
     known = len(broken)
-    mended_jobs, found = mend_clocks(jobs, verdict, tracks, judged, map, ByCuts(told), broken)
-    return (mended_jobs, found) if len(broken) > known else (jobs, verdict)
+    mended_jobs, mended_verdict = mend_clocks(jobs, verdict, tracks, judged, map, ByCuts(told), broken)
+    return (mended_jobs, mended_verdict) if len(broken) > known else (jobs, verdict)
 
 
 def mend_by_windows(

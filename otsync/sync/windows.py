@@ -24,7 +24,7 @@ from ..match.synchronous import MOMENTS as MOST_MOMENTS
 from ..match.synchronous import SynchronousMatching, apart, joined, longest_seen, mutual, placed, rms_extent
 from ..match.verb import match
 from ..types import Clock, Matches, Status, TrackSet
-from .pairs import Job, run
+from .pairs import Job
 from .rematching import at_known_times, evidence_of
 from .verdict import Answer
 
@@ -315,31 +315,53 @@ def within(tracks: TrackSet, begin: float, end: float) -> TrackSet:
     return dataclasses.replace(tracks, visible=tracks.seen & inside)
 
 
-def in_pieces(job: Job) -> Answer | None:
-    """What a pair tells where one of its videos may be cut: both pieces of that video are matched and aligned, each by
-    itself, and are the parts of the answer. None where none may be cut, or a piece alone leaves any doubt.
+@dataclass(frozen=True)
+class Pieces:
+    """A pair of which one video may be cut, in the two pieces that the cut makes of it.
 
-    One offset does not suit a video that is cut, and under noise no peak of its scan stands out.
+    One offset does not suit a video that is cut, and under noise no peak of its scan stands out; each piece has one.
+
+    Args:
+        which: 0 where the first video is cut, 1 where the second one is. cut: s of its own clock.
     """
-    sharpest = [Steps.of(tracks).sharpest() for tracks in (job.a, job.b)]
-    k = int(np.argmax([size for _, size in sharpest]))
-    cut, size = sharpest[k]
-    if size < CALM:
-        return None
-    told = []
-    for begin, end in (-np.inf, cut), (cut, np.inf):
-        a, b = (within(tracks, begin, end) if n == k else tracks for n, tracks in enumerate((job.a, job.b)))
-        told.append(run(dataclasses.replace(job, a=a, b=b)))
-        if not told[-1].finite or not set(told[-1].refined.flags) <= OF_PIECES:
+
+    job: Job
+    which: int
+    cut: float
+
+    @classmethod
+    def of(cls, job: Job) -> Pieces | None:
+        """At the sharpest jolt of both videos; None where none may be a cut."""
+        sharpest = [Steps.of(tracks).sharpest() for tracks in (job.a, job.b)]
+        which = int(np.argmax([size for _, size in sharpest]))
+        cut, size = sharpest[which]
+        return None if size < CALM else cls(job, which, cut)
+
+    @property
+    def jobs(self) -> tuple[Job, Job]:
+        """The work on the pair, with what lies before the cut, and with what lies behind it."""
+        cut, a, b = self.cut, self.job.a, self.job.b
+        spans = (-np.inf, cut), (cut, np.inf)
+        if self.which == 0:
+            before, behind = (dataclasses.replace(self.job, a=within(a, *span)) for span in spans)
+        else:
+            before, behind = (dataclasses.replace(self.job, b=within(b, *span)) for span in spans)
+        return before, behind
+
+    def joined(self, before: Answer, behind: Answer) -> Answer | None:
+        """The better of the answers of both pieces, with both as its parts; None where one of them leaves a doubt."""
+        told = before, behind
+        if not all(a.finite and set(a.refined.flags) <= OF_PIECES for a in told):
             return None
-    first, second = (answer.refined.offset for answer in told)
-    if abs(second - first) < LEAST_JUMP:
-        return None
-    begin, turn = float(job.a.times[0]), cut if k == 0 else cut + first
-    (earliest, latest) = job.b.times[[0, -1]]
-    if k == 1 and latest - earliest < 2 * (first - second):  # b goes back so far that a shows the later piece first
-        first, second, turn = second, first, float(earliest) + first
-    parts = np.array([[begin, first], [turn, second]])
-    best = max(told, key=evidence_of)
-    scanned = dataclasses.replace(best.scanned, parts=parts)
-    return dataclasses.replace(best, matches=matches_of_parts(job, parts, 1.0), scanned=scanned)
+        first, second = (a.refined.offset for a in told)
+        if abs(second - first) < LEAST_JUMP:
+            return None
+        begin, turn = float(self.job.a.times[0]), self.cut if self.which == 0 else self.cut + first
+        earliest, latest = (float(t) for t in self.job.b.times[[0, -1]])
+        if self.which == 1 and latest - earliest < 2 * (first - second):
+            # b goes back so far that a shows the later piece first
+            first, second, turn = second, first, earliest + first
+        parts = np.array([[begin, first], [turn, second]])
+        best = max(told, key=evidence_of)
+        matches = matches_of_parts(self.job, parts, 1.0)
+        return dataclasses.replace(best, matches=matches, scanned=dataclasses.replace(best.scanned, parts=parts))

@@ -11,9 +11,9 @@ from otsync.bench.trust.worlds import CLASSES
 from otsync.clocks.cuts import BLOCK, Steps, alone, calm, unexplained
 from otsync.refine.splines import SplineRefine
 from otsync.sync.mending import cut_where_it_holds
-from otsync.sync.pairs import Job
+from otsync.sync.pairs import Job, run
 from otsync.sync.verdict import Answer
-from otsync.sync.windows import in_pieces
+from otsync.sync.windows import Pieces
 from otsync.types import Alignment, Break, TrackSet
 from tests.otsync.refine.test_common_error import smooth
 
@@ -149,6 +149,12 @@ def jobs_of(name: str, seed: int) -> Job:
     """The work on the first two videos of a world."""
     a, b = CLASSES[name](seed).tracks[:2]
     return Job((0, 1), a, b, None, LikelihoodScan(), SplineRefine(), None)
+
+
+def in_pieces(job: Job) -> Answer | None:
+    """What the pieces tell of a pair; None where none may be cut, or they leave a doubt."""
+    pieces = Pieces.of(job)
+    return None if pieces is None else pieces.joined(*(run(piece) for piece in pieces.jobs))
 
 
 def test_the_pieces_of_a_video_that_is_cut_tell_an_offset_each():
