@@ -18,16 +18,13 @@ NEAR = 30
 """Frames on either side, behind those, whose steps tell how far apart such lines usually are."""
 
 SUDDEN = 1.5
-"""Times the largest of these that the step of a cut is."""
+"""Times the largest of these that the step of a cut is. What jumps in the scene looks so, too: in a recording of
+basketball all players turn at once, and eleven of fifteen cameras have up to 1.8, and 3.6 in pixels."""
 
 CALM = 1.3
 """Up to which no step is a cut. Of videos without one (seeds 80100 to 80103, all classes) five have more, 1.53 at most,
 where a freeze or a slow motion begins, and of few tracks; brutal noise has 1.46 once (80100 to 80107). Of 44 that are
 cut 41 have more than 1.8; two that lack ten frames under hard noise, and one that lacks a stride, have 1.2."""
-
-HELD = 2.2
-"""Jolts from which on a cut that no break explains speaks against an answer. Depth that is made in blocks of frames
-jumps between them: of fifteen cameras of basketball, lifted by stereo, eleven have jolts of 1.5 to 1.81 there."""
 
 FEWEST = 5
 """Tracks that must be seen in all frames beside a step, and other steps that must be known."""
@@ -72,8 +69,8 @@ class Steps:
             tracks.times, np.divide(apart, largest, out=np.full(len(apart), np.nan), where=known & (largest > 0))
         )
 
-    def cuts(self, least: float = SUDDEN) -> Int[np.ndarray, " K"]:
-        """The frames behind the cuts, of jolts that are larger than ``least``.
+    def cuts(self) -> Int[np.ndarray, " K"]:
+        """The frames behind the cuts.
 
         A recorder that was paused, frames that were lost, a picture that froze and then caught up: whatever happened to
         the clock, it happened here. A freeze and its end, where the file goes on with what came next, are no cuts.
@@ -81,7 +78,7 @@ class Steps:
         padded = np.pad(np.nan_to_num(self.jolts), BESIDE - 1)
         beside = sliding_window_view(padded, 2 * BESIDE - 1).max(1) if len(self.jolts) else padded
         # lines beside a cut are laid across it
-        sudden = np.flatnonzero((self.jolts > least) & (self.jolts == beside))
+        sudden = np.flatnonzero((self.jolts > SUDDEN) & (self.jolts == beside))
         return np.zeros(0, int) if len(sudden) * RHYTHM > len(self.times) else sudden + 1
 
     def cut_near(self, at: float, within: float) -> float | None:
@@ -96,12 +93,6 @@ class Steps:
             return 0.0, 0.0
         k = int(np.nanargmax(self.jolts))
         return float(self.times[k + 1]), float(self.jolts[k])
-
-    def largest(self, begin: float, end: float) -> float:
-        """The largest jolt between two moments; 0 where nothing is known."""
-        behind = self.times[1:]
-        inside = self.jolts[(behind >= begin) & (behind <= end)]
-        return float(np.nanmax(inside)) if np.isfinite(inside).any() else 0.0
 
 
 def _apart(tracks: TrackSet) -> Float[np.ndarray, " T-1"]:
@@ -136,26 +127,15 @@ def _jumps_beside(x: Float[np.ndarray, "M T 3"]) -> Bool[np.ndarray, "M S"]:
 
 
 EXPLAINED = 0.2
-"""Seconds within which a break explains a cut, and another video's jolt a jolt: both are measured by motion, which is
-slow."""
+"""Seconds within which a break explains a cut: it is measured by motion, which is slow."""
 
 
 def unexplained(steps: Steps, breaks: Sequence[Break]) -> Int[np.ndarray, " K"]:
-    """The frames behind the clear cuts (:data:`HELD`) of a video that none of the breaks of its clock explains."""
+    """The frames behind the cuts of a video that none of the breaks of its clock explains."""
     known = np.array([moment for b in breaks for moment in (b.at, b.at - b.still)])
-    found = steps.cuts(HELD)
+    found = steps.cuts()
     far = [not len(known) or bool(np.abs(known - steps.times[k]).min() > EXPLAINED) for k in found]
     return found[np.array(far, bool)]
-
-
-def alone(other: Steps, at: float) -> bool:
-    """Whether another video sees the moment of a cut, on its own clock, and shows nothing there: what jumps in the
-    scene jumps for all.
-    """
-    if not other.times.min() < at < other.times.max():
-        return False
-    seen = other.largest(at - EXPLAINED, at + EXPLAINED)
-    return 0 < seen < CALM
 
 
 def calm(steps: Steps) -> bool:

@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 
 from ..clocks.common import nominal_fps
-from ..clocks.cuts import Steps, alone, calm, unexplained
+from ..clocks.cuts import Steps, calm, unexplained
 from ..compute.threads import MapLike
 from ..refine.verb import refine
 from ..types import Break, Clock, Status, TrackSet, in_order, mended_times
@@ -383,26 +383,29 @@ def doubted(answer: Answer) -> Answer:
 
 
 def cut_where_it_holds(
-    answers: Sequence[Answer], tracks: Sequence[TrackSet], broken: Mapping[int, tuple[Break, ...]]
+    answers: Sequence[Answer],
+    filmed: Sequence[TrackSet],
+    tracks: Sequence[TrackSet],
+    broken: Mapping[int, tuple[Break, ...]],
 ) -> set[Pair]:
-    """The pairs in whose overlap one video alone shows a cut, and no break of its clock explains it.
+    """The pairs in whose overlap a video shows a cut that no break of its clock explains, and whose answer does not
+    hold beside it. What jumps in the scene is no cut: there it holds.
 
     Args:
-        tracks: as they were filmed, on their videos' own clocks.
+        filmed: as they were filmed, on their videos' own clocks. tracks: on the clocks of the answers.
     """
-    own = [Steps.of(t) for t in tracks]
-    left = [unexplained(steps, broken.get(v, ())) for v, steps in enumerate(own)]
-    steps = [
-        dataclasses.replace(steps, times=mended_times(steps.times, broken.get(v, ()))[0]) for v, steps in enumerate(own)
-    ]
+    shown = []
+    for v, video in enumerate(filmed):
+        steps, breaks = Steps.of(video), broken.get(v, ())
+        shown.append(mended_times(steps.times, breaks)[0][unexplained(steps, breaks)])
     found = set()
     for answer in answers:
-        if not answer.finite or not any(len(left[v]) for v in answer.pair):
+        a, b = answer.pair
+        if not answer.finite or not len(shown[a]) + len(shown[b]):
             continue
         clock = Clock(answer.refined.offset, answer.refined.rate)
-        a, b = answer.pair
-        for one, other, there in (a, b, clock.own), (b, a, clock.world):
-            if any(alone(steps[other], there(float(steps[one].times[k]))) for k in left[one]):
+        for moment in (*shown[a], *clock.world(shown[b])):
+            if not runs_on(answer, tracks[a], tracks[b], float(moment), float(moment)):
                 found.add(answer.pair)
     return found
 

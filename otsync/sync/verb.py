@@ -122,7 +122,7 @@ def synchronize(
         else:
             verdict = with_parts_checked(verdict, tracks, judged)
             verdict = with_witnesses_heard(verdict, jobs, broken, rematched > 0, refining.trust.parted, judged, map)
-        cut = cut_where_it_holds(verdict.answers, original, broken)
+        cut = cut_where_it_holds(verdict.answers, original, tracks, broken)
         if cut:
             verdict = judged([doubted(a) if a.pair in cut else a for a in verdict.answers])
         lags = list(map(lag_of, tracks))

@@ -8,8 +8,9 @@ import pytest
 from otsync import Matches, Status, synchronize
 from otsync.align.likelihood import LikelihoodScan
 from otsync.bench.trust.worlds import CLASSES
-from otsync.clocks.cuts import BLOCK, Steps, alone, calm, unexplained
+from otsync.clocks.cuts import BLOCK, Steps, calm, unexplained
 from otsync.refine.splines import SplineRefine
+from otsync.sync.breaks import mended
 from otsync.sync.mending import cut_where_it_holds
 from otsync.sync.pairs import Job, run
 from otsync.sync.verdict import Answer
@@ -85,15 +86,6 @@ def test_a_break_explains_the_cut_beside_it_alone():
     assert len(unexplained(steps_of(90), ())) == 0
 
 
-def test_what_jumps_for_another_video_too_is_no_cut():
-    assert alone(steps_of(90), 1.5)
-    assert alone(steps_of(90, (45, 1.2)), 1.5)  # noise
-    assert not alone(steps_of(90, (45, 1.6)), 1.5)
-    assert not alone(steps_of(90, (48, 3.0)), 1.5)  # a tenth of a second later
-    assert alone(steps_of(90, (60, 3.0)), 1.5)
-    assert not alone(steps_of(90), 5.0)  # it does not film then
-
-
 def test_the_sharpest_and_the_nearest_cut():
     steps = steps_of(300, (60, 1.7), (75, 4.0))
     assert steps.sharpest() == (75 / FPS, 4.0)
@@ -101,7 +93,6 @@ def test_the_sharpest_and_the_nearest_cut():
     assert calm(steps_of(90)) and calm(steps_of(90, (40, 1.2))) and not calm(steps_of(90, (40, 1.35)))
     nothing = Steps.of(TrackSet(moving(90)[:2], fps=FPS))
     assert nothing.sharpest() == (0.0, 0.0) and calm(nothing) and len(nothing.cuts()) == 0
-    assert nothing.largest(0.0, 9.0) == 0.0 and not alone(nothing, 1.5)
 
 
 @pytest.mark.parametrize("noise", [0.002, 0.01])
@@ -129,20 +120,25 @@ def test_a_clock_that_is_mended_where_its_video_is_cut_is_trusted(name):
     assert world.errors(found)[1].max() < 0.2
 
 
-def test_a_cut_speaks_where_both_videos_were_filming_and_no_break_explains_it():
-    x = moving()
-    even, cut = TrackSet(x, fps=FPS), TrackSet(np.delete(x, np.arange(50, 65), axis=1), fps=FPS)
-    none = Matches(np.zeros((0, 2), int))
+def test_a_cut_speaks_where_the_answer_does_not_hold_beside_it():
+    x = moving(240)
+    lacking = np.delete(x, np.arange(100, 115), axis=1)
+    even, cut = TrackSet(x, fps=FPS), TrackSet(lacking, fps=FPS)
+    same = Matches(np.stack([np.arange(len(x))] * 2, 1), np.zeros(len(x)))
 
-    def said(offset: float, tracks=(even, cut), broken=None) -> bool:
+    def said(offset: float, filmed=(even, cut), tracks=None, broken=None) -> bool:
         told = Alignment(offset, fps=FPS)
-        return cut_where_it_holds([Answer((0, 1), none, told, told)], tracks, broken or {}) == {(0, 1)}
+        return bool(cut_where_it_holds([Answer((0, 1), same, told, told)], filmed, tracks or filmed, broken or {}))
 
-    assert said(0.0) and said(-1.6)
-    assert not said(-1.7) and not said(2.4)  # a has ended, or has not begun, when b is cut at 1.67 s
-    assert said(0.0, (cut, even)) and not said(1.7, (cut, even))
-    assert not said(0.0, broken={1: (Break(50 / FPS, 0.5),)}) and said(0.0, broken={0: (Break(50 / FPS, 0.5),)})
-    assert not said(float("nan"))
+    assert said(0.0) and said(0.5)  # right on one side of it
+    assert said(0.0, (cut, even)) and said(-0.5, (cut, even))
+    assert not said(0.0, (cut, cut))  # the scene jumped, for both
+    assert not said(0.0, (even, even)) and not said(float("nan"))
+    assert not said(-20.0) and not said(20.0)  # nobody else was filming
+    lost = (Break(100 / FPS, 0.5),)
+    assert not said(0.0, tracks=(even, mended(cut, lost)), broken={1: lost})
+    elsewhere = (Break(150 / FPS, 0.5),)
+    assert said(0.0, tracks=(even, mended(cut, elsewhere)), broken={1: elsewhere})
 
 
 def jobs_of(name: str, seed: int) -> Job:
@@ -202,5 +198,5 @@ def test_what_a_video_shows_by_itself_says_which_clock_broke_and_where(name, see
 def test_a_cut_that_holds_is_heard_whatever_else_says(monkeypatch):
     tracks = list(CLASSES["mid"](80100).tracks)
     assert synchronize(tracks).ok
-    monkeypatch.setattr("otsync.sync.verb.cut_where_it_holds", lambda answers, tracks, broken: {(0, 1)})
+    monkeypatch.setattr("otsync.sync.verb.cut_where_it_holds", lambda answers, filmed, tracks, broken: {(0, 1)})
     assert Status.BROKEN_CLOCK in synchronize(tracks).flags[1]
