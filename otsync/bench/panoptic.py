@@ -164,17 +164,18 @@ WATCHED = (
     "graph_apart_max",
     "all_cameras_mean",
     "all_cameras_apart",
+    "flagged",
 )
 
 
 def figures_of(rows: list[dict[str, Any]], cameras: tuple[str, ...]) -> dict[str, float]:
-    """What the gate compares: errors by route, of this set of cameras, and trusted answers that are wrong."""
+    """What the gate compares, by route, of this set of cameras: errors, doubts, and trusted answers that are wrong."""
     who = f"{len(cameras)} cameras"
     return {f"{who}, {r['route']}: {key}": r[key] for r in rows for key in (*WATCHED, "trusted_wrong")}
 
 
 def worse(key: str, measured: float, baseline: float) -> bool:
-    """Errors may grow by a fifth and .01 frame; there may be no more trusted answers that are wrong."""
+    """Errors, and the share of doubted pairs, may grow by a fifth and .01; no more trusted answers may be wrong."""
     if key.endswith("trusted_wrong"):
         return measured > baseline
     return measured > 1.2 * baseline + 0.01
