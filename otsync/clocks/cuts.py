@@ -21,6 +21,10 @@ SUDDEN = 1.5
 """Times the largest of these that the step of a cut is. What jumps in the scene looks so, too: in a recording of
 basketball all players turn at once, and eleven of fifteen cameras have up to 1.8, and 3.6 in pixels."""
 
+CLEAR = 2.2
+"""The same where a cut alone speaks against an answer: above all that was seen of things that jump in recordings with
+depth. A cut with less says where to look, and must prove itself there."""
+
 CALM = 1.3
 """Up to which no step is a cut. Of videos without one (seeds 80100 to 80103, all classes) five have more, 1.53 at most,
 where a freeze or a slow motion begins, and of few tracks; brutal noise has 1.46 once (80100 to 80107). Of 44 that are
@@ -131,9 +135,10 @@ EXPLAINED = 0.2
 
 
 def unexplained(steps: Steps, breaks: Sequence[Break]) -> Int[np.ndarray, " K"]:
-    """The frames behind the cuts of a video that none of the breaks of its clock explains."""
+    """The frames behind the clear cuts of a video that none of the breaks of its clock explains."""
     known = np.array([moment for b in breaks for moment in (b.at, b.at - b.still)])
     found = steps.cuts()
+    found = found[steps.jolts[found - 1] > CLEAR]
     far = [not len(known) or bool(np.abs(known - steps.times[k]).min() > EXPLAINED) for k in found]
     return found[np.array(far, bool)]
 

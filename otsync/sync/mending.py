@@ -388,8 +388,8 @@ def cut_where_it_holds(
     tracks: Sequence[TrackSet],
     broken: Mapping[int, tuple[Break, ...]],
 ) -> set[Pair]:
-    """The pairs in whose overlap a video shows a cut that no break of its clock explains, and whose answer does not
-    hold beside it. What jumps in the scene is no cut: there it holds.
+    """The pairs in whose overlap a video shows a clear cut that no break of its clock explains, and whose answer does
+    not hold beside it. What jumps in the scene is no cut: there it holds.
 
     Args:
         filmed: as they were filmed, on their videos' own clocks. tracks: on the clocks of the answers.

@@ -200,3 +200,19 @@ def test_a_cut_that_holds_is_heard_whatever_else_says(monkeypatch):
     assert synchronize(tracks).ok
     monkeypatch.setattr("otsync.sync.verb.cut_where_it_holds", lambda answers, filmed, tracks, broken: {(0, 1)})
     assert Status.BROKEN_CLOCK in synchronize(tracks).flags[1]
+
+
+def test_cuts_are_sought_in_what_was_filmed(monkeypatch):
+    """Not on a clock that was mended, where their moments are others."""
+    asked = []
+
+    def spy(answers, filmed, tracks, broken):
+        asked.append((filmed[1].times, tracks[1].times, broken))
+        return cut_where_it_holds(answers, filmed, tracks, broken)
+
+    monkeypatch.setattr("otsync.sync.verb.cut_where_it_holds", spy)
+    world = CLASSES["a second missing"](80103)
+    synchronize(list(world.tracks))
+    ((filmed, mended_clock, broken),) = asked
+    np.testing.assert_array_equal(filmed, world.tracks[1].times)
+    assert len(broken[1]) == 1 and mended_clock[-1] > filmed[-1] + 0.9
