@@ -77,7 +77,7 @@ class Protocol:
 
     pairs: int = 24
     graph_cameras: int = 8
-    graph_seeds: int = 3
+    graph_seeds: int = 8
     graph_frames: int = 120
     largest: int = 1
     matching: int = 24

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from ..clocks.common import nominal_fps, on_clock, strongest
 from ..geometry import fundamentals, seen_pixels
@@ -30,8 +30,11 @@ LEAST_SEEN, LEAST_PAIRS = 12 / 30, 3
 
 LEAST_GAIN, LEAST_SHARE = 50.0, 0.25
 """Nats, and share of the rise over the typical offset, by which another offset must suit two windows in a row better.
-Basketball: without a break at most 49 nats (12 pairs) and none (9 sets of four cameras); with ten frames dropped or
-fifteen frozen 60 and more in 19 of 24 pairs, and 230 and more in sets of four."""
+Whole clips of basketball: sound cameras have less in 65 of 70 pairs and in 16 of 16 sets of four, those with ten frames
+dropped or fifteen frozen more in 51 of 60 and 15 of 16 (seeds 21900-21969, 23900-23915)."""
+
+SAME = 3 / 30
+"""Seconds within which a later or an earlier window has the same offset."""
 
 AGREED = 0.9
 """Root sums of squares of its pairs' gains that their sum must reach; that of one pair alone is 1. Matches of a few
@@ -122,12 +125,13 @@ def _some(matches: Matches) -> Matches:
 
 def _gain(curves: Sequence[Float[np.ndarray, "W D"]], fps: float) -> float:
     """Nats that other offsets have beyond the answer, summed over every two windows in a row where that is more than
-    chance has.
+    chance has, and where it goes on to an end of what was filmed: a rhythm suits some windows by chance, but a clock
+    that broke is off from there on, or was up to there.
     """
     if not curves:
         return 0.0
-    pairs = np.stack(curves)
-    pairs = pairs[:, :-1] + pairs[:, 1:]
+    single = np.stack(curves)
+    pairs = single[:, :-1] + single[:, 1:]
     total = pairs.sum(0)
     middle = total.shape[1] // 2
     near = np.flatnonzero(np.abs(np.arange(total.shape[1]) - middle) <= NEAR * fps)
@@ -138,4 +142,24 @@ def _gain(curves: Sequence[Float[np.ndarray, "W D"]], fps: float) -> float:
     # a curve that still rises at its end tells of no offset
     inside = np.abs(best - middle) < middle - 1
     agreed = gain >= AGREED * np.sqrt((each**2).sum(0))
-    return float(gain[inside & agreed & (gain > LEAST_GAIN) & (gain > LEAST_SHARE * rise)].sum())
+    told = inside & agreed & (gain > LEAST_GAIN) & (gain > LEAST_SHARE * rise)
+    summed, same = single.sum(0), round(SAME * fps)
+    lasting = [told[k] and _lasts(summed, int(k), int(best[k]), near, same) for k in window]
+    return float(gain[lasting].sum())
+
+
+def _lasts(total: Float[np.ndarray, "W D"], first: int, best: int, answer: Int[np.ndarray, " A"], same: int) -> bool:
+    """Whether no window of the two from ``first`` on speaks for the answer, and the sum of all up to them, or of all
+    from them on, for the same other offset.
+
+    Args:
+        best: of these two, a column; ``same`` columns on either side are the same offset. answer: the answer's columns.
+    """
+    there = slice(max(best - same, 0), best + same + 1)
+    each = total[first : first + 2]
+    ends = np.stack([total[: first + 2].sum(0), total[first:].sum(0)])
+
+    def gained(windows: Float[np.ndarray, "K D"]) -> Float[np.ndarray, " K"]:
+        return windows[:, there].max(1) - windows[:, answer].max(1)
+
+    return bool((gained(each) >= 0).all() and (gained(ends) > LEAST_GAIN).any())

@@ -113,6 +113,22 @@ BREAKS = (
         "a clock breaks although its pairs contradict each other about that",
     ),
     Break(
+        "steady-one-window-decides",
+        "otsync/epipolar/steady.py",
+        "(gained(each) >= 0).all()",
+        "True",
+        ("tests/otsync/epipolar/test_steady.py",),
+        "a clock breaks by what happens in one window",
+    ),
+    Break(
+        "steady-anywhere",
+        "otsync/epipolar/steady.py",
+        "(gained(ends) > LEAST_GAIN).any()",
+        "True",
+        ("tests/otsync/epipolar/test_steady.py",),
+        "a clock breaks by a rhythm that suits the middle",
+    ),
+    Break(
         "audit-averages-everything",
         "otsync/recordings/audit.py",
         "own = np.maximum(common**2, SHARED * sigma**2)",

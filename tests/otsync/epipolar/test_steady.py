@@ -97,3 +97,29 @@ def test_a_clock_breaks_where_its_pairs_agree_that_it_does(nats, breaks):
     told = [(x, 0.0) for x in nats] + [(-200.0, -200.0)] * 3
     found = unsteady(Told({10 + n: x for n, x in enumerate(told)}), tracks, matches, np.zeros(4))
     assert found == [3] * breaks
+
+
+class InWindows:
+    """A scan of which each window in turn says of offsets 12 frames later what a list says."""
+
+    def __init__(self, nats: list[float]):
+        self.nats = iter(nats)
+
+    def evidence(self, part, xb, F, pairs, lags, fps, unit, weight):
+        return next(self.nats) * np.clip(1 - np.abs(lags - lags[len(lags) // 2] - 12) / 8, 0, 1)
+
+
+@pytest.mark.parametrize(
+    "nats, breaks",
+    [
+        ([60.0, 60, -90, -90, -90], True),
+        ([-90.0, -90, -90, 60, 60], True),
+        ([90.0, -20, -90, -90, -90], False),  # what happened in one window alone
+        ([-90.0, 60, 60, -90, -90], False),  # in the middle, as a rhythm suits it
+        ([60.0, 60, -90, 0, 0], True),
+    ],
+)
+def test_a_clock_that_broke_is_off_up_to_an_end(nats, breaks):
+    tracks = filmed([np.arange(105.0)] * 2)
+    same = Matches(np.stack([np.arange(10)] * 2, 1))
+    assert unsteady(InWindows(nats), tracks, {(0, 1): same}, np.zeros(2)) == [1] * breaks
