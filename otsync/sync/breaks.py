@@ -14,6 +14,7 @@ import numpy as np
 
 from ..clocks.common import readable, strongest
 from ..clocks.cuts import Steps
+from ..clocks.lengths import jumping, lasting
 from ..clocks.splines import TrackSplines
 from ..clocks.stillness import AROUND, pause, stood_still
 from ..refine.gauss_newton import Fit, fit_clock
@@ -40,13 +41,6 @@ ENOUGH = 15
 
 BACK = 1.5
 """Seconds that a video must go back by to be taken for cut; less is lost frames."""
-
-WHOLE, PAUSED_WHOLE = 0.8, 0.98
-"""How likely it is that lost frames are a whole number, and that repeated ones are. A camera whose clock runs on while
-frames are lost loses whole ones; a recorder that paused goes on anywhere."""
-
-ROUNDING, MOST_FRAMES = 1e-6, 3.0
-"""Frames: a sigma below the first is that, and one above the second tells no whole number."""
 
 SIGMAS = 3.0
 """By which a pause that is counted may differ from what a pair measures, or by a frame and a half."""
@@ -166,44 +160,6 @@ def _counted(shown: Raw, start: float, length: float, sigma: float, frame: float
     lasts = round((found[1] - found[0]) / frame) * frame
     near = max(1.5 * frame, SIGMAS * sigma if math.isfinite(sigma) else 0.0)
     return Break(found[1], -lasts, lasts, 0.0) if abs(lasts - length) <= near else None
-
-
-def lasting(start: float, length: float, sigma: float, frame: float) -> Break:
-    """A pause from ``start`` on, of the likeliest length, in whole frames where nothing tells how well it is known: all
-    in s.
-    """
-    if not math.isfinite(sigma):
-        length = round(length / frame) * frame
-    length, sigma = in_frames(length, sigma, frame, PAUSED_WHOLE)
-    return Break(start + length, -length, length, sigma)
-
-
-def jumping(at: float, jump: float, sigma: float, frame: float) -> Break:
-    """A clock that jumps as lost frames and cuts make it, by the likeliest length: all in s."""
-    jump, sigma = in_frames(jump, sigma, frame, WHOLE)
-    return Break(at, jump, 0.0, sigma)
-
-
-def in_frames(length: float, sigma: float, frame: float, whole: float) -> tuple[float, float]:
-    """The mean and one standard deviation, s, of a length that was measured, where it is a whole number of frames with
-    the probability ``whole``, each as likely as the next, and else any length.
-
-    A sigma of nan (its own parts cannot tell) stays.
-    """
-    if not math.isfinite(sigma):
-        return length, sigma
-    known = max(sigma / frame, ROUNDING)
-    if known > MOST_FRAMES:
-        return length, sigma  # whole numbers are too dense to tell
-    told = length / frame
-    values = np.round(told) + np.arange(-np.ceil(6 * known), np.ceil(6 * known) + 1)
-    each = math.log(whole) - math.log(known * math.sqrt(2 * math.pi)) - (values - told) ** 2 / (2 * known**2)
-    each = np.append(each, math.log1p(-whole))
-    weight = np.exp(each - each.max())
-    weight /= weight.sum()
-    mean = float(weight @ np.append(values, told))
-    variance = float(weight @ (np.append(values, told) - mean) ** 2 + weight[-1] * known**2)
-    return mean * frame, math.sqrt(variance) * frame
 
 
 def _offsets(

@@ -15,6 +15,7 @@ import numpy as np
 
 from ..clocks.common import nominal_fps
 from ..clocks.cuts import Steps, calm, unexplained
+from ..clocks.lengths import jumping, lasting
 from ..compute.threads import MapLike
 from ..refine.verb import refine
 from ..types import Break, Clock, Status, TrackSet, in_order, mended_times
@@ -25,8 +26,6 @@ from .breaks import (
     Seen,
     Suspect,
     culprit,
-    jumping,
-    lasting,
     mended,
     remeasured,
     runs_on,

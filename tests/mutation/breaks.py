@@ -451,10 +451,10 @@ BREAKS = (
     ),
     Break(
         "breaks-whole-frames-only",
-        "otsync/sync/breaks.py",
+        "otsync/clocks/lengths.py",
         "each = np.append(each, math.log1p(-whole))",
         "each = np.append(each, -np.inf)",
-        ("tests/otsync/sync/test_breaks.py",),
+        ("tests/otsync/clocks/test_lengths.py",),
         "a jump that is clearly no whole number of frames is made one",
     ),
     Break(
