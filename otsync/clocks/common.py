@@ -85,6 +85,12 @@ def common_clock(a: TrackSet, b: TrackSet, matches: Matches) -> CommonClock:
     return CommonClock(xa, xb, fps, float(a.times[0] - b.times[0]), float(a.times[0]))
 
 
+def within(tracks: TrackSet, begin: float, end: float) -> TrackSet:
+    """The tracks, seen only from ``begin`` to ``end`` s of their clock."""
+    inside = (tracks.times >= begin) & (tracks.times < end)
+    return replace(tracks, visible=tracks.seen & inside)
+
+
 def strongest(matches: Matches, limit: int) -> Matches:
     """At most ``limit`` matches, the best by score in their given order; ties are drawn by a fixed shuffle."""
     if len(matches) <= limit:

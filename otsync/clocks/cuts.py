@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.lib.stride_tricks import sliding_window_view
 
+from ..geometry import seen_pixels
 from ..types import Break, TrackSet
 
 BESIDE = 5
@@ -63,7 +64,18 @@ class Steps:
     @classmethod
     def of(cls, tracks: TrackSet) -> Steps:
         """Of tracks with positions; of others nothing is known."""
-        apart = _apart(tracks)
+        if tracks.xyz is None:
+            return cls._of(tracks, np.full(max(tracks.n_frames - 1, 0), np.nan))
+        return cls._of(tracks, _apart(lambda frames: tracks.positions(frames=frames), tracks.n_frames))
+
+    @classmethod
+    def in_pixels(cls, tracks: TrackSet) -> Steps:
+        """Of tracks with pixels; a camera that is jerked looks cut, too."""
+        x = seen_pixels(tracks)
+        return cls._of(tracks, _apart(lambda frames: x[:, frames], tracks.n_frames))
+
+    @classmethod
+    def _of(cls, tracks: TrackSet, apart: Float[np.ndarray, " T-1"]) -> Steps:
         padded = np.pad(apart, NEAR, constant_values=np.nan)
         late = [k for k in range(-NEAR, NEAR + 1) if abs(k) >= BESIDE]
         beside = np.stack([padded[NEAR + k : NEAR + k + len(apart)] for k in late])
@@ -99,16 +111,18 @@ class Steps:
         return float(self.times[k + 1]), float(self.jolts[k])
 
 
-def _apart(tracks: TrackSet) -> Float[np.ndarray, " T-1"]:
-    """The distances, world units; nan where few tracks are seen on both sides."""
-    told = np.full(max(tracks.n_frames - 1, 0), np.nan)
-    if tracks.xyz is None:
-        return told
+def _apart(part_of: Callable[[slice], Float[np.ndarray, "M F D"]], n_frames: int) -> Float[np.ndarray, " T-1"]:
+    """The distances, in units of the coordinates; nan where few tracks are seen on both sides.
+
+    Args:
+        part_of: coordinates of the tracks in some frames, nan where not seen.
+    """
+    told = np.full(max(n_frames - 1, 0), np.nan)
     at = np.arange(BESIDE) + 0.5
     one_side = 1 / BESIDE - at.mean() * (at - at.mean()) / np.square(at - at.mean()).sum()  # the line's value at 0
     weight = np.concatenate([-one_side[::-1], one_side])
     for first in range(0, len(told) - len(weight) + 2, BLOCK):
-        x = tracks.positions(frames=slice(first, first + BLOCK + len(weight) - 1))
+        x = part_of(slice(first, first + BLOCK + len(weight) - 1))
         steps = x.shape[1] - len(weight) + 1
         away = sum(w * x[:, k : k + steps] for k, w in enumerate(weight))
         square = np.square(away).sum(2)
@@ -122,7 +136,7 @@ def _apart(tracks: TrackSet) -> Float[np.ndarray, " T-1"]:
     return told
 
 
-def _jumps_beside(x: Float[np.ndarray, "M T 3"]) -> Bool[np.ndarray, "M S"]:
+def _jumps_beside(x: Float[np.ndarray, "M T D"]) -> Bool[np.ndarray, "M S"]:
     """Which tracks jump by themselves within the frames that lines are laid through, beside the step in question."""
     length = np.sqrt(np.square(np.diff(x, axis=1)).sum(2))
     around = sliding_window_view(length, 2 * BESIDE - 1, axis=1)

@@ -166,7 +166,27 @@ def pause(
     return (float(times[i]), float(times[j])) if clear and not rhythm and beside > 0 else None
 
 
-def mean_steps(x: Float[np.ndarray, "M T 3"]) -> Float[np.ndarray, " T-1"]:
+AT_REST = 0.01
+"""A picture that stands still is at rest where its mean square steps are less than this share of the median."""
+
+
+def pauses(x: Float[np.ndarray, "M T D"]) -> list[tuple[int, int]]:
+    """The first and the last frame of each time that all tracks are at rest, though they mostly are not; nobody guesses
+    when that is.
+
+    Args:
+        x: coordinates of the tracks, nan where not seen.
+    """
+    steps = mean_steps(x)
+    known = steps[np.isfinite(steps)]
+    if not len(known):
+        return []
+    rest = np.concatenate([[False], steps < AT_REST * float(np.median(known)), [False]])
+    turns = np.flatnonzero(rest[1:] != rest[:-1])
+    return [(int(i), int(j)) for i, j in turns.reshape(-1, 2) if j - i >= FEWEST]
+
+
+def mean_steps(x: Float[np.ndarray, "M T D"]) -> Float[np.ndarray, " T-1"]:
     """Mean square of how far tracks go from frame to frame; nan where none is seen in both."""
     square = ((x[:, 1:] - x[:, :-1]) ** 2).sum(2)
     seen = np.isfinite(square)

@@ -190,7 +190,7 @@ def mend_clocks(
         jobs, tracks[v], fresh, exact = tried
         way.kept(fresh.values())
         earlier = broken.get(v, ())
-        broken[v] = (*earlier, _on_own_clock(exact, earlier))
+        broken[v] = (*earlier, on_own_clock(exact, earlier))
         verdict = judged([fresh.get(a.pair, a) for a in verdict.answers])
         if not steady_beside(fresh, tracks, v, exact):
             doubtful_mends.add(v)
@@ -495,7 +495,7 @@ def _broken(answers: Iterable[Answer]) -> int:
     return sum(Status.BROKEN_CLOCK in a.refined.flags for a in answers)
 
 
-def _on_own_clock(found: Break, earlier: Sequence[Break]) -> Break:
+def on_own_clock(found: Break, earlier: Sequence[Break]) -> Break:
     """A break that was found on a mended clock, told in the video's own time."""
     late = sum(b.jump for b in earlier if b.at + b.jump <= found.at)
     return dataclasses.replace(found, at=found.at - late)

@@ -14,6 +14,8 @@ from ..align.slot import Aligner, AlignerLike
 from ..clocks.common import nominal_fps
 from ..clocks.shutter import at_frame_times
 from ..compute.threads import MapLike, blas_for
+from ..epipolar.breaks import find_breaks
+from ..epipolar.refine import EpipolarRefine
 from ..epipolar.scan import EpipolarScan
 from ..epipolar.steady import unsteady
 from ..frames import OwnFrames
@@ -22,9 +24,10 @@ from ..refine.slot import Rate, Refiner, RefinerLike
 from ..refine.splines import SplineRefine
 from ..types import Alignment, Break, Matches, Offsets, Status, TrackSet
 from ..types.checks import check_whole
+from .breaks import MOST, SAME_MOMENT, mended
 from .graph import Graph, Pair
 from .lags import Lag, lag_of, lagging, with_lags
-from .mending import ByMotion, cut_where_it_holds, doubted, mend_by_cuts, mend_by_windows, mend_clocks
+from .mending import ByMotion, cut_where_it_holds, doubted, mend_by_cuts, mend_by_windows, mend_clocks, on_own_clock
 from .method import Method
 from .own_frames import Frames, refuse_common, solver_from, synchronize_own
 from .pairs import Job, Refit, run, run_refit, with_rate
@@ -118,6 +121,7 @@ def synchronize(
     with blas_for(max(len(t) for t in tracks)):
         jobs, verdict, broken = _answered(jobs, tracks, judged, map, rematched)
         if isinstance(aligning, EpipolarScan):
+            verdict = _mended_in_pixels(jobs, verdict, tracks, aligning, judged, map, broken)
             verdict = _without_unsteady(verdict, tracks, aligning, judged)
         else:
             verdict = with_parts_checked(verdict, tracks, judged)
@@ -162,6 +166,46 @@ def _answered(
         fresh = {answer.pair: answer for answer in map(run, again)}
         verdict = judged([_still_broken(fresh.get(a.pair, a), a) for a in verdict.answers])
     return jobs, verdict, broken
+
+
+def _mended_in_pixels(
+    jobs: Sequence[Job],
+    verdict: Verdict,
+    tracks: list[TrackSet],
+    aligner: EpipolarScan,
+    judged: Callable[[Sequence[Answer]], Verdict],
+    map: MapLike,
+    broken: dict[int, tuple[Break, ...]],
+) -> Verdict:
+    """The verdict, with clocks that break put right (``tracks`` and ``broken`` in place), or their pairs doubted."""
+    refiner = EpipolarRefine(scan=aligner)
+    for _ in range(MOST):
+        found = find_breaks(refiner, tracks, _matches(verdict), verdict.x)
+        new = [f for f in found if f.broke is not None and not _known(f.broke, broken.get(f.video, ()))]
+        if not new:
+            break
+        surest = max(new, key=lambda f: f.gain)
+        v, broke = surest.video, surest.broke
+        assert broke is not None
+        earlier = broken.get(v, ())
+        tracks[v] = mended(tracks[v], (broke,))
+        broken[v] = (*earlier, on_own_clock(broke, earlier))
+        jobs = [dataclasses.replace(j, a=tracks[j.pair[0]], b=tracks[j.pair[1]]) for j in jobs]
+        fresh = {answer.pair: answer for answer in map(run, [j for j in jobs if v in j.pair])}
+        verdict = judged([fresh.get(a.pair, a) for a in verdict.answers])
+    else:
+        found = find_breaks(refiner, tracks, _matches(verdict), verdict.x)
+    breaking = {f.video for f in found}
+    return judged([doubted(a) if breaking & set(a.pair) else a for a in verdict.answers]) if breaking else verdict
+
+
+def _matches(verdict: Verdict) -> dict[Pair, Matches]:
+    return {a.pair: a.matches for a in verdict.answers if len(a.matches)}
+
+
+def _known(found: Break, earlier: Sequence[Break]) -> bool:
+    """Whether a break, told on a mended clock, is one that was mended."""
+    return any(abs(found.at - b.at - b.jump) < SAME_MOMENT for b in earlier)
 
 
 def _without_unsteady(

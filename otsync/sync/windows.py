@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..align.likelihood import evidence
-from ..clocks.common import CommonClock, nominal_fps
+from ..clocks.common import CommonClock, nominal_fps, within
 from ..clocks.cuts import CALM, Steps
 from ..clocks.splines import sampled
 from ..costs.linear import Cosine
@@ -307,12 +307,6 @@ def matches_of_parts(job: Job, parts: Float[np.ndarray, "P 2"], rate: float) -> 
     score = np.concatenate([m.score for m in found if m.score is not None])
     pairs, kept = np.unique(together, axis=0, return_index=True)
     return Matches(pairs, score[kept])
-
-
-def within(tracks: TrackSet, begin: float, end: float) -> TrackSet:
-    """The tracks, seen only from ``begin`` to ``end`` s of their clock."""
-    inside = (tracks.times >= begin) & (tracks.times < end)
-    return dataclasses.replace(tracks, visible=tracks.seen & inside)
 
 
 @dataclass(frozen=True)

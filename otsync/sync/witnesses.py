@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..clocks.common import readable, strongest, thinned
+from ..clocks.common import readable, strongest, thinned, within
 from ..compute.threads import MapLike
 from ..refine.common_motion import common_motion
 from ..refine.gauss_newton import fit_clock, neighbours
@@ -33,7 +33,7 @@ from .graph import Pair
 from .pairs import Job, run
 from .rematching import at_each, evidence_of
 from .verdict import Answer
-from .windows import EVERY, NEAR, Windows, within
+from .windows import EVERY, NEAR, Windows
 
 GROUPS, FEWEST = 6, 5
 """Neighbourhoods that are asked, and matches of one at least."""
