@@ -45,8 +45,9 @@ MENDED = 50.0
 """Nats by which two offsets suit the pieces better than one, from which on a clock is mended. Four of those cameras
 have 54 to 660 in 24 of 25, sound ones 0."""
 
-LEAST_VIDEOS = 3
-"""Videos with which a clock is mended: of two, motion that is alike decides too often by how much."""
+LEAST_PAIRS = 2
+"""Pairs that must agree by how much a clock jumps at a cut: of one alone, motion that is alike decides too often. A
+picture that stood still tells it by itself."""
 
 AGREED = 1 / 30
 """Seconds within which most of a video's pairs must measure the same jump; what they say they know it to adds to it."""
@@ -129,8 +130,7 @@ def find_breaks(
         if doubt <= DOUBTED:
             continue
         gain, before, jump, _, moment = max(told, key=lambda t: t[0])
-        enough = len(tracks) >= LEAST_VIDEOS and gain > MENDED
-        broke = _measured(refiner, tracks, pairs, seconds, v, moment, before, jump) if enough else None
+        broke = _measured(refiner, tracks, pairs, seconds, v, moment, before, jump) if gain > MENDED else None
         found.append(Found(v, doubt, gain, broke))
     return found
 
@@ -155,11 +155,13 @@ class Pieces:
 
     Args:
         offsets: (K,) s, one frame apart. before, behind: (K,) of what lies before a moment, and of what lies behind it.
+        shared: (2,K) how many seconds of either another video has filmed, too, at these offsets.
     """
 
     offsets: Float[np.ndarray, " K"]
     before: Float[np.ndarray, " K"]
     behind: Float[np.ndarray, " K"]
+    shared: Float[np.ndarray, "2 K"]
 
     @classmethod
     def of(
@@ -175,15 +177,21 @@ class Pieces:
         """Of video v, with the others' offsets as they are."""
         told = []
         for pair, m in matches.items():
-            offsets, before, behind = _curves(scan, tracks, pair, m, v, moment, fps)
+            offsets, nats = _curves(scan, tracks, pair, m, v, moment, fps)
             other = _of_other(pair, v, seconds)
-            at = other + offsets if v == pair[1] else (other - offsets)[::-1]
-            one, two = (curve if v == pair[1] else curve[::-1] for curve in (before, behind))
-            told.append((at, one, two))
-        low, high = min(at[0] for at, _, _ in told), max(at[-1] for at, _, _ in told)
+            told.append((other + offsets, nats) if v == pair[1] else ((other - offsets)[::-1], nats[:, ::-1]))
+        low, high = min(at[0] for at, _ in told), max(at[-1] for at, _ in told)
         grid = low + np.arange(round((high - low) * fps) + 1) / fps
-        total = [sum(np.interp(grid, t[0], t[k], 0.0, 0.0) for t in told) for k in (1, 2)]
-        return cls(grid, np.asarray(total[0]), np.asarray(total[1]))
+        total = np.sum([[np.interp(grid, at, curve, 0.0, 0.0) for curve in nats] for at, nats in told], 0)
+        own = tracks[v].times
+        spans = (own[0], moment.start), (moment.at, own[-1])
+        shared = np.zeros((2, len(grid)))
+        for pair in matches:
+            filmed = tracks[_other(pair, v)].times + _of_other(pair, v, seconds)
+            for k, (begin, end) in enumerate(spans):
+                common = np.minimum(grid + end, filmed[-1]) - np.maximum(grid + begin, filmed[0])
+                shared[k] = np.maximum(shared[k], common)
+        return cls(grid, total[0], total[1], shared)
 
     def best(self, least: float, most: float) -> tuple[float, float, float]:
         """(nats that two offsets have beyond one, the offset before, s, and how much larger it is behind, s).
@@ -199,11 +207,14 @@ class Pieces:
         return two - one, float(self.offsets[k]), d / fps
 
     def doubt(self) -> float:
-        """Nats by which another offset suits one of the pieces better than the one that suits both."""
+        """Nats by which another offset suits one of the pieces better than the one that suits both; of pieces that
+        others have filmed, too.
+        """
         same = round(SAME / (self.offsets[1] - self.offsets[0]))
         k = int((self.before + self.behind).argmax())
         near = slice(max(0, k - same), k + same + 1)
-        return max(float(piece.max() - piece[near].max()) for piece in (self.before, self.behind))
+        pieces = zip((self.before, self.behind), self.shared[:, k] >= LEAST_PIECE, strict=True)
+        return max((float(piece.max() - piece[near].max()) for piece, filmed in pieces if filmed), default=0.0)
 
     def _joint(self, d: int) -> tuple[float, int, int]:
         """(most nats of an offset before, and one behind that is d frames larger; the index of the former; d)."""
@@ -224,7 +235,7 @@ def _curves(
     v: int,
     moment: Moment,
     fps: float,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[Float[np.ndarray, " K"], Float[np.ndarray, "2 K"]]:
     """A pair's offsets, s, and the evidence of both pieces of video v for them."""
     a, b = tracks[pair[0]], tracks[pair[1]]
     assert a.camera is not None and b.camera is not None
@@ -238,7 +249,7 @@ def _curves(
         one = np.where(inside, xa, np.nan) if v == pair[0] else xa
         two = np.where(inside, xb, np.nan) if v == pair[1] else xb
         told.append(scan.evidence(one, two, F, matches.pairs, lags, fps, unit, matches.weight))
-    return float(a.times[0] - b.times[0]) + lags / fps, told[0], told[1]
+    return float(a.times[0] - b.times[0]) + lags / fps, np.stack(told)
 
 
 def _spans(moment: Moment) -> Iterator[tuple[float, float]]:
@@ -262,17 +273,17 @@ def _measured(
         _jump(refiner, tracks, pair, m, v, moment, before - _of_other(pair, v, seconds), jump)
         for pair, m in matches.items()
     ]
-    known = np.array([t for t in told if t is not None]).reshape(-1, 2)
-    if len(known) < 2:
+    known, least = np.array([t for t in told if t is not None]).reshape(-1, 2), 1 if moment.still else LEAST_PAIRS
+    if len(known) < least:
         return None
     jumps, sigmas = known.T
     near = np.abs(jumps - np.median(jumps)) <= AGREED + sigmas
-    if 2 * near.sum() <= len(told) or near.sum() < 2:
+    if 2 * near.sum() <= len(told) or near.sum() < least:
         return None
     weight = 1 / sigmas[near] ** 2
     mean = float(weight @ jumps[near] / weight.sum())
     # pairs that differ by more than they say do not know it better together
-    misfit = float(weight @ (jumps[near] - mean) ** 2) / (near.sum() - 1)
+    misfit = float(weight @ (jumps[near] - mean) ** 2) / max(1, near.sum() - 1)
     sigma = math.sqrt(max(1.0, misfit) / weight.sum())
     frame = 1 / nominal_fps(tracks[v])
     if not moment.still:
