@@ -8,7 +8,8 @@ hard_cases/  the catalogue of hard cases, and running it
 panoptic.py  the paper's protocol on a truly synchronised recording
 own_frames.py  clock and pose without a common frame, on worlds and on a truly synchronised recording
 calibrate.py  cameras from videos alone, against simulated and given ones
-rig/  synchronised recordings: one camera moved, all videos begun at other frames, a ball as a witness of their clocks
+rig/  synchronised recordings: one camera moved, all videos begun at other frames, pictures lost and repeated, a ball as
+      a witness of their clocks
 trust/  whether "ok" is right: classes of worlds, claims and errors; thresholds.py: the limits behind the flags
 record.py  tables on disk, machine and versions, the gate against a committed baseline
 """
@@ -36,6 +37,7 @@ OWN = {
     "calibrate": "calibrate",
     "audit": "rig.audit",
     "shifts": "rig.shifts",
+    "breaks": "rig.breaks",
     "ball": "rig.ball",
 }
 """Our own suites, and where they are."""

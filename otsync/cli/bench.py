@@ -51,8 +51,8 @@ class Bench:
     """Which benchmark; "all": every one that needs no recording, but for films, thresholds and scale, which take
     hours."""
     scene: tyro.conf.Positional[Path | None] = None
-    """A truly synchronised recording (its folder or scene.json): of panoptic, audit, shifts, ball and budget; if you
-    like, of chain, own-frames and calibrate."""
+    """A truly synchronised recording (its folder or scene.json): of panoptic, audit, shifts, breaks, ball and budget;
+    if you like, of chain, own-frames and calibrate."""
     out: Path = Path("bench/out")
     """Folder for CSV, JSON and plots."""
     gate: bool = False
@@ -63,11 +63,11 @@ class Bench:
     """For sync and match: measure what is promised, on fresh seeds, instead of the tables; for trust: exit code 1 where
     it is not kept."""
     first_seed: int | None = None
-    """For core, match, sync, panoptic, chain, own-frames, trust, thresholds, calibrate, audit, shifts, scale and
-    budget: where they begin; default: the suite's own."""
+    """For core, match, sync, panoptic, chain, own-frames, trust, thresholds, calibrate, audit, shifts, breaks, scale
+    and budget: where they begin; default: the suite's own."""
     seeds: int | None = None
-    """For core, match, sync, chain, own-frames, trust, thresholds, calibrate, audit and shifts: how many; default: the
-    suite's own."""
+    """For core, match, sync, chain, own-frames, trust, thresholds, calibrate, audit, shifts and breaks: how many;
+    default: the suite's own."""
     only: tuple[str, ...] = ()
     """For match, hard-cases and chain: names of the solvers to run; for calibrate of the worlds, for trust of the
     classes, for thresholds of the limits, for scale of the sizes; default: all."""
@@ -80,8 +80,8 @@ class Bench:
     json: bool = False
     """For panoptic and own-frames: one line of JSON on standard output instead of tables."""
     cache: Path | None = None
-    """For panoptic, chain, own-frames, calibrate, audit and shifts: where tracks and depth are kept; default: stages
-    in --out. For scale: where films are kept; default: films in --out."""
+    """For panoptic, chain, own-frames, calibrate, audit, shifts and breaks: where tracks and depth are kept; default:
+    stages in --out. For scale: where films are kept; default: films in --out."""
     against: tuple[Path, ...] = ()
     """For ball: offsets.json of finished answers on this recording, each held against what the ball tells."""
 

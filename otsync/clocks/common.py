@@ -167,8 +167,15 @@ def on_clock(tracks: TrackSet, x: Float[np.ndarray, "N T D"], fps: float) -> Flo
     if is_uniform(tracks) and abs(nominal_fps(tracks) / fps - 1) <= SAME_FPS:
         return x
     times = tracks.times
-    grid = times[0] + np.arange(int(np.floor((times[-1] - times[0]) * fps + WHOLE)) + 1) / fps
+    grid = times[0] + np.arange(frames_on_clock(tracks, fps)) / fps
     return TrackSplines(times, in_space(x)).sample(grid)[..., : x.shape[2]]
+
+
+def frames_on_clock(tracks: TrackSet, fps: float) -> int:
+    """How many frames a video has on an even clock of ``fps``: see :func:`on_clock`."""
+    if is_uniform(tracks) and abs(nominal_fps(tracks) / fps - 1) <= SAME_FPS:
+        return tracks.n_frames
+    return int(np.floor((tracks.times[-1] - tracks.times[0]) * fps + WHOLE)) + 1
 
 
 def in_space(x: Float[np.ndarray, "N T D"]) -> Float[np.ndarray, "N T 3"]:

@@ -7,7 +7,7 @@ its pairs has an offset of its own, and all of one video's differ by the same ti
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,10 +17,10 @@ from ..clocks.common import nominal_fps, on_clock, within
 from ..clocks.cuts import Steps
 from ..clocks.lengths import jumping
 from ..clocks.stillness import pauses
-from ..geometry import fundamentals, seen_pixels
+from ..geometry import seen_pixels
 from ..types import Alignment, Break, Matches, Status, TrackSet
 from .refine import EpipolarRefine
-from .scan import EpipolarScan, unit_of
+from .scan import EpipolarScan, lines_of, unit_of
 
 LEAST_PIECE = 24 / 30
 """Seconds filmed on either side of a moment that is asked about: in less, motion that is alike suits another time."""
@@ -55,8 +55,18 @@ AGREED = 1 / 30
 ROUNDING = 1e-6
 """Seconds by which a frame may lie beside a moment."""
 
+WIDE = 10.0
+"""Seconds around the offset that a video has within which its pieces are looked for."""
+
+MOST_PAIRS = 8
+"""Pairs of a video that are asked, at most: the time of all grows with the square of their number."""
+
 MOST_MOMENTS = 6
 """Moments of a video that are asked about, at most: the longest pauses and the sharpest cuts."""
+
+
+Span = tuple[float, float]
+"""From when to when, s of a video's own clock."""
 
 
 @dataclass(frozen=True)
@@ -115,38 +125,164 @@ def find_breaks(
     """The videos whose pieces, beside a moment at which they look broken, one offset does not suit.
 
     Args:
-        matches: of the pairs that are asked. seconds: (V,) offsets of the videos, of which those of the others are
-            taken as they are; nan where there is none.
+        matches: of the pairs that are asked, the surest first: of each video so many as :data:`MOST_PAIRS`.
+        seconds: (V,) offsets of the videos, of which those of the others are taken as they are; nan where there is
+            none.
     """
-    fps = min(nominal_fps(t) for t in tracks)
     found = []
-    for v, video in enumerate(tracks):
-        pairs = {pair: m for pair, m in matches.items() if v in pair and len(m) and _other_known(pair, v, seconds)}
+    for v in range(len(tracks)):
+        asked = Asked.of(refiner, tracks, matches, seconds, v)
+        all_moments = moments(tracks[v]) if asked.pairs else []
         told = []
-        for moment in moments(video) if pairs else ():
-            pieces = Pieces.of(refiner.scan, tracks, pairs, seconds, v, moment, fps)
-            told.append((*pieces.best(*moment.jumps(1 / nominal_fps(video))), pieces.doubt(), moment))
+        for moment in all_moments:
+            pieces = asked.pieces(moment)
+            told.append((*pieces.best(*moment.jumps(1 / nominal_fps(tracks[v]))), pieces.doubt(), moment))
         doubt = max((t[3] for t in told), default=0.0)
         if doubt <= DOUBTED:
             continue
         gain, before, jump, _, moment = max(told, key=lambda t: t[0])
-        broke = _measured(refiner, tracks, pairs, seconds, v, moment, before, jump) if gain > MENDED else None
+        broke = asked.measured(moment, _beside(moment, all_moments), before, jump) if gain > MENDED else None
         found.append(Found(v, doubt, gain, broke))
     return found
 
 
-def _other_known(pair: tuple[int, int], v: int, seconds: Float[np.ndarray, " V"]) -> bool:
-    """Whether the video that v is compared with has an offset; of two videos the other one's clock is the world's."""
-    return bool(len(seconds) == 2 or np.isfinite(seconds[_other(pair, v)]))
+def _beside(moment: Moment, others: Sequence[Moment]) -> tuple[Span, Span]:
+    """The spans before and behind a moment up to the nearest others that leave enough: there may be breaks, too."""
+    before = [m.at for m in others if m.at <= moment.start - LEAST_PIECE]
+    behind = [m.start for m in others if m.start >= moment.at + LEAST_PIECE]
+    return (max(before, default=-math.inf), moment.start), (moment.at, min(behind, default=math.inf))
 
 
-def _other(pair: tuple[int, int], v: int) -> int:
-    return pair[0] if v == pair[1] else pair[1]
+@dataclass(frozen=True, eq=False)
+class Asked:
+    """A video whose clock may break, and the pairs that are asked about it.
+
+    Args:
+        own: the video. around: its offset, s; nan where it has none. pairs: the others, with matches and offsets.
+    """
+
+    refiner: EpipolarRefine
+    own: TrackSet
+    around: float
+    pairs: tuple[Pair, ...]
+
+    @classmethod
+    def of(
+        cls,
+        refiner: EpipolarRefine,
+        tracks: Sequence[TrackSet],
+        matches: Mapping[tuple[int, int], Matches],
+        seconds: Float[np.ndarray, " V"],
+        v: int,
+    ) -> Asked:
+        """Of video v. Of two videos the other one's clock is the world's."""
+        offsets = seconds if len(seconds) > 2 else seconds - seconds[1 - v]
+        if len(seconds) == 2:
+            offsets[1 - v] = 0.0
+        pairs: list[Pair] = []
+        for (i, j), m in matches.items():
+            other = i if v == j else j
+            if v in (i, j) and len(m) and np.isfinite(offsets[other]) and len(pairs) < MOST_PAIRS:
+                pairs.append(Pair(tracks[other], float(offsets[other]), m, v == j))
+        return cls(refiner, tracks[v], float(offsets[v]), tuple(pairs))
+
+    def pieces(self, moment: Moment) -> Pieces:
+        """What lies before a moment, and what lies behind it, as all pairs see them."""
+        fps = min(nominal_fps(t) for t in (self.own, *(p.other for p in self.pairs)))
+        told = [p.curves(self.refiner.scan, self.own, moment, self.around, fps) for p in self.pairs]
+        low, high = min(at[0] for at, _ in told), max(at[-1] for at, _ in told)
+        grid = low + np.arange(round((high - low) * fps) + 1) / fps
+        total = np.sum([[np.interp(grid, at, curve, 0.0, 0.0) for curve in nats] for at, nats in told], 0)
+        t = self.own.times
+        shared = np.zeros((2, len(grid)))
+        for k, (begin, end) in enumerate(((t[0], moment.start), (moment.at, t[-1]))):
+            for pair in self.pairs:
+                first, last = pair.other.times[[0, -1]] + pair.offset
+                shared[k] = np.maximum(shared[k], np.minimum(grid + end, last) - np.maximum(grid + begin, first))
+        return Pieces(grid, total[0], total[1], shared)
+
+    def measured(self, moment: Moment, spans: tuple[Span, Span], before: float, jump: float) -> Break | None:
+        """The break as the pairs measure it, beside it; None where most of them do not agree."""
+        told = [pair.jump(self.refiner, self.own, spans, (before, before + jump)) for pair in self.pairs]
+        known, least = np.array([t for t in told if t is not None]).reshape(-1, 2), 1 if moment.still else LEAST_PAIRS
+        if len(known) < least:
+            return None
+        jumps, sigmas = known.T
+        near = np.abs(jumps - np.median(jumps)) <= AGREED + sigmas
+        if 2 * near.sum() <= len(told) or near.sum() < least:
+            return None
+        weight = 1 / sigmas[near] ** 2
+        mean = float(weight @ jumps[near] / weight.sum())
+        # pairs that differ by more than they say do not know it better together
+        misfit = float(weight @ (jumps[near] - mean) ** 2) / max(1, near.sum() - 1)
+        sigma = math.sqrt(max(1.0, misfit) / weight.sum())
+        frame = 1 / nominal_fps(self.own)
+        if not moment.still:
+            return jumping(moment.at, mean, sigma, frame)
+        if abs(moment.still + mean) > COUNTED * frame:
+            return None
+        return Break(moment.at, -moment.still, moment.still, 0.0)  # it shows itself how long it stood still
 
 
-def _of_other(pair: tuple[int, int], v: int, seconds: Float[np.ndarray, " V"]) -> float:
-    """The offset of the video that v is compared with, s."""
-    return 0.0 if len(seconds) == 2 else float(seconds[_other(pair, v)])
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """Another video that the one in question is compared with.
+
+    Args:
+        offset: of the other one, s. later: whether it comes first in ``matches``, the one in question second.
+    """
+
+    other: TrackSet
+    offset: float
+    matches: Matches
+    later: bool
+
+    def both(self, own: TrackSet) -> tuple[TrackSet, TrackSet]:
+        """As in the matches."""
+        return (self.other, own) if self.later else (own, self.other)
+
+    def curves(
+        self, scan: EpipolarScan, own: TrackSet, moment: Moment, around: float, fps: float
+    ) -> tuple[Float[np.ndarray, " K"], Float[np.ndarray, "2 K"]]:
+        """Offsets of the video in question, s, and the evidence of both of its pieces for them."""
+        a, b = self.both(own)
+        xa, xb = (on_clock(t, seen_pixels(t), fps) for t in (a, b))
+        F, unit, origin = lines_of(a, b, fps), unit_of(a, b), float(a.times[0] - b.times[0])
+        lags = np.arange(1 - xb.shape[1], xa.shape[1])
+        offsets = self.offset + (1 if self.later else -1) * (origin + lags / fps)
+        if np.isfinite(around):
+            near = np.abs(offsets - around) <= WIDE
+            lags, offsets = lags[near], offsets[near]
+        x = xb if self.later else xa
+        at = own.times[0] + np.arange(x.shape[1]) / fps
+        told = []
+        # where a video stands still it shows the moment of the start
+        for begin, end in ((-math.inf, moment.start), (moment.at, math.inf)):
+            inside = (at >= begin - ROUNDING) & (at < end - ROUNDING)
+            part = np.where(inside[None, :, None], x, np.nan)
+            one, two = (xa, part) if self.later else (part, xb)
+            told.append(scan.evidence(one, two, F, self.matches.pairs, lags, fps, unit, self.matches.weight))
+        order = slice(None) if self.later else slice(None, None, -1)
+        return offsets[order], np.stack(told)[:, order]
+
+    def jump(
+        self, refiner: EpipolarRefine, own: TrackSet, spans: tuple[Span, Span], offsets: tuple[float, float]
+    ) -> tuple[float, float] | None:
+        """By how much the offset of the video in question jumps, and one sigma, s; None where a piece does not tell.
+
+        Args:
+            spans: the pieces. offsets: of the video in each of them, about, s.
+        """
+        sign, fps = 1 if self.later else -1, min(nominal_fps(own), nominal_fps(self.other))
+        found = []
+        for span, offset in zip(spans, offsets, strict=True):
+            start = Alignment(sign * (offset - self.offset), sigma=1 / fps, fps=fps)
+            piece = refiner(*self.both(within(own, *span)), self.matches, start)
+            if not math.isfinite(piece.offset) or {Status.MOVED, Status.NO_OVERLAP} & set(piece.flags):
+                return None
+            found.append(piece)
+        first, second = found
+        return sign * (second.offset - first.offset), math.hypot(first.sigma, second.sigma)
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,36 +298,6 @@ class Pieces:
     before: Float[np.ndarray, " K"]
     behind: Float[np.ndarray, " K"]
     shared: Float[np.ndarray, "2 K"]
-
-    @classmethod
-    def of(
-        cls,
-        scan: EpipolarScan,
-        tracks: Sequence[TrackSet],
-        matches: Mapping[tuple[int, int], Matches],
-        seconds: Float[np.ndarray, " V"],
-        v: int,
-        moment: Moment,
-        fps: float,
-    ) -> Pieces:
-        """Of video v, with the others' offsets as they are."""
-        told = []
-        for pair, m in matches.items():
-            offsets, nats = _curves(scan, tracks, pair, m, v, moment, fps)
-            other = _of_other(pair, v, seconds)
-            told.append((other + offsets, nats) if v == pair[1] else ((other - offsets)[::-1], nats[:, ::-1]))
-        low, high = min(at[0] for at, _ in told), max(at[-1] for at, _ in told)
-        grid = low + np.arange(round((high - low) * fps) + 1) / fps
-        total = np.sum([[np.interp(grid, at, curve, 0.0, 0.0) for curve in nats] for at, nats in told], 0)
-        own = tracks[v].times
-        spans = (own[0], moment.start), (moment.at, own[-1])
-        shared = np.zeros((2, len(grid)))
-        for pair in matches:
-            filmed = tracks[_other(pair, v)].times + _of_other(pair, v, seconds)
-            for k, (begin, end) in enumerate(spans):
-                common = np.minimum(grid + end, filmed[-1]) - np.maximum(grid + begin, filmed[0])
-                shared[k] = np.maximum(shared[k], common)
-        return cls(grid, total[0], total[1], shared)
 
     def best(self, least: float, most: float) -> tuple[float, float, float]:
         """(nats that two offsets have beyond one, the offset before, s, and how much larger it is behind, s).
@@ -225,93 +331,3 @@ class Pieces:
         total = self.before[first] + self.behind[then]
         k = int(total.argmax())
         return float(total[k]), k + first.start, d
-
-
-def _curves(
-    scan: EpipolarScan,
-    tracks: Sequence[TrackSet],
-    pair: tuple[int, int],
-    matches: Matches,
-    v: int,
-    moment: Moment,
-    fps: float,
-) -> tuple[Float[np.ndarray, " K"], Float[np.ndarray, "2 K"]]:
-    """A pair's offsets, s, and the evidence of both pieces of video v for them."""
-    a, b = tracks[pair[0]], tracks[pair[1]]
-    assert a.camera is not None and b.camera is not None
-    xa, xb = (on_clock(t, seen_pixels(t), fps) for t in (a, b))
-    F, unit = fundamentals(a.camera, b.camera), unit_of(a, b)
-    lags = np.arange(1 - xb.shape[1], xa.shape[1])
-    told = []
-    for begin, end in _spans(moment):
-        at = tracks[v].times[0] + np.arange((xa if v == pair[0] else xb).shape[1]) / fps
-        inside = ((at >= begin - ROUNDING) & (at < end - ROUNDING))[None, :, None]
-        one = np.where(inside, xa, np.nan) if v == pair[0] else xa
-        two = np.where(inside, xb, np.nan) if v == pair[1] else xb
-        told.append(scan.evidence(one, two, F, matches.pairs, lags, fps, unit, matches.weight))
-    return float(a.times[0] - b.times[0]) + lags / fps, np.stack(told)
-
-
-def _spans(moment: Moment) -> Iterator[tuple[float, float]]:
-    """From when to when each piece was filmed; where a video stands still it shows the moment of the start."""
-    yield -math.inf, moment.start
-    yield moment.at, math.inf
-
-
-def _measured(
-    refiner: EpipolarRefine,
-    tracks: Sequence[TrackSet],
-    matches: Mapping[tuple[int, int], Matches],
-    seconds: Float[np.ndarray, " V"],
-    v: int,
-    moment: Moment,
-    before: float,
-    jump: float,
-) -> Break | None:
-    """The break as the pairs of video v measure it; None where most of them do not agree."""
-    told = [
-        _jump(refiner, tracks, pair, m, v, moment, before - _of_other(pair, v, seconds), jump)
-        for pair, m in matches.items()
-    ]
-    known, least = np.array([t for t in told if t is not None]).reshape(-1, 2), 1 if moment.still else LEAST_PAIRS
-    if len(known) < least:
-        return None
-    jumps, sigmas = known.T
-    near = np.abs(jumps - np.median(jumps)) <= AGREED + sigmas
-    if 2 * near.sum() <= len(told) or near.sum() < least:
-        return None
-    weight = 1 / sigmas[near] ** 2
-    mean = float(weight @ jumps[near] / weight.sum())
-    # pairs that differ by more than they say do not know it better together
-    misfit = float(weight @ (jumps[near] - mean) ** 2) / max(1, near.sum() - 1)
-    sigma = math.sqrt(max(1.0, misfit) / weight.sum())
-    frame = 1 / nominal_fps(tracks[v])
-    if not moment.still:
-        return jumping(moment.at, mean, sigma, frame)
-    # it shows itself how long it stood still
-    return Break(moment.at, -moment.still, moment.still, 0.0) if abs(moment.still + mean) <= COUNTED * frame else None
-
-
-def _jump(
-    refiner: EpipolarRefine,
-    tracks: Sequence[TrackSet],
-    pair: tuple[int, int],
-    matches: Matches,
-    v: int,
-    moment: Moment,
-    before: float,
-    jump: float,
-) -> tuple[float, float] | None:
-    """By how much a pair says that the offset of video v jumps, and one sigma, s; None where a piece does not tell."""
-    a, b = tracks[pair[0]], tracks[pair[1]]
-    sign = 1 if v == pair[1] else -1
-    fps = min(nominal_fps(a), nominal_fps(b))
-    found = []
-    for (begin, end), offset in zip(_spans(moment), (before, before + jump), strict=True):
-        one, two = (within(t, begin, end) if t is tracks[v] else t for t in (a, b))
-        piece = refiner(one, two, matches, Alignment(sign * offset, sigma=1 / fps, fps=fps))
-        if not math.isfinite(piece.offset) or {Status.MOVED, Status.NO_OVERLAP} & set(piece.flags):
-            return None
-        found.append(piece)
-    first, second = found
-    return sign * (second.offset - first.offset), math.hypot(first.sigma, second.sigma)

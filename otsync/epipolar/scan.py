@@ -15,10 +15,10 @@ from jaxtyping import Float, Int
 from ..align.likelihood import APART, MIN_OVERLAP
 from ..align.peaks import peak, separate_peaks
 from ..align.slot import Aligner
-from ..clocks.common import nominal_fps, on_clock
+from ..clocks.common import frames_on_clock, nominal_fps, on_clock
 from ..compute.indices import lives
 from ..geometry import fundamentals, seen_pixels
-from ..types import Alignment, Matches, Status, TrackSet, in_order
+from ..types import Alignment, Camera, Matches, Status, TrackSet, in_order
 from .residuals import MAD, Residuals, broken
 
 MIXTURE_CAP = 80.0
@@ -106,9 +106,7 @@ class EpipolarScan(Aligner):
             lags = lags[np.abs(origin + lags / fps) <= self.max_lag + 1e-9]
         if len(matches) == 0 or len(lags) == 0:
             return _nothing(fps, Status.FEW_MATCHES if len(matches) == 0 else Status.NO_OVERLAP)
-        total = self.evidence(
-            xa, xb, fundamentals(a.camera, b.camera), matches.pairs, lags, fps, unit_of(a, b), matches.weight
-        )
+        total = self.evidence(xa, xb, lines_of(a, b, fps), matches.pairs, lags, fps, unit_of(a, b), matches.weight)
         if np.ptp(total) == 0:
             return _nothing(fps, Status.NO_OVERLAP)
         overlap = np.minimum(xa.shape[1], xb.shape[1] + lags) - np.maximum(0, lags)
@@ -122,9 +120,8 @@ class EpipolarScan(Aligner):
 
     def residuals(self, a: TrackSet, b: TrackSet, matches: Matches, offset: float, fps: float) -> Residuals | None:
         """Of the matches that have most of their tracks' evidence at ``offset``, s; None where there are too few."""
-        assert a.camera is not None and b.camera is not None
         xa, xb = (on_clock(tracks, seen_pixels(tracks), fps) for tracks in (a, b))
-        F = fundamentals(a.camera, b.camera)
+        F = lines_of(a, b, fps)
         lag = round((offset - float(a.times[0] - b.times[0])) * fps)
         share = self.support(xa, xb, F, matches.pairs, lag, fps, unit_of(a, b))
         return Residuals.of(a, b, xa, F, matches.pairs, share, fps)
@@ -303,6 +300,25 @@ def mixture(
     sums = np.add.reduceat(weight, edges, axis=0)
     nats = np.log(sums / counts + np.exp(FLOOR))
     return np.where(nats > 0, -TRACK_CAP * np.expm1(-np.maximum(nats, 0) / TRACK_CAP), nats).sum(0)
+
+
+def lines_of(a: TrackSet, b: TrackSet, fps: float) -> Float[np.ndarray, "Fa Fb 3 3"]:
+    """One fundamental matrix for each pair of frames of both videos' even clocks (:func:`on_clock`); axes of length 1
+    for static cameras.
+    """
+    return fundamentals(_camera_on_clock(a, fps), _camera_on_clock(b, fps))
+
+
+def _camera_on_clock(tracks: TrackSet, fps: float) -> Camera:
+    """The camera; where it moves, with the nearest pose of each frame of an even clock: frames may be missing."""
+    camera, t = tracks.camera, tracks.times
+    assert camera is not None
+    if camera.w2c.ndim == 2:
+        return camera
+    at = t[0] + np.arange(frames_on_clock(tracks, fps)) / fps
+    late = np.clip(np.searchsorted(t, at), 1, len(t) - 1)
+    nearest = np.where(at - t[late - 1] < t[late] - at, late - 1, late)
+    return replace(camera, w2c=camera.w2c[nearest])
 
 
 def unit_of(a: TrackSet, b: TrackSet) -> float:

@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..clocks.common import nominal_fps, on_clock, strongest
-from ..geometry import fundamentals, seen_pixels
+from ..geometry import seen_pixels
 from ..types import Matches, TrackSet
-from .scan import EpipolarScan, unit_of
+from .scan import EpipolarScan, lines_of, unit_of
 
 STEP = 20 / 30
 """Half the length, s, of the windows, and how far they are apart."""
@@ -34,7 +34,7 @@ Whole clips of basketball: sound cameras have less in 65 of 70 pairs and in 16 o
 dropped or fifteen frozen more in 51 of 60 and 15 of 16 (seeds 21900-21969, 23900-23915)."""
 
 SAME = 3 / 30
-"""Seconds within which a later or an earlier window has the same offset."""
+"""Seconds within which all windows up to an end have the same offset."""
 
 AGREED = 0.9
 """Root sums of squares of its pairs' gains that their sum must reach; that of one pair alone is 1. Matches of a few
@@ -62,9 +62,8 @@ def local_evidence(
         start: of the first window on a's clock, s. count: of windows, :data:`STEP` apart. fps: of the clock that both
             videos are brought on, so that curves of several pairs can be added.
     """
-    assert a.camera is not None and b.camera is not None
     xa, xb = (on_clock(tracks, seen_pixels(tracks), fps) for tracks in (a, b))
-    F, unit = fundamentals(a.camera, b.camera), unit_of(a, b)
+    F, unit = lines_of(a, b, fps), unit_of(a, b)
     middle = round((offset - float(a.times[0] - b.times[0])) * fps)
     reach, length = round(REACH * fps), round(2 * STEP * fps)
     lags = middle + np.arange(-reach, reach + 1)
@@ -162,4 +161,5 @@ def _lasts(total: Float[np.ndarray, "W D"], first: int, best: int, answer: Int[n
     def gained(windows: Float[np.ndarray, "K D"]) -> Float[np.ndarray, " K"]:
         return windows[:, there].max(1) - windows[:, answer].max(1)
 
-    return bool((gained(each) >= 0).all() and (gained(ends) > LEAST_GAIN).any())
+    enough = np.maximum(LEAST_GAIN, LEAST_SHARE * (ends.max(1) - np.median(ends, 1)))
+    return bool((gained(each) >= 0).all() and (gained(ends) > enough).any())

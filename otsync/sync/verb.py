@@ -200,12 +200,15 @@ def _mended_in_pixels(
 
 
 def _matches(verdict: Verdict) -> dict[Pair, Matches]:
-    return {a.pair: a.matches for a in verdict.answers if len(a.matches)}
+    """The matches of all pairs, the surest first."""
+    surest = sorted(verdict.answers, key=lambda a: (not a.refined.status.ok, -a.scanned.stats.get("evidence", 0.0)))
+    return {a.pair: a.matches for a in surest if len(a.matches)}
 
 
 def _known(found: Break, earlier: Sequence[Break]) -> bool:
     """Whether a break, told on a mended clock, is one that was mended."""
-    return any(abs(found.at - b.at - b.jump) < SAME_MOMENT for b in earlier)
+    at = on_own_clock(found, earlier).at
+    return any(abs(at - b.at) < SAME_MOMENT for b in earlier)
 
 
 def _without_unsteady(

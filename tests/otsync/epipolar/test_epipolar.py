@@ -14,7 +14,7 @@ from otsync.align.peaks import separate_peaks
 from otsync.costs.positions import CurveDistance, MedianPosition, SynchronousDistance, capped, scene_scale
 from otsync.epipolar.refine import COMMON_ERRORS, EpipolarRefine
 from otsync.epipolar.residuals import Residuals, Step, detrended
-from otsync.epipolar.scan import TRACK_CAP, EpipolarScan, Told, mixture, residuals_by_lag
+from otsync.epipolar.scan import TRACK_CAP, EpipolarScan, Told, lines_of, mixture, residuals_by_lag
 from otsync.geometry import common_target, fundamental, fundamentals, sampson, undistort, view_angle
 from otsync.match.candidates import Candidates
 from otsync.sync.graph import judged_by_cycles
@@ -442,3 +442,21 @@ def test_wander_is_what_the_seconds_say_by_their_information():
     assert wander == pytest.approx(np.sqrt((3 * 0.03**2 + 0.01**2) / 4))
     assert blur == pytest.approx(wander)  # nothing else is left
     assert problem.wander(Step(residual, 0 * slope, ones)) == (0.0, 0.0)
+
+
+def test_a_pose_is_that_of_the_nearest_frame_on_an_even_clock():
+    """Of a video that lacks frames, which has fewer poses than its even clock has frames."""
+    still, other = ring(2, width=640, height=360)
+    poses = np.repeat(np.asarray(still.w2c)[None], 20, 0)
+    poses[:, 0, 3] += 0.1 * np.arange(20)
+    times = np.delete(np.arange(30), np.arange(10, 20)) / 30
+    uv = np.full((3, 20, 2), 5.0)
+    moving = TrackSet(None, uv=uv, camera=replace(still, w2c=poses), timestamps=times, frame="world", name="a")
+    fixed = TrackSet(None, uv=uv, camera=other, fps=30.0, frame="world", name="b")
+    F = lines_of(moving, fixed, 30.0)
+    assert F.shape == (30, 1, 3, 3)
+    nearest = [*range(10), *[9] * 5, *[10] * 5, *range(10, 20)]
+    for k, frame in enumerate(nearest):
+        if k != 14:  # half way
+            np.testing.assert_allclose(F[k, 0], fundamental(moving.camera, other, frame))
+    assert lines_of(fixed, moving, 30.0).shape == (1, 30, 3, 3) and lines_of(fixed, fixed, 30.0).shape == (1, 1, 3, 3)

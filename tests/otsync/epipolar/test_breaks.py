@@ -1,0 +1,133 @@
+"""Clocks that break, without depth: pictures show when, pairs tell by how much; what only looks so is left alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from otsync import Status, TrackSet
+from otsync.epipolar.breaks import Found, Moment, Pieces, find_breaks, moments
+from otsync.epipolar.refine import EpipolarRefine
+from otsync.types import Break, Matches
+from tests.otsync.epipolar.test_steady import FPS, LATE, filmed, solved
+from tests.recording_world import paths, ring
+
+LOST = np.delete(np.arange(130.0), np.arange(50, 60))
+"""Ten frames were lost."""
+
+FROZEN = np.arange(120.0) - np.clip(np.arange(120) - 50, 0, 10)
+"""One picture was shown for ten frames more, and the rest late."""
+
+CAUGHT_UP = np.where((np.arange(120) > 50) & (np.arange(120) <= 60), 50.0, np.arange(120.0))
+"""One picture was shown for ten frames more, in place of what came then."""
+
+
+def worlds(own: np.ndarray, videos: int, seed: int = 0, who: int = 1) -> list[TrackSet]:
+    """Videos of which one shows these frames."""
+    return filmed([(own if v == who else np.arange(120.0)) + LATE[v] for v in range(videos)], seed)
+
+
+def error(offsets, videos: int) -> float:
+    return float(np.abs(offsets.seconds * FPS - LATE[:videos]).max())
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("who", [0, 1, 3])
+def test_frames_that_were_lost_are_named_and_the_rest_is_right(seed, who):
+    offsets = solved(worlds(LOST, 4, seed, who))
+    (broke,) = offsets.breaks[who]
+    assert broke.jump * FPS == pytest.approx(10, abs=0.05) and broke.still == 0
+    assert broke.at * FPS == pytest.approx(50) and 0 < broke.sigma * FPS < 0.3
+    assert sum(map(len, offsets.breaks)) == 1 and offsets.ok and error(offsets, 4) < 0.1
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("videos", [2, 4])
+def test_a_picture_that_stood_still_is_counted(videos, seed):
+    offsets = solved(worlds(FROZEN, videos, seed))
+    (broke,) = offsets.breaks[1]
+    assert broke.still * FPS == pytest.approx(10) and broke.jump == -broke.still and broke.sigma == 0
+    assert broke.at * FPS == pytest.approx(60) and offsets.ok and error(offsets, videos) < 0.1
+
+
+@pytest.mark.parametrize("videos", [2, 4])
+def test_one_that_caught_up_lost_nothing(videos):
+    offsets = solved(worlds(CAUGHT_UP, videos))
+    assert not any(offsets.breaks) and error(offsets, videos) < 0.5
+
+
+def test_two_breaks_of_one_video_are_found_one_after_the_other():
+    twice = np.delete(np.arange(140.0), np.r_[35:45, 90:100])
+    offsets = solved(worlds(twice, 4, 1))
+    assert [round(b.at * FPS) for b in offsets.breaks[1]] == [35, 80]
+    assert [b.jump * FPS for b in offsets.breaks[1]] == pytest.approx([10, 10], abs=0.1)
+    assert error(offsets, 4) < 0.1
+
+
+def test_of_two_videos_nobody_knows_what_was_lost():
+    assert Status.BROKEN_CLOCK in solved(worlds(LOST, 2)).flags[1]
+
+
+def test_what_jerks_for_all_is_no_break():
+    """Things that jump half a second on, in the world: every video shows a cut."""
+    jerk = np.where(np.arange(140) < 70, np.arange(140.0), np.arange(140.0) + 15)
+    tracks = filmed([jerk[round(late) + 10 :][:120] for late in LATE], 2)
+    assert all(len(moments(t)) == 1 for t in tracks)
+    offsets = solved(tracks)
+    assert offsets.ok and not any(offsets.breaks) and error(offsets, 4) < 0.1
+
+
+def test_moments_are_where_a_video_looks_broken():
+    lost, frozen, even = (worlds(own, 2)[1] for own in (LOST, FROZEN, np.arange(120.0)))
+    assert moments(lost) == [Moment(50 / FPS, 50 / FPS)] and moments(even) == []
+    rest = moments(frozen)[0]
+    assert (rest.start * FPS, rest.at * FPS) == pytest.approx((50, 60))
+    assert rest.jumps(1 / FPS) == pytest.approx((-11.5 / FPS, -8.5 / FPS))
+    late = replace(lost, visible=lost.seen & (np.arange(120) < 70))
+    assert moments(late) == moments(lost)  # what is seen there is asked of the pairs
+
+
+def test_a_moment_near_an_end_is_not_asked_about():
+    early = np.delete(np.arange(130.0), np.arange(15, 25))
+    assert moments(worlds(early, 2)[1]) == []
+
+
+def test_pieces_that_nobody_else_filmed_leave_no_doubt():
+    offsets, there = np.arange(9.0), np.eye(9)
+    shared = np.full((2, 9), 2.0)
+    told = Pieces(offsets, 40 * there[4], 30 * there[7], shared)
+    assert told.doubt() == 30
+    assert replace(told, shared=np.stack([shared[0], 0 * shared[1]])).doubt() == 0
+    assert told.best(0.0, 5.0) == (30.0, 4.0, 3.0)
+    assert told.best(-5.0, 0.0)[0] == 0  # where it only goes back
+
+
+def test_videos_without_matches_tell_nothing():
+    tracks = worlds(LOST, 4)
+    nothing = {(0, 1): Matches(np.zeros((0, 2), int))}
+    assert find_breaks(EpipolarRefine(), tracks, nothing, np.zeros(4)) == []
+
+
+@pytest.mark.parametrize("own", [LOST, FROZEN], ids=["ten frames lost", "frozen for ten frames"])
+def test_cameras_that_move_keep_their_poses_on_a_mended_clock(own):
+    """Its even clock has other frames than were filmed: each with the pose that is nearest in time."""
+    shown = [(own if v == 1 else np.arange(120.0)) + LATE[v] for v in range(4)]
+    rng, sets = np.random.default_rng(0), []
+    for v, (static, still) in enumerate(zip(filmed(shown), ring(4, width=640, height=360), strict=True)):
+        poses = np.repeat(np.asarray(still.w2c)[None], 120, 0)
+        poses[:, 0, 3] += 0.3 * np.sin(shown[v] / 15 + v)
+        camera = replace(still, w2c=poses)
+        uv = camera.project(paths(shown[v] / FPS, 40, 5)) + rng.normal(0, 0.3, (40, 120, 2))
+        sets.append(replace(static, uv=uv, camera=camera))
+    offsets = solved(sets)
+    assert len(offsets.breaks[1]) == 1 and offsets.ok and error(offsets, 4) < 0.1
+
+
+@pytest.mark.parametrize("broke", [None, Break(2.0, 0.5)])
+def test_a_break_that_cannot_be_mended_is_flagged(monkeypatch, broke):
+    """Nor is one that is found again where it was mended."""
+    monkeypatch.setattr("otsync.sync.verb.find_breaks", lambda *job: [Found(1, 30.0, 60.0, broke)])
+    offsets = solved(worlds(np.arange(120.0), 4))
+    assert Status.BROKEN_CLOCK in offsets.flags[1] and len(offsets.breaks[1]) == (broke is not None)
