@@ -314,13 +314,14 @@ class Pieces:
 
     def doubt(self) -> float:
         """Nats by which another offset suits one of the pieces better than the one that suits both; of pieces that
-        others have filmed, too.
+        others have filmed, too. What suits a piece no better than nothing (0 nats) is no offset of it.
         """
         same = round(SAME / (self.offsets[1] - self.offsets[0]))
         k = int((self.before + self.behind).argmax())
         near = slice(max(0, k - same), k + same + 1)
         pieces = zip((self.before, self.behind), self.shared[:, k] >= LEAST_PIECE, strict=True)
-        return max((float(piece.max() - piece[near].max()) for piece, filmed in pieces if filmed), default=0.0)
+        told = (float(piece.max()) - max(float(piece[near].max()), 0.0) for piece, filmed in pieces if filmed)
+        return max([0.0, *told])
 
     def _joint(self, d: int) -> tuple[float, int, int]:
         """(most nats of an offset before, and one behind that is d frames larger; the index of the former; d)."""

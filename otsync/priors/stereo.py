@@ -18,7 +18,7 @@ from ..compute.threads import MapLike
 from ..files.cache import Cache
 from ..files.digest import content_key
 from ..geometry import common_target
-from ..types import Camera, Video
+from ..types import Break, Camera, Video, mended_frames
 from ..types.checks import check_number, check_whole
 from .working import WorkingFrames
 
@@ -65,17 +65,22 @@ class Rig:
         offsets: Float[np.ndarray, " V"],
         width: int = 640,
         rates: Float[np.ndarray, " V"] | None = None,
+        breaks: Sequence[Sequence[Break]] | None = None,
     ) -> Rig:
-        """Frames that show the same moment under ``offsets`` (seconds) and ``rates``, on the fastest video's beat."""
+        """Frames that show the same moment under ``offsets`` (seconds) and ``rates``, on the fastest video's beat.
+
+        ``breaks``: of every video's clock. What stands still shows nothing.
+        """
         frames = tuple(WorkingFrames(v.frames, (v.camera.width, v.camera.height), width) for v in videos)
         rates = np.ones(len(videos)) if rates is None else rates
-        clocks = [r * v.times + o for v, o, r in zip(videos, offsets, rates, strict=True)]
+        told = [mended_frames(v.times, b) for v, b in zip(videos, breaks or [()] * len(videos), strict=True)]
+        clocks = [r * shown + o for (_, shown), o, r in zip(told, offsets, rates, strict=True)]
         fps = max(v.fps or 30.0 for v in videos)
         start, stop = min(c[0] for c in clocks), max(c[-1] for c in clocks)
         # the grid runs through the first video's own frames: whole-frame offsets meet exactly
         first = clocks[0][0]
         moments = first + np.arange(np.ceil((start - first) * fps - 1e-6), (stop - first) * fps + 1e-6) / fps
-        index = np.stack([_nearest(c, moments, 0.5 / fps) for c in clocks], 1)
+        index = np.stack([_nearest(c, moments, 0.5 / fps, keep) for c, (keep, _) in zip(clocks, told, strict=True)], 1)
         return cls(frames, tuple(masks), tuple(v.camera for v in videos), index)
 
 
@@ -474,8 +479,9 @@ def _maps(distortion: bytes, K: bytes, size: tuple[int, int]) -> tuple[np.ndarra
     return cv2.initUndistortRectifyMap(shifted, lens, None, shifted, size, cv2.CV_32FC1)
 
 
-def _nearest(clock: np.ndarray, moments: np.ndarray, within: float) -> np.ndarray:
+def _nearest(clock: np.ndarray, moments: np.ndarray, within: float, frames: np.ndarray) -> np.ndarray:
+    """Of ``frames``, shown at the times of a clock, the nearest to each moment; -1 where none is near."""
     at = np.clip(np.searchsorted(clock, moments), 1, len(clock) - 1) if len(clock) > 1 else np.zeros(len(moments), int)
     if len(clock) > 1:
         at = np.where(moments - clock[at - 1] <= clock[at] - moments, at - 1, at)
-    return np.where(np.abs(clock[at] - moments) <= within * (1 + 1e-6), at, -1)
+    return np.where(np.abs(clock[at] - moments) <= within * (1 + 1e-6), frames[at], -1)

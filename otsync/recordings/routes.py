@@ -37,8 +37,10 @@ from ..priors.slots import cache_key
 from ..priors.stereo import EmptyHull, Rig
 from ..priors.working import WIDTH
 from ..progress import Deadline, Progress, Tell
+from ..sync.breaks import mended
+from ..sync.mending import on_own_clock
 from ..sync.method import Method
-from ..sync.verb import synchronize
+from ..sync.verb import jump_sigma, synchronize
 from ..types import Offsets, Status, TrackSet, Video
 from ..types.checks import check_whole
 from .given import names_of, tracks_of
@@ -175,7 +177,8 @@ def _synchronized(
         tell(doubt)
         return replace(epipolar, why=(*why, doubt))
     with progress.stage("synchronise"):
-        offsets = pairs_in_space(lifted, reference, stages, cache, map, processes)
+        whole = [mended(t, breaks) for t, breaks in zip(lifted, first.breaks, strict=True)]
+        offsets = breaking(pairs_in_space(whole, reference, stages, cache, map, processes), first, lifted)
         offsets = with_doubts(without_times(offsets), astray)
     if not named and (doubt := _less_sure(offsets, first)):
         tell(doubt)
@@ -377,7 +380,8 @@ def rig_at(
     videos = [scene.videos[v] for v in chosen]
     # rounding keeps the key the same over the last bits of a solution
     seconds, rates = np.round(offsets.seconds[list(chosen)], 6), offsets.rates[list(chosen)]
-    rig = Rig.at(videos, [masks[v] for v in chosen], seconds, stages.tracking.width, rates)
+    breaks = [offsets.breaks[v] for v in chosen]
+    rig = Rig.at(videos, [masks[v] for v in chosen], seconds, stages.tracking.width, rates, breaks)
     pixels = [stages.tracking.key(scene.videos[v], scene.masks[v]) for v in chosen]
     poses = [
         (c.K.tobytes(), c.w2c.tobytes(), None if c.distortion is None else c.distortion.tobytes()) for c in rig.cameras
@@ -408,6 +412,21 @@ three recordings of ``recon simulate`` (seeds 30, 33, 36), whose depth was built
 def inheriting(offsets: Offsets, first: Offsets) -> Offsets:
     """The answer of tracks whose depth was measured at the offsets ``first``, with its share of their errors."""
     return replace(offsets, sigma=np.hypot(offsets.sigma, INHERITED * first.sigma)).judged_by_sigma()
+
+
+def breaking(offsets: Offsets, first: Offsets, tracks: Sequence[TrackSet]) -> Offsets:
+    """The answer of ``tracks`` that were mended as ``first`` says: with these breaks, and with their errors."""
+    breaks = [
+        tuple(sorted((*known, *(on_own_clock(b, known) for b in new)), key=lambda b: b.at))
+        for known, new in zip(first.breaks, offsets.breaks, strict=True)
+    ]
+    fps = np.array([t.fps for t in tracks], float)
+    # the error of a jump is that of all behind it
+    loose = np.array(
+        [sum(jump_sigma(b, 1 / f) ** 2 for b in known) for known, f in zip(first.breaks, fps, strict=True)]
+    )
+    loose = np.where(np.arange(len(fps)) == offsets.reference, 0.0, loose + loose[offsets.reference])
+    return replace(offsets, fps=fps, breaks=tuple(breaks), sigma=np.hypot(offsets.sigma, np.sqrt(loose)))
 
 
 LESS_SURE = 2.0

@@ -332,7 +332,7 @@ def to_offsets(
     lags: Sequence[Lag] = (),
 ) -> Offsets:
     """Args: lags: delays among the tracks of each video; none: nobody asked."""
-    found = tuple((broken or {}).get(v, ()) for v in range(len(tracks)))
+    found = tuple(tuple(sorted((broken or {}).get(v, ()), key=lambda b: b.at)) for v in range(len(tracks)))
     # the error of a jump is that of all behind it
     loose = [
         sum(jump_sigma(b, 1 / nominal_fps(t)) ** 2 for b in breaks) for breaks, t in zip(found, tracks, strict=True)

@@ -1331,8 +1331,8 @@ BREAKS = (
     Break(
         "pixels-breaks-mixed",
         "otsync/epipolar/breaks.py",
-        "spans = _beside(moment, all_moments)",
-        "spans = (-math.inf, moment.start), (moment.at, math.inf)",
+        "measured(moment, _beside(moment, all_moments), before",
+        "measured(moment, ((-math.inf, moment.start), (moment.at, math.inf)), before",
         ("tests/otsync/epipolar/test_breaks.py",),
         "a jump is measured by what lies behind another break",
     ),
@@ -1359,6 +1359,22 @@ BREAKS = (
         "nearest = np.minimum(np.arange(len(at)), len(t) - 1)",
         ("tests/otsync/epipolar/test_epipolar.py",),
         "a camera that moves has the poses of other moments where its video lacks frames",
+    ),
+    Break(
+        "stereo-breaks-unheard",
+        "otsync/priors/stereo.py",
+        "breaks or [()] * len(videos)",
+        "[()] * len(videos)",
+        ("tests/otsync/priors/test_priors.py",),
+        "depth is built from frames of different moments where a clock breaks",
+    ),
+    Break(
+        "stereo-breaks-forgotten",
+        "otsync/recordings/routes.py",
+        "tuple(sorted((*known, *(on_own_clock(b, known) for b in new)), key=lambda b: b.at))",
+        "tuple(new)",
+        ("tests/otsync/recordings/test_recordings.py",),
+        "the answer of lifted tracks forgets the breaks that were mended before",
     ),
     Break(
         "cuts-of-what-jumps-by-itself",

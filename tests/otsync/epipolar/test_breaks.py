@@ -100,6 +100,9 @@ def test_pieces_that_nobody_else_filmed_leave_no_doubt():
     told = Pieces(offsets, 40 * there[4], 30 * there[7], shared)
     assert told.doubt() == 30
     assert replace(told, shared=np.stack([shared[0], 0 * shared[1]])).doubt() == 0
+    assert replace(told, shared=0 * shared).doubt() == 0
+    assert replace(told, behind=told.behind - 25).doubt() == 5  # than nothing
+    assert replace(told, behind=told.behind - 50).doubt() == 0
     assert told.best(0.0, 5.0) == (30.0, 4.0, 3.0)
     assert told.best(-5.0, 0.0)[0] == 0  # where it only goes back
 

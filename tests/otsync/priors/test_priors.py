@@ -23,7 +23,7 @@ from otsync.priors.stereo import HullStereo, Rig
 from otsync.priors.working import bilinear
 from otsync.recordings.lift import Lift, depth_at, running_median, smooth_in_time
 from otsync.recordings.tracking import Selection, Tracking, pixel_tracks
-from otsync.types import Camera, Video
+from otsync.types import Break, Camera, Video
 from tests.recording_world import paths, render, ring
 
 W, H, T = 320, 180, 36
@@ -402,3 +402,13 @@ def test_the_rig_pairs_frames_of_one_moment():
     half = Rig.at(videos, masks, np.array([0.0, 4.4 / 30])).index
     both = half[(half >= 0).all(1)]
     np.testing.assert_array_equal(both[:, 0] - both[:, 1], 4)
+
+
+def test_the_rig_pairs_what_a_broken_video_shows():
+    """Frames 4 to 6 repeat frame 3; two frames are lost before the other one's frame 6."""
+    videos = [Video([np.zeros((H, W, 3), np.uint8)] * 10, CAMERA, 30.0, name=str(v)) for v in range(2)]
+    masks = [np.zeros((10, H, W), bool)] * 2
+    breaks = [(Break(6 / 30, -3 / 30, 3 / 30),), (Break(6 / 30, 2 / 30),)]
+    index = Rig.at(videos, masks, np.zeros(2), breaks=breaks).index
+    both = index[(index >= 0).all(1)]
+    np.testing.assert_array_equal(both, [[0, 0], [1, 1], [2, 2], [6, 3], [7, 4], [8, 5]])

@@ -28,12 +28,19 @@ from otsync.plugins import forget, register
 from otsync.priors import Cache, ChainedFlow, Daisy, MedianBackground
 from otsync.progress import Deadline
 from otsync.recordings.kept_pairs import MANY, KeptPairs, pack, unpack
-from otsync.recordings.routes import _refuse_unused, _too_late, choose_route, synchronize_scene, without_times
+from otsync.recordings.routes import (
+    _refuse_unused,
+    _too_late,
+    breaking,
+    choose_route,
+    synchronize_scene,
+    without_times,
+)
 from otsync.recordings.stages import PIXELS, SPACE, Stages, stages_from, with_labels, with_method
 from otsync.recordings.tracking import Tracking, track_labels
 from otsync.simulate import simulate
 from otsync.sync.pairs import Job, run
-from otsync.types import Offsets, Similarity
+from otsync.types import Break, Offsets, Similarity, TrackSet
 from tests.otsync.epipolar.test_epipolar import world
 from tests.recording_world import exact_depth, exact_labels, paths, ring, write_recording
 
@@ -424,6 +431,22 @@ def test_without_times_leaves_no_wall_clock(synced):
     assert '"seconds"' not in text.replace('"unit": "seconds"', "") and "refine_seconds" not in text
     found = without_times(Offsets.load(synced / "offsets.json"))
     assert not any(k.endswith("seconds") for a in found.alignments.values() for k in a.stats)
+
+
+def test_an_answer_on_mended_tracks_has_their_breaks_and_their_errors():
+    def told(breaks: tuple[tuple[Break, ...], ...]) -> Offsets:
+        one = np.ones(3)
+        return Offsets(
+            ("a", "b", "c"), 30 * one, 0 * one, one, 0.01 * one, 0, np.zeros(3, int), ((),) * 3, breaks=breaks
+        )
+
+    tracks = [TrackSet(np.zeros((1, 90, 3)), fps=30.0, name=name) for name in "abc"]
+    first = told(((), (Break(1.0, 0.5, sigma=0.02),), ()))
+    # found half a second behind the first one, on the mended clock
+    found = breaking(told(((), (Break(2.0, -0.2, 0.2, 0.0),), (Break(0.5, 0.1, sigma=0.0),))), first, tracks)
+    assert [(b.at, b.jump) for b in found.breaks[1]] == [(1.0, 0.5), (1.5, -0.2)] and not found.breaks[0]
+    assert [(b.at, b.jump) for b in found.breaks[2]] == [(0.5, 0.1)]
+    np.testing.assert_allclose(found.sigma, [0.01, np.hypot(0.01, 0.02), 0.01])
 
 
 @pytest.mark.slow
