@@ -117,6 +117,7 @@ def moments(tracks: TrackSet) -> list[Moment]:
 
 
 def find_breaks(
+    scan: EpipolarScan,
     refiner: EpipolarRefine,
     tracks: Sequence[TrackSet],
     matches: Mapping[tuple[int, int], Matches],
@@ -125,13 +126,14 @@ def find_breaks(
     """The videos whose pieces, beside a moment at which they look broken, one offset does not suit.
 
     Args:
+        scan: whose evidence is asked. refiner: what measures jumps.
         matches: of the pairs that are asked, the surest first: of each video so many as :data:`MOST_PAIRS`.
         seconds: (V,) offsets of the videos, of which those of the others are taken as they are; nan where there is
             none.
     """
     found = []
     for v in range(len(tracks)):
-        asked = Asked.of(refiner, tracks, matches, seconds, v)
+        asked = Asked.of(scan, refiner, tracks, matches, seconds, v)
         all_moments = moments(tracks[v]) if asked.pairs else []
         told = []
         for moment in all_moments:
@@ -161,6 +163,7 @@ class Asked:
         own: the video. around: its offset, s; nan where it has none. pairs: the others, with matches and offsets.
     """
 
+    scan: EpipolarScan
     refiner: EpipolarRefine
     own: TrackSet
     around: float
@@ -169,6 +172,7 @@ class Asked:
     @classmethod
     def of(
         cls,
+        scan: EpipolarScan,
         refiner: EpipolarRefine,
         tracks: Sequence[TrackSet],
         matches: Mapping[tuple[int, int], Matches],
@@ -184,12 +188,12 @@ class Asked:
             other = i if v == j else j
             if v in (i, j) and len(m) and np.isfinite(offsets[other]) and len(pairs) < MOST_PAIRS:
                 pairs.append(Pair(tracks[other], float(offsets[other]), m, v == j))
-        return cls(refiner, tracks[v], float(offsets[v]), tuple(pairs))
+        return cls(scan, refiner, tracks[v], float(offsets[v]), tuple(pairs))
 
     def pieces(self, moment: Moment) -> Pieces:
         """What lies before a moment, and what lies behind it, as all pairs see them."""
         fps = min(nominal_fps(t) for t in (self.own, *(p.other for p in self.pairs)))
-        told = [p.curves(self.refiner.scan, self.own, moment, self.around, fps) for p in self.pairs]
+        told = [p.curves(self.scan, self.own, moment, self.around, fps) for p in self.pairs]
         low, high = min(at[0] for at, _ in told), max(at[-1] for at, _ in told)
         grid = low + np.arange(round((high - low) * fps) + 1) / fps
         total = np.sum([[np.interp(grid, at, curve, 0.0, 0.0) for curve in nats] for at, nats in told], 0)

@@ -121,7 +121,7 @@ def synchronize(
     with blas_for(max(len(t) for t in tracks)):
         jobs, verdict, broken = _answered(jobs, tracks, judged, map, rematched)
         if isinstance(aligning, EpipolarScan):
-            verdict = _mended_in_pixels(jobs, verdict, tracks, aligning, judged, map, broken)
+            verdict = _mended_in_pixels(jobs, verdict, tracks, aligning, refining, judged, map, broken)
             verdict = _without_unsteady(verdict, tracks, aligning, judged)
         else:
             verdict = with_parts_checked(verdict, tracks, judged)
@@ -173,14 +173,15 @@ def _mended_in_pixels(
     verdict: Verdict,
     tracks: list[TrackSet],
     aligner: EpipolarScan,
+    refining: Refiner,
     judged: Callable[[Sequence[Answer]], Verdict],
     map: MapLike,
     broken: dict[int, tuple[Break, ...]],
 ) -> Verdict:
     """The verdict, with clocks that break put right (``tracks`` and ``broken`` in place), or their pairs doubted."""
-    refiner = EpipolarRefine(scan=aligner)
+    refiner = refining if isinstance(refining, EpipolarRefine) else EpipolarRefine()
     for _ in range(MOST):
-        found = find_breaks(refiner, tracks, _matches(verdict), verdict.x)
+        found = find_breaks(aligner, refiner, tracks, _matches(verdict), verdict.x)
         new = [f for f in found if f.broke is not None and not _known(f.broke, broken.get(f.video, ()))]
         if not new:
             break
@@ -194,7 +195,7 @@ def _mended_in_pixels(
         fresh = {answer.pair: answer for answer in map(run, [j for j in jobs if v in j.pair])}
         verdict = judged([fresh.get(a.pair, a) for a in verdict.answers])
     else:
-        found = find_breaks(refiner, tracks, _matches(verdict), verdict.x)
+        found = find_breaks(aligner, refiner, tracks, _matches(verdict), verdict.x)
     breaking = {f.video for f in found}
     return judged([doubted(a) if breaking & set(a.pair) else a for a in verdict.answers]) if breaking else verdict
 

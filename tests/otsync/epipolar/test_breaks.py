@@ -10,6 +10,7 @@ import pytest
 from otsync import Status, TrackSet
 from otsync.epipolar.breaks import Found, Moment, Pieces, find_breaks, moments
 from otsync.epipolar.refine import EpipolarRefine
+from otsync.epipolar.scan import EpipolarScan
 from otsync.types import Break, Matches
 from tests.otsync.epipolar.test_steady import FPS, LATE, filmed, solved
 from tests.recording_world import paths, ring
@@ -110,7 +111,7 @@ def test_pieces_that_nobody_else_filmed_leave_no_doubt():
 def test_videos_without_matches_tell_nothing():
     tracks = worlds(LOST, 4)
     nothing = {(0, 1): Matches(np.zeros((0, 2), int))}
-    assert find_breaks(EpipolarRefine(), tracks, nothing, np.zeros(4)) == []
+    assert find_breaks(EpipolarScan(), EpipolarRefine(), tracks, nothing, np.zeros(4)) == []
 
 
 @pytest.mark.parametrize("own", [LOST, FROZEN], ids=["ten frames lost", "frozen for ten frames"])
