@@ -167,7 +167,7 @@ class Asked:
     refiner: EpipolarRefine
     own: TrackSet
     around: float
-    pairs: tuple[Pair, ...]
+    pairs: tuple[Compared, ...]
 
     @classmethod
     def of(
@@ -183,14 +183,14 @@ class Asked:
         offsets = seconds if len(seconds) > 2 else seconds - seconds[1 - v]
         if len(seconds) == 2:
             offsets[1 - v] = 0.0
-        pairs: list[Pair] = []
+        pairs: list[Compared] = []
         for (i, j), m in matches.items():
             other = i if v == j else j
             if v in (i, j) and len(m) and np.isfinite(offsets[other]) and len(pairs) < MOST_PAIRS:
-                pairs.append(Pair(tracks[other], float(offsets[other]), m, v == j))
+                pairs.append(Compared(tracks[other], float(offsets[other]), m, v == j))
         return cls(scan, refiner, tracks[v], float(offsets[v]), tuple(pairs))
 
-    def pieces(self, moment: Moment) -> Pieces:
+    def pieces(self, moment: Moment) -> Evidence:
         """What lies before a moment, and what lies behind it, as all pairs see them."""
         fps = min(nominal_fps(t) for t in (self.own, *(p.other for p in self.pairs)))
         told = [p.curves(self.scan, self.own, moment, self.around, fps) for p in self.pairs]
@@ -203,7 +203,7 @@ class Asked:
             for pair in self.pairs:
                 first, last = pair.other.times[[0, -1]] + pair.offset
                 shared[k] = np.maximum(shared[k], np.minimum(grid + end, last) - np.maximum(grid + begin, first))
-        return Pieces(grid, total[0], total[1], shared)
+        return Evidence(grid, total[0], total[1], shared)
 
     def measured(self, moment: Moment, spans: tuple[Span, Span], before: float, jump: float) -> Break | None:
         """The break as the pairs measure it, beside it; None where most of them do not agree."""
@@ -229,7 +229,7 @@ class Asked:
 
 
 @dataclass(frozen=True, eq=False)
-class Pair:
+class Compared:
     """Another video that the one in question is compared with.
 
     Args:
@@ -290,7 +290,7 @@ class Pair:
 
 
 @dataclass(frozen=True, eq=False)
-class Pieces:
+class Evidence:
     """Evidence (nats) of the pieces of a video for its offsets, of all its pairs together.
 
     Args:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from otsync import Status, TrackSet
-from otsync.epipolar.breaks import Found, Moment, Pieces, find_breaks, moments
+from otsync.epipolar.breaks import Evidence, Found, Moment, find_breaks, moments
 from otsync.epipolar.refine import EpipolarRefine
 from otsync.epipolar.scan import EpipolarScan
 from otsync.types import Break, Matches
@@ -98,7 +98,7 @@ def test_a_moment_near_an_end_is_not_asked_about():
 def test_pieces_that_nobody_else_filmed_leave_no_doubt():
     offsets, there = np.arange(9.0), np.eye(9)
     shared = np.full((2, 9), 2.0)
-    told = Pieces(offsets, 40 * there[4], 30 * there[7], shared)
+    told = Evidence(offsets, 40 * there[4], 30 * there[7], shared)
     assert told.doubt() == 30
     assert replace(told, shared=np.stack([shared[0], 0 * shared[1]])).doubt() == 0
     assert replace(told, shared=0 * shared).doubt() == 0

@@ -11,9 +11,10 @@ from otsync import synchronize
 from otsync.bench.trust.worlds import CLASSES, plain
 from otsync.simulate import simulate
 from otsync.simulate.effects import Drop, In
-from otsync.sync.parts import broken_part, unvouched
+from otsync.sync.alike import Raw
+from otsync.sync.parts import _Matched, broken_part, does_not_agree, unvouched
 from otsync.sync.verdict import Answer
-from otsync.types import Alignment, Matches, Status, TrackSet
+from otsync.types import Alignment, Clock, Matches, Status, TrackSet
 
 FPS = 30.0
 
@@ -79,6 +80,24 @@ def test_the_end_behind_a_break_is_named(turned):
     assert found is not None
     last = a.times[-1] if not turned else b.times[-1] - 0.3
     assert found[1] == pytest.approx(last) and 0.3 < found[1] - found[0] < 0.6
+
+
+@pytest.mark.parametrize(
+    ("share", "better", "named"), [(0.3, 0.0, True), (0.6, 0.0, False), (0.6, 5.0, True), (0.85, 5.0, False)]
+)
+def test_a_part_within_is_named_where_few_agree_or_fewer_do_and_another_offset_suits(monkeypatch, share, better, named):
+    answer, a, b = pair()
+    begins: list[float] = []
+
+    def shares(matched, begin, length):
+        begins.append(begin)
+        return share if 2 <= len(begins) - 1 <= 3 else 0.9
+
+    monkeypatch.setattr("otsync.sync.parts._share", shares)
+    monkeypatch.setattr("otsync.sync.parts._others", lambda matched, begin, length: iter([(better, better)]))
+    raw = Raw.of(a, answer.matches.pairs[:, 0]), Raw.of(b, answer.matches.pairs[:, 1])
+    away = a.times - a.times[0]
+    assert does_not_agree(_Matched(*raw, Clock(0.3), a.times, away)) == (begins[2] if named else None)
 
 
 def test_where_another_offset_cannot_be_seen_positions_that_do_not_agree_tell(monkeypatch):
