@@ -309,9 +309,13 @@ def remeasured(answer: Answer, a: TrackSet, b: TrackSet, moment: float) -> tuple
     """What is left of a jump after it was mended, s, and one sigma of it; ``moment``: of the break, on a's clock."""
     curves = SplineRefine().splines(a, b, strongest(answer.matches, readable(LIMIT, a, b)))
     offset = answer.refined.offset
-    sides = Part(-math.inf, moment - MARGIN, offset), Part(moment + MARGIN, math.inf, offset)
-    (first, second), sigma = _offsets(*curves, sides)
-    return second - first, math.hypot(*sigma)
+    for margin in (MARGIN, curves[0].frame):  # right up to the break where too little is left of a part
+        sides = Part(-math.inf, moment - margin, offset), Part(moment + margin, math.inf, offset)
+        (first, second), sigmas = _offsets(*curves, sides)
+        sigma = math.hypot(*sigmas)
+        if math.isfinite(sigma):
+            break
+    return second - first, sigma
 
 
 def runs_on(answer: Answer, a: TrackSet, b: TrackSet, before: float, behind: float) -> bool:

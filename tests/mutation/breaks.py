@@ -1187,8 +1187,8 @@ BREAKS = (
     Break(
         "graph-told-alone",
         "otsync/sync/graph.py",
-        "own = np.maximum(shared * _halves",
-        "own = np.minimum(shared * _halves",
+        "own = np.maximum(shared * _usual_variance",
+        "own = np.minimum(shared * _usual_variance",
         GRAPH,
         "what edges tell of their videos' errors counts only where it is less than the usual share",
     ),

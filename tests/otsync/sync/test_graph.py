@@ -193,6 +193,17 @@ def test_shared_errors_change_sigma_and_nothing_else_and_nothing_of_a_single_pai
     assert solve(4, hanging, 0, shared=0.5).sigma[3] == pytest.approx(0.2)  # no less than its only edge says
 
 
+def test_what_a_bad_pair_has_in_common_reaches_no_video_that_its_other_pairs_tell():
+    """It counts by the pair's weight in the answer: four films of 3 s, one pair of which knew nothing, had sigmas of a
+    frame with errors of .07."""
+    edges = edges_of(np.zeros(4), all_pairs(4), 0.2)
+    common = [replace(e, common=0.15) for e in edges]
+    sound = solve(4, common, 0).sigma[1:]
+    with_bad = solve(4, [replace(common[0], sigma=4.0, common=4.0), *common[1:]], 0).sigma[1:]
+    assert (sound > solve(4, edges, 0).sigma[1:]).all()
+    assert (with_bad >= sound).all() and (with_bad < 1.5 * sound).all()
+
+
 @pytest.mark.parametrize("scale", [0.5, 1.0, 2.0])
 def test_tentative_sigmas_are_judged_by_how_cycles_close(scale):
     """Half of each edge's variance is its videos' own, the cycles show the other half: sigma becomes what is true, but
