@@ -13,20 +13,30 @@ def fundamental(a: Camera, b: Camera, frame_a: int = 0, frame_b: int = 0) -> Flo
 
     ``frame_a``, ``frame_b`` choose the pose of a camera that moves. (Hartley and Zisserman, Sec. 9.2.)
     """
-    Ra, ta = _pose(a, frame_a)
-    Rb, tb = _pose(b, frame_b)
-    R = Rb @ Ra.T
-    t = tb - R @ ta
-    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
-    F = np.linalg.inv(b.K).T @ cross @ R @ np.linalg.inv(a.K)
-    return F / max(float(np.linalg.norm(F)), 1e-300)
+    w2c = [c.w2c if c.w2c.ndim == 2 else c.w2c[k] for c, k in ((a, frame_a), (b, frame_b))]
+    return fundamental_of(a.K, w2c[0], b.K, w2c[1])
 
 
 def fundamentals(a: Camera, b: Camera) -> Float[np.ndarray, "Fa Fb 3 3"]:
     """One F per pair of poses: axes of length 1 for static cameras."""
-    poses_a = 1 if a.w2c.ndim == 2 else len(a.w2c)
-    poses_b = 1 if b.w2c.ndim == 2 else len(b.w2c)
-    return np.array([[fundamental(a, b, i, j) for j in range(poses_b)] for i in range(poses_a)])
+    wa, wb = (c.w2c[None] if c.w2c.ndim == 2 else c.w2c for c in (a, b))
+    return fundamental_of(a.K, wa[:, None], b.K, wb[None])
+
+
+def fundamental_of(
+    Ka: Float[np.ndarray, "3 3"],
+    a: Float[np.ndarray, "*A 4 4"],
+    Kb: Float[np.ndarray, "3 3"],
+    b: Float[np.ndarray, "*B 4 4"],
+) -> Float[np.ndarray, "*N 3 3"]:
+    """F of unit norm of all poses ``a`` with those of ``b``, which are broadcast against each other."""
+    R = b[..., :3, :3] @ np.swapaxes(a[..., :3, :3], -1, -2)
+    t = b[..., :3, 3] - np.einsum("...ij,...j->...i", R, a[..., :3, 3])
+    cross = np.zeros((*t.shape, 3))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        cross[..., i, j], cross[..., j, i] = -t[..., k], t[..., k]
+    F = np.linalg.inv(Kb).T @ cross @ R @ np.linalg.inv(Ka)
+    return F / np.maximum(np.linalg.norm(F, axis=(-2, -1), keepdims=True), 1e-300)
 
 
 def sampson(

@@ -19,8 +19,9 @@ from ..clocks.lengths import jumping
 from ..clocks.stillness import pauses
 from ..geometry import seen_pixels
 from ..types import Alignment, Break, Matches, Status, TrackSet
+from .poses import Views
 from .refine import EpipolarRefine
-from .scan import EpipolarScan, lines_of, unit_of
+from .scan import EpipolarScan, unit_of
 
 LEAST_PIECE = 24 / 30
 """Seconds filmed on either side of a moment that is asked about: in less, motion that is alike suits another time."""
@@ -251,7 +252,7 @@ class Compared:
         """Offsets of the video in question, s, and the evidence of both of its pieces for them."""
         a, b = self.both(own)
         xa, xb = (on_clock(t, seen_pixels(t), fps) for t in (a, b))
-        F, unit, origin = lines_of(a, b, fps), unit_of(a, b), float(a.times[0] - b.times[0])
+        views, unit, origin = Views.of(a, b, fps), unit_of(a, b), float(a.times[0] - b.times[0])
         lags = np.arange(1 - xb.shape[1], xa.shape[1])
         offsets = self.offset + (1 if self.later else -1) * (origin + lags / fps)
         if np.isfinite(around):
@@ -265,7 +266,7 @@ class Compared:
             inside = (at >= begin - ROUNDING) & (at < end - ROUNDING)
             part = np.where(inside[None, :, None], x, np.nan)
             one, two = (xa, part) if self.later else (part, xb)
-            told.append(scan.evidence(one, two, F, self.matches.pairs, lags, fps, unit, self.matches.weight))
+            told.append(scan.evidence(one, two, views, self.matches.pairs, lags, fps, unit, self.matches.weight))
         order = slice(None) if self.later else slice(None, None, -1)
         return offsets[order], np.stack(told)[:, order]
 

@@ -8,44 +8,66 @@ from ..compute.jit import kernel
 
 
 @kernel()
-def epipolar_evidence(A, B, F, pairs, lives_a, lives_b, low, edge, min_frames, window, min_window, mean, count):
+def epipolar_evidence(
+    A, B, F, turn, pairs, lives_a, lives_b, low, edge, min_frames, window, min_window, prior, mean, count
+):
     """Epipolar residuals of candidate pairs at every lag at which both tracks live.
 
     A (Na,Ta,2), B (Nb,Tb,2): pixels, nan unseen; lives_a (Na,2), lives_b (Nb,2): the frames from which on, and before
     which, each is seen. F (Fa,Fb,3,3): one per pose, axes of length 1 when static. Frame t of a meets frame t - k of b;
     candidate m is asked at the lags from low[m] on, whose answers stand from edge[m] to edge[m + 1]: in ``mean[0]`` the
-    residuals' mean square per sample, over windows of ``window`` frames (aligned to a's clock) with their mean removed;
+    residuals' mean square per sample, over windows of ``window`` frames (aligned to a's clock) without their mean or,
+    where a camera moves, without what a constant distance of the two points makes of them (``turn`` (Fb,4,3): how b
+    turned; ``prior``: least squares' ridge);
     in ``mean[1]`` the raw one; nan where fewer than ``min_frames`` samples (``min_window`` per window) exist; and in
     ``count`` the samples behind each.
     """
-    moves_a, moves_b = F.shape[0] > 1, F.shape[1] > 1
+    moves_b = F.shape[1] > 1
+    moves = moves_b or F.shape[0] > 1
     for m in range(pairs.shape[0]):
         i, j = pairs[m, 0], pairs[m, 1]
         for at in range(edge[m], edge[m + 1]):
             k = low[m] + at - edge[m]
             within, raw, n_within, n_raw = 0.0, 0.0, 0, 0
             n, s, q = 0, 0.0, 0.0
+            p0, p1, h00, h01, h11 = 0.0, 0.0, prior, 0.0, prior
             first, last = max(lives_a[i, 0], lives_b[j, 0] + k), min(lives_a[i, 1], lives_b[j, 1] + k)
             for t in range(first, last):
                 xa, ya, xb, yb = A[i, t, 0], A[i, t, 1], B[j, t - k, 0], B[j, t - k, 1]
                 if not (np.isnan(xa) or np.isnan(xb)):
-                    G = F[t if moves_a else 0, t - k if moves_b else 0]
+                    G = F[t if F.shape[0] > 1 else 0, t - k if moves_b else 0]
                     l0 = G[0, 0] * xa + G[0, 1] * ya + G[0, 2]
                     l1 = G[1, 0] * xa + G[1, 1] * ya + G[1, 2]
                     l2 = G[2, 0] * xa + G[2, 1] * ya + G[2, 2]
                     g0 = G[0, 0] * xb + G[1, 0] * yb + G[2, 0]
                     g1 = G[0, 1] * xb + G[1, 1] * yb + G[2, 1]
-                    e = (l0 * xb + l1 * yb + l2) / np.sqrt(l0 * l0 + l1 * l1 + g0 * g0 + g1 * g1 + 1e-300)
+                    size = np.sqrt(l0 * l0 + l1 * l1 + g0 * g0 + g1 * g1 + 1e-300)
+                    e = (l0 * xb + l1 * yb + l2) / size
                     n += 1
                     s += e
                     q += e * e
+                    if moves:
+                        Q = turn[t - k if moves_b else 0]
+                        along = l0 * xb + l1 * yb
+                        step = (Q[3, 0] * xb + Q[3, 1] * yb + Q[3, 2]) / size
+                        u = step * (Q[0, 0] * l0 + Q[1, 0] * l1 - Q[2, 0] * along)
+                        v = step * (Q[0, 1] * l0 + Q[1, 1] * l1 - Q[2, 1] * along)
+                        p0 += u * e
+                        p1 += v * e
+                        h00 += u * u
+                        h01 += u * v
+                        h11 += v * v
                 if (t + 1) % window == 0 or t + 1 == last:
                     raw += q
                     n_raw += n
                     if n >= min_window:
-                        within += max(q - s * s / n, 0.0)
+                        told = s * s / n
+                        if moves:
+                            told = (h11 * p0 * p0 - 2 * h01 * p0 * p1 + h00 * p1 * p1) / (h00 * h11 - h01 * h01)
+                        within += max(q - told, 0.0)
                         n_within += n
                     n, s, q = 0, 0.0, 0.0
+                    p0, p1, h00, h01, h11 = 0.0, 0.0, prior, 0.0, prior
             if n_within >= min_frames:
                 mean[0, at] = within / n_within
                 count[0, at] = n_within

@@ -15,11 +15,12 @@ from jaxtyping import Float, Int
 from ..align.likelihood import APART, MIN_OVERLAP
 from ..align.peaks import peak, separate_peaks
 from ..align.slot import Aligner
-from ..clocks.common import frames_on_clock, nominal_fps, on_clock
+from ..clocks.common import nominal_fps, on_clock
 from ..compute.indices import lives
-from ..geometry import fundamentals, seen_pixels
-from ..types import Alignment, Camera, Matches, Status, TrackSet, in_order
-from .residuals import MAD, Residuals, broken
+from ..geometry import seen_pixels
+from ..types import Alignment, Matches, Status, TrackSet, in_order
+from .poses import Lines, Views
+from .residuals import APART_BY, MAD, Residuals, broken
 
 MIXTURE_CAP = 80.0
 """Nats that one candidate counts at most: beyond them the exponential says nothing more, and could overflow."""
@@ -106,7 +107,7 @@ class EpipolarScan(Aligner):
             lags = lags[np.abs(origin + lags / fps) <= self.max_lag + 1e-9]
         if len(matches) == 0 or len(lags) == 0:
             return _nothing(fps, Status.FEW_MATCHES if len(matches) == 0 else Status.NO_OVERLAP)
-        total = self.evidence(xa, xb, lines_of(a, b, fps), matches.pairs, lags, fps, unit_of(a, b), matches.weight)
+        total = self.evidence(xa, xb, Views.of(a, b, fps), matches.pairs, lags, fps, unit_of(a, b), matches.weight)
         if np.ptp(total) == 0:
             return _nothing(fps, Status.NO_OVERLAP)
         overlap = np.minimum(xa.shape[1], xb.shape[1] + lags) - np.maximum(0, lags)
@@ -121,16 +122,16 @@ class EpipolarScan(Aligner):
     def residuals(self, a: TrackSet, b: TrackSet, matches: Matches, offset: float, fps: float) -> Residuals | None:
         """Of the matches that have most of their tracks' evidence at ``offset``, s; None where there are too few."""
         xa, xb = (on_clock(tracks, seen_pixels(tracks), fps) for tracks in (a, b))
-        F = lines_of(a, b, fps)
+        views = Views.of(a, b, fps)
         lag = round((offset - float(a.times[0] - b.times[0])) * fps)
-        share = self.support(xa, xb, F, matches.pairs, lag, fps, unit_of(a, b))
-        return Residuals.of(a, b, xa, F, matches.pairs, share, fps)
+        share = self.support(xa, xb, views, matches.pairs, lag, fps, unit_of(a, b))
+        return Residuals.of(a, b, xa, Lines.of(a, b, fps), matches.pairs, share, fps)
 
     def evidence(
         self,
         xa: Float[np.ndarray, "Na Ta 2"],
         xb: Float[np.ndarray, "Nb Tb 2"],
-        F: Float[np.ndarray, "Fa Fb 3 3"],
+        views: Views,
         pairs: Int[np.ndarray, "M 2"],
         lags: Int[np.ndarray, " K"],
         fps: float,
@@ -138,7 +139,7 @@ class EpipolarScan(Aligner):
         weight: Float[np.ndarray, " M"] | None = None,
     ) -> Float[np.ndarray, " K"]:
         """Summed evidence per lag, in nats; mean over the mixtures of a's and of b's tracks."""
-        told = self.scores(xa, xb, F, pairs, lags, fps, unit)
+        told = self.scores(xa, xb, views, pairs, lags, fps, unit)
         if not np.isfinite(told.mean).any():
             return np.zeros(len(lags))
         both = np.full((len(pairs), len(lags)), -np.inf)
@@ -149,7 +150,7 @@ class EpipolarScan(Aligner):
         self,
         xa: np.ndarray,
         xb: np.ndarray,
-        F: np.ndarray,
+        views: Views,
         pairs: np.ndarray,
         lags: np.ndarray,
         fps: float,
@@ -159,7 +160,7 @@ class EpipolarScan(Aligner):
         by position, -inf where too little is seen; 0 of a kind that is known nowhere.
         """
         least, window = max(2, round(self.min_seen * fps)), max(4, round(self.window * fps))
-        told = residuals_by_lag(xa, xb, F, pairs, lags, least, window, max(LEAST_SAMPLES, round(MIN_WINDOW * fps)))
+        told = residuals_by_lag(xa, xb, views, pairs, lags, least, window, max(LEAST_SAMPLES, round(MIN_WINDOW * fps)))
         mean, count, nats = told.mean, told.count, np.full(told.mean.shape, -np.inf)
         for kind, scale in enumerate((self.motion_scale, self.position_scale)):
             known = np.isfinite(mean[kind])
@@ -172,10 +173,10 @@ class EpipolarScan(Aligner):
         return replace(told, nats=nats)
 
     def support(
-        self, xa: np.ndarray, xb: np.ndarray, F: np.ndarray, pairs: np.ndarray, lag: int, fps: float, unit: float
+        self, xa: np.ndarray, xb: np.ndarray, views: Views, pairs: np.ndarray, lag: int, fps: float, unit: float
     ) -> Float[np.ndarray, " M"]:
         """Each candidate's share of its tracks' mixtures at ``lag``, the outlier included; in [0, 1]."""
-        told = self.scores(xa, xb, F, pairs, np.arange(lag - 1, lag + 2), fps, unit)
+        told = self.scores(xa, xb, views, pairs, np.arange(lag - 1, lag + 2), fps, unit)
         share = np.zeros(len(pairs))
         if not np.isfinite(told.mean).any():
             return share
@@ -250,7 +251,7 @@ class Told:
 def residuals_by_lag(
     xa: Float[np.ndarray, "Na Ta 2"],
     xb: Float[np.ndarray, "Nb Tb 2"],
-    F: Float[np.ndarray, "Fa Fb 3 3"],
+    views: Views,
     pairs: Int[np.ndarray, "M 2"],
     lags: Int[np.ndarray, " K"],
     least: int,
@@ -274,8 +275,8 @@ def residuals_by_lag(
     many = np.where(long, np.maximum(0, high - low + 1), 0)
     edge = np.concatenate([[0], np.cumsum(many)])
     mean, count = np.full((2, edge[-1]), np.nan), np.zeros((2, edge[-1]))
-    arrays = np.ascontiguousarray(xa), np.ascontiguousarray(xb), F, pairs, lives_a, lives_b, low, edge
-    epipolar_evidence(*arrays, least, window, least_in_window, mean, count)
+    arrays = np.ascontiguousarray(xa), np.ascontiguousarray(xb), views.F, views.turn, pairs, lives_a, lives_b, low, edge
+    epipolar_evidence(*arrays, least, window, least_in_window, APART_BY**-2, mean, count)
     candidate = np.repeat(np.arange(len(pairs)), many)
     lag = np.arange(edge[-1]) - edge[candidate] + low[candidate] - lags[0]
     return Told(candidate, lag, mean, count, np.full(mean.shape, np.nan))
@@ -300,25 +301,6 @@ def mixture(
     sums = np.add.reduceat(weight, edges, axis=0)
     nats = np.log(sums / counts + np.exp(FLOOR))
     return np.where(nats > 0, -TRACK_CAP * np.expm1(-np.maximum(nats, 0) / TRACK_CAP), nats).sum(0)
-
-
-def lines_of(a: TrackSet, b: TrackSet, fps: float) -> Float[np.ndarray, "Fa Fb 3 3"]:
-    """One fundamental matrix for each pair of frames of both videos' even clocks (:func:`on_clock`); axes of length 1
-    for static cameras.
-    """
-    return fundamentals(_camera_on_clock(a, fps), _camera_on_clock(b, fps))
-
-
-def _camera_on_clock(tracks: TrackSet, fps: float) -> Camera:
-    """The camera; where it moves, with the nearest pose of each frame of an even clock: frames may be missing."""
-    camera, t = tracks.camera, tracks.times
-    assert camera is not None
-    if camera.w2c.ndim == 2:
-        return camera
-    at = t[0] + np.arange(frames_on_clock(tracks, fps)) / fps
-    late = np.clip(np.searchsorted(t, at), 1, len(t) - 1)
-    nearest = np.where(at - t[late - 1] < t[late] - at, late - 1, late)
-    return replace(camera, w2c=camera.w2c[nearest])
 
 
 def unit_of(a: TrackSet, b: TrackSet) -> float:

@@ -14,7 +14,8 @@ from jaxtyping import Float, Int
 from ..clocks.common import nominal_fps, on_clock, strongest
 from ..geometry import seen_pixels
 from ..types import Matches, TrackSet
-from .scan import EpipolarScan, lines_of, unit_of
+from .poses import Views
+from .scan import EpipolarScan, unit_of
 
 STEP = 20 / 30
 """Half the length, s, of the windows, and how far they are apart."""
@@ -63,7 +64,7 @@ def local_evidence(
             videos are brought on, so that curves of several pairs can be added.
     """
     xa, xb = (on_clock(tracks, seen_pixels(tracks), fps) for tracks in (a, b))
-    F, unit = lines_of(a, b, fps), unit_of(a, b)
+    views, unit = Views.of(a, b, fps), unit_of(a, b)
     middle = round((offset - float(a.times[0] - b.times[0])) * fps)
     reach, length = round(REACH * fps), round(2 * STEP * fps)
     lags = middle + np.arange(-reach, reach + 1)
@@ -76,8 +77,7 @@ def local_evidence(
         if seen.sum() < LEAST_PAIRS:
             continue
         few = None if matches.weight is None else matches.weight[seen]
-        there = F[inside] if len(F) > 1 else F
-        out[w] = scan.evidence(part, xb, there, matches.pairs[seen], lags - inside.start, fps, unit, few)
+        out[w] = scan.evidence(part, xb, views.within(inside), matches.pairs[seen], lags - inside.start, fps, unit, few)
     return out
 
 

@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 from otsync import Alignment, Matches, Status, TrackSet, synchronize
 from otsync.align.peaks import separate_peaks
 from otsync.costs.positions import CurveDistance, MedianPosition, SynchronousDistance, capped, scene_scale
+from otsync.epipolar.poses import Moves, Views, not_turned
 from otsync.epipolar.refine import COMMON_ERRORS, EpipolarRefine
-from otsync.epipolar.residuals import Residuals, Step, detrended
-from otsync.epipolar.scan import TRACK_CAP, EpipolarScan, Told, lines_of, mixture, residuals_by_lag
+from otsync.epipolar.residuals import APART_BY, Residuals, Step, detrended
+from otsync.epipolar.scan import TRACK_CAP, EpipolarScan, Told, mixture, residuals_by_lag
 from otsync.geometry import common_target, fundamental, fundamentals, sampson, undistort, view_angle
 from otsync.match.candidates import Candidates
 from otsync.sync.graph import judged_by_cycles
@@ -310,7 +311,8 @@ def test_a_moving_camera_stands_at_every_frame_where_its_pose_says():
     A, B = rng.uniform(0, 300, (2, 25, 2)), rng.uniform(0, 300, (1, 20, 2))
     A[0, 7:9] = np.nan
     F, pairs = fundamentals(a, moving), np.array([[0, 0], [1, 0]])
-    told = residuals_by_lag(A, B, F, pairs, np.arange(-3, 6), 4, 10, 3)
+    turn = Moves(moving, np.arange(20) / FPS).turns(np.arange(20) / FPS) + 0.01 * rng.normal(size=(20, 4, 3))
+    told = residuals_by_lag(A, B, Views(F, turn), pairs, np.arange(-3, 6), 4, 10, 3)
     mean, count = np.full((2, 2, 9), np.nan), np.zeros((2, 2, 9))
     mean[:, told.candidate, told.lag], count[:, told.candidate, told.lag] = told.mean, told.count
     for m in range(2):
@@ -319,6 +321,19 @@ def test_a_moving_camera_stands_at_every_frame_where_its_pose_says():
             e = np.array([sampson(F[0, s - k], A[m, [s]], B[0, [s - k]])[0] for s in t])
             assert mean[1, m, k + 3] == pytest.approx(np.nanmean(e**2))
             assert count[1, m, k + 3] == np.isfinite(e).sum()
+            # beside, without what a constant distance makes of e: least squares with a ridge, in each window
+            left, n = 0.0, 0
+            for w in range(3):
+                s = np.array([x for x in t[np.isfinite(e)] if x // 10 == w], int)
+                if len(s) >= 3:
+                    ha, hb = (np.append(x, np.ones((len(s), 1)), 1) for x in (A[m, s], B[0, s - k]))
+                    la, lb = np.einsum("sij,sj->si", F[0, s - k], ha), np.einsum("sij,si->sj", F[0, s - k], hb)
+                    size = np.sqrt((la[:, :2] ** 2).sum(1) + (lb[:, :2] ** 2).sum(1))
+                    g = not_turned((la[:, :2] / size[:, None])[None], B[:, s - k], turn[s - k])[0]
+                    y = e[np.isin(t, s)]
+                    left += y @ y - g.T @ y @ np.linalg.solve(g.T @ g + np.eye(2) / APART_BY**2, g.T @ y)
+                    n += len(s)
+            assert (n < 4 and np.isnan(mean[0, m, k + 3])) or mean[0, m, k + 3] == pytest.approx(left / n)
 
 
 @settings(max_examples=25, deadline=None)
@@ -333,8 +348,9 @@ def test_only_lags_at_which_both_tracks_live_are_asked_and_none_is_forgotten(see
             begin, end = np.sort(rng.integers(0, len(track) + 1, 2))
             track[:begin], track[end:], track[rng.random(len(track)) < 0.2] = np.nan, np.nan, np.nan
     F, pairs = rng.normal(size=(1, 1, 3, 3)), np.argwhere(np.ones((3, 3)))
+    views = Views(F, np.zeros((1, 4, 3)))
     lags = np.arange(-frames[1] + 5, frames[0] - 4)
-    told = residuals_by_lag(A, B, F, pairs, lags, least, window, within)
+    told = residuals_by_lag(A, B, views, pairs, lags, least, window, within)
     for m, k in zip(told.candidate, told.lag, strict=True):
         i, j = (np.flatnonzero(np.isfinite(x[n, :, 0])) for x, n in ((A, pairs[m, 0]), (B, pairs[m, 1])))
         assert min(i[-1], j[-1] + lags[k]) - max(i[0], j[0] + lags[k]) + 1 >= least
@@ -391,7 +407,7 @@ def test_tracks_of_one_limb_are_not_independent():
         own = rng.normal(0, 0.3, places)
         middle = np.repeat(rng.uniform(0, 640, (places, 2)), each, 0) + rng.normal(0, 2, (places * each, 2))
         xa = np.repeat(middle[:, None], frames, 1)
-        problem = Residuals(xa, None, np.arange(frames) / 30, None, 0.0, 30.0, np.ones(places * each))
+        problem = Residuals(xa, None, np.arange(frames) / 30, None, 30.0, np.ones(places * each))
         ones = np.ones((places * each, frames))
         residual = np.repeat(own, each)[:, None] + rng.normal(0, 1, ones.shape)
         wrong.append(residual.sum() / ones.sum())
@@ -437,26 +453,77 @@ def test_wander_is_what_the_seconds_say_by_their_information():
     ones = np.ones((1, 60))
     slope = np.where(np.arange(60) < 30, np.sqrt(3.0), 1.0)[None] * 100
     residual = -slope * np.where(np.arange(60) < 30, 0.03, -0.01)
-    problem = Residuals(np.zeros((1, 60, 2)), None, np.arange(60) / FPS, None, 0.0, FPS, np.ones(1))
+    problem = Residuals(np.zeros((1, 60, 2)), None, np.arange(60) / FPS, None, FPS, np.ones(1))
     wander, blur = problem.wander(Step(residual, slope, ones))
     assert wander == pytest.approx(np.sqrt((3 * 0.03**2 + 0.01**2) / 4))
     assert blur == pytest.approx(wander)  # nothing else is left
     assert problem.wander(Step(residual, 0 * slope, ones)) == (0.0, 0.0)
 
 
-def test_a_pose_is_that_of_the_nearest_frame_on_an_even_clock():
-    """Of a video that lacks frames, which has fewer poses than its even clock has frames."""
+def test_a_camera_is_known_at_every_moment():
+    """At its frames, between them, and on the even clock of a video that lacks frames."""
     still, other = ring(2, width=640, height=360)
-    poses = np.repeat(np.asarray(still.w2c)[None], 20, 0)
-    poses[:, 0, 3] += 0.1 * np.arange(20)
-    times = np.delete(np.arange(30), np.arange(10, 20)) / 30
-    uv = np.full((3, 20, 2), 5.0)
-    moving = TrackSet(None, uv=uv, camera=replace(still, w2c=poses), timestamps=times, frame="world", name="a")
+    poses = moving_poses(still, np.arange(30) / 30)
+    kept = np.delete(np.arange(30), np.arange(12, 20))
+    uv = np.full((3, 22, 2), 5.0)
+    moving = TrackSet(
+        None, uv=uv, camera=replace(still, w2c=poses[kept]), timestamps=kept / 30, frame="world", name="a"
+    )
     fixed = TrackSet(None, uv=uv, camera=other, fps=30.0, frame="world", name="b")
-    F = lines_of(moving, fixed, 30.0)
+    F = Views.of(moving, fixed, 30.0).F
     assert F.shape == (30, 1, 3, 3)
-    nearest = [*range(10), *[9] * 5, *[10] * 5, *range(10, 20)]
-    for k, frame in enumerate(nearest):
-        if k != 14:  # half way
-            np.testing.assert_allclose(F[k, 0], fundamental(moving.camera, other, frame))
-    assert lines_of(fixed, moving, 30.0).shape == (1, 30, 3, 3) and lines_of(fixed, fixed, 30.0).shape == (1, 1, 3, 3)
+    for k in kept:
+        np.testing.assert_allclose(F[k, 0], fundamental(replace(still, w2c=poses), other, k), atol=1e-12)
+    half = (np.arange(10) + 0.5) / 30
+    np.testing.assert_allclose(Moves.of(moving).at(half), moving_poses(still, half), atol=2e-3)
+    np.testing.assert_allclose(Moves.of(moving).at(np.array([-1.0, 2.0])), poses[[0, -1]])
+    assert Views.of(fixed, moving, 30.0).F.shape == (1, 30, 3, 3) and Views.of(fixed, fixed, 30.0).F.shape[:2] == (1, 1)
+    few = Moves(replace(still, w2c=poses[:3]), kept[:3] / 30)
+    np.testing.assert_allclose(few.at(np.array([0.04])), poses[[1]])
+
+
+def moving_poses(camera: Camera, times: np.ndarray) -> np.ndarray:
+    """(T,4,4) of a camera that sways by 8 cm and 2 degrees, once a second."""
+    from scipy.spatial.transform import Rotation
+
+    wave = np.sin(2 * np.pi * (times[:, None] * [1.0, 1.3, 0.8] + [0.1, 0.4, 0.7]))
+    out = np.repeat(np.asarray(camera.w2c, float)[None], len(times), 0)
+    out[:, :3, :3] = Rotation.from_rotvec(np.radians(2) * wave).as_matrix() @ out[:, :3, :3]
+    out[:, :3, 3] = -np.einsum("tij,tj->ti", out[:, :3, :3], camera.center + 0.08 * wave[:, ::-1])
+    return out
+
+
+def shaken(seed: int, late: float, frames: int = 75) -> tuple[TrackSet, TrackSet, Matches]:
+    """Eight opaque balls before two cameras that shake: each sees the side that faces it, for half a second a track.
+    Candidates are all tracks of one ball.
+    """
+    phase, rate = np.random.default_rng(seed).uniform([[[0.0]], [[0.3]]], [[[6.28]], [[0.9]]], (2, 8, 3))[..., None, :]
+    sets = []
+    for own, (camera, shift) in enumerate(zip(ring(6, width=640, height=360)[:2], (0.0, late / FPS), strict=True)):
+        t = np.arange(frames)[:, None] / FPS
+        ball = 0.4 * np.sin(2 * np.pi * rate * (t + shift) + phase)
+        facing = camera.center / np.linalg.norm(camera.center)
+        side = facing + np.random.default_rng([seed, own]).normal(0, 0.03, (8, 10, 1, 3))
+        points = ball[:, None] + 0.25 * side / np.linalg.norm(side, axis=-1, keepdims=True)
+        poses = moving_poses(camera, t[:, 0] + own)
+        at = (np.einsum("tij,nptj->npti", poses[:, :3, :3], points) + poses[:, :3, 3]).reshape(80, frames, 3)
+        uv = (at @ camera.K.T)[..., :2] / at[..., 2:]
+        begin = np.tile(np.linspace(0, frames - 15, 10), 8)[:, None]
+        lives = (np.arange(frames) >= begin) & (np.arange(frames) < begin + 15)
+        moving = replace(camera, w2c=poses)
+        sets.append(TrackSet(None, uv=uv, visible=lives, camera=moving, fps=FPS, frame="world", name=str(own)))
+    ball = np.repeat(np.arange(8), 10)
+    pairs = np.argwhere(ball[:, None] == ball)
+    return (*sets, Matches(pairs, np.ones(len(pairs))))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_two_points_of_one_body_make_of_the_distance_is_taken_off_where_a_camera_shakes(seed):
+    """At the true offset less is left than without the mean alone; and the offset stays right."""
+    a, b, matches = shaken(seed, 7.4)
+    problem = EpipolarScan().residuals(a, b, matches, 7.4 / FPS, FPS)
+    e = problem.residual(7.4 / FPS)
+    left, centred = problem.solve(7.4 / FPS, 20 / FPS, 1, 1.0)[1].residual, detrended(e, np.isfinite(e), 20)
+    assert 0 < np.square(left).sum() < 0.5 * np.square(centred[left != 0]).sum()
+    found = EpipolarRefine()(a, b, matches, Alignment(7 / FPS, fps=FPS, sigma=0.1 / FPS))
+    assert found.offset * FPS == pytest.approx(7.4, abs=0.06)
