@@ -222,3 +222,12 @@ def test_an_answer_that_did_not_settle_is_weak(monkeypatch):
     monkeypatch.setattr(sys.modules[SplineRefine.__module__], "fit_clock", partial(fit_clock, iterations=2))
     found = refine(a, b, matches, near(0.31), throw=False)
     assert found.stats["settled"] == 0.0 and Status.WEAK in found.flags
+
+
+@pytest.mark.parametrize(("overlap", "broken"), [(1.6, False), (2.0, True), (5.0, True)])
+def test_a_part_of_a_second_does_not_differ_from_one(overlap, broken):
+    """The wander of blocks of a second speaks from two whole ones on."""
+    even = dict.fromkeys(("moved", "spread", "unsteady", "astray", "untold"), 0.0)
+    good = {"common_motion": 1.0, "settled": 1.0, "effective_matches": 50.0, "correlation": 1.0}
+    stats = even | good | {"blur": 0.03, "wander": 0.02, "overlap": overlap}
+    assert (Status.BROKEN_CLOCK in SplineRefine()._flags(stats)) == broken
