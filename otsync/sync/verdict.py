@@ -254,7 +254,7 @@ def _relocated(network: Network, x: np.ndarray, refit: Refit) -> Network:
             tasks.append((link, predicted / rates[e.a], rates[e.b] / rates[e.a]))
     for (link, start, _), again in zip(tasks, refit(tasks), strict=True):
         if abs(again.offset - start) <= CAPTURED:
-            moved = {"relocated": again.offset - link.scanned.offset}
+            moved = {"relocated": again.offset - link.scanned.offset, "contradicted": float(link.refined.status.ok)}
             kept.append(replace(link, refined=replace(again, stats=again.stats | moved)))
     return network.of(sorted(kept, key=lambda a: a.pair))
 
@@ -373,7 +373,12 @@ def _flags(
     Args:
         own: its links, and whether each agrees with the solution. in_reach: whether it is on the reference's clock.
     """
-    vouching = [ok for a, ok in own if a.refined.status.ok]
+    # a pair that vouched for another time, and was fitted anew at this one, does not vouch for this one
+    vouching = [
+        ok and not a.refined.stats.get("contradicted", 0.0)
+        for a, ok in own
+        if a.refined.status.ok or a.refined.stats.get("contradicted", 0.0)
+    ]
     contradicted = len(vouching) > 0 and sum(vouching) <= len(vouching) / 2
     mismatch = sum(Status.RATE_MISMATCH in a.refined.flags for a, _ in own) > len(own) / 2
     # where others settle which of two returns is right, a lost one may still hide in what an ambiguous pair sees

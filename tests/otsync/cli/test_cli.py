@@ -247,7 +247,8 @@ def test_chosen_seeds_reach_every_benchmark_that_draws(args, module, drawn, monk
 
 def test_version_help_and_unknown_commands(capsys):
     assert shell("--version").stdout.strip() == f"otsync {__version__}"
-    as_module = subprocess.run([sys.executable, "-m", "otsync", "--version"], capture_output=True, text=True, check=True)
+    command = [sys.executable, "-m", "otsync", "--version"]
+    as_module = subprocess.run(command, capture_output=True, text=True, check=True)
     assert as_module.stdout.strip() == f"otsync {__version__}"
     for command in ("demo", "simulate", "match", "sync"):
         with pytest.raises(SystemExit) as stop:
