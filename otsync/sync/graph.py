@@ -216,13 +216,12 @@ def judged_by_cycles(residual: Float[np.ndarray, " E"], free: int) -> float:
 
 
 def _usual_variance(n: int, edges: Sequence[Edge]) -> Float[np.ndarray, " V"]:
-    """Half of the median variance of every video's edges that vouch for themselves, or of all; 0 without an edge."""
-    around: list[list[Edge]] = [[] for _ in range(n)]
+    """Half of the median variance of every video's edges, without what a doubt makes of it; 0 without an edge."""
+    around: list[list[float]] = [[] for _ in range(n)]
     for e in edges:
         for v in (e.a, e.b):
-            around[v].append(e)
-    sound = [[e for e in own if e.trusted] or own for own in around]
-    return np.array([float(np.median([e.sigma**2 / 2 for e in own])) if own else 0.0 for own in sound])
+            around[v].append((e.sigma / e.doubt) ** 2 / 2)
+    return np.array([float(np.median(v)) if v else 0.0 for v in around])
 
 
 def _common_variance(n: int, edges: Sequence[Edge]) -> Float[np.ndarray, " V"]:

@@ -204,14 +204,12 @@ def test_what_a_bad_pair_has_in_common_reaches_no_video_that_its_other_pairs_tel
     assert (with_bad >= sound).all() and (with_bad < 1.5 * sound).all()
 
 
-def test_what_flagged_pairs_say_of_themselves_is_no_error_of_their_videos():
+def test_what_a_doubt_makes_of_a_sigma_is_no_error_of_a_video():
     """Of a reference with one good pair of three, the answers were said to be off by a frame and more."""
     edges = edges_of(np.zeros(4), all_pairs(4), 0.2)
-    doubtful = [replace(e, sigma=3.0, trusted=False) if e.a == 0 and e.b > 1 else e for e in edges]
+    doubtful = [replace(e, sigma=0.6, doubt=3.0, trusted=False) if e.a == 0 and e.b > 1 else e for e in edges]
     sound, beside = (solve(4, e, 0, shared=0.35).sigma[1:] for e in (edges, doubtful))
-    assert (beside >= sound).all() and (beside < 2 * sound).all()
-    alone = [replace(e, sigma=3.0, trusted=False) for e in edges]
-    np.testing.assert_allclose(solve(4, alone, 0, shared=0.35).sigma[1:], 15 * sound)
+    assert (beside >= sound).all() and (beside < 1.7 * sound).all()
 
 
 @pytest.mark.parametrize("scale", [0.5, 1.0, 2.0])
