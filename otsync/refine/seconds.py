@@ -113,9 +113,9 @@ class Seconds:
 
         A clock that sways shows it in all of its seconds: what they are off by has more variance than their sigmas
         have. This is the difference, averaged by information (the method of moments of DerSimonian and Laird 1986,
-        about the answer) and cut off at 0: of an even clock it is some tenths of a second's own sigma by chance. A
-        second that is wild among the others counts as off by :data:`WILD` times as much as usual. A clock that bends by
-        less than single seconds can tell looks even.
+        about the answer), beyond one standard error of it: what ten seconds of an even clock show by chance, half of a
+        second's own variance, is none. A second that is wild among the others counts as off by :data:`WILD` times as
+        much as usual. A clock that bends by less than single seconds can tell looks even.
 
         Args:
             floor: as of :meth:`unsteady`.
@@ -126,7 +126,8 @@ class Seconds:
         chance = self.sigma[known] ** 2 + floor**2
         usual = max(1.0, float(np.median(self.late[known] ** 2 / chance)))
         excess = np.minimum(self.late[known] ** 2, WILD**2 * usual * chance) - chance
-        return math.sqrt(max(float(np.average(excess, weights=1 / chance)), 0.0))
+        by_chance = math.sqrt(2 * len(chance)) / float((1 / chance).sum())
+        return math.sqrt(max(float(np.average(excess, weights=1 / chance)) - by_chance, 0.0))
 
     def untold(self) -> float:
         """The larger sigma of the first and the last second, s, of those in which things move and which is far larger
