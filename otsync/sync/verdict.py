@@ -254,7 +254,9 @@ def _relocated(network: Network, x: np.ndarray, refit: Refit) -> Network:
             tasks.append((link, predicted / rates[e.a], rates[e.b] / rates[e.a]))
     for (link, start, _), again in zip(tasks, refit(tasks), strict=True):
         if abs(again.offset - start) <= CAPTURED:
-            moved = {"relocated": again.offset - link.scanned.offset, "contradicted": float(link.refined.status.ok)}
+            moved = {"relocated": again.offset - link.scanned.offset}
+            if link.refined.status.ok:
+                moved["vouched"] = link.refined.sigma
             kept.append(replace(link, refined=replace(again, stats=again.stats | moved)))
     return network.of(sorted(kept, key=lambda a: a.pair))
 
@@ -373,13 +375,12 @@ def _flags(
     Args:
         own: its links, and whether each agrees with the solution. in_reach: whether it is on the reference's clock.
     """
-    # a pair that vouched for another time, and was fitted anew at this one, does not vouch for this one
-    vouching = [
-        ok and not a.refined.stats.get("contradicted", 0.0)
-        for a, ok in own
-        if a.refined.status.ok or a.refined.stats.get("contradicted", 0.0)
-    ]
+    vouching = [ok for a, ok in own if a.refined.status.ok]
     contradicted = len(vouching) > 0 and sum(vouching) <= len(vouching) / 2
+    # a pair that vouched for another time, surer than those that vouch for this one: fitted anew it says little
+    moved = [a.refined.stats["vouched"] ** -2 for a, _ in own if "vouched" in a.refined.stats]
+    agreeing = [a.refined.sigma**-2 for a, ok in own if ok and a.refined.status.ok and "vouched" not in a.refined.stats]
+    contradicted |= len(moved) >= max(len(agreeing), 1) and sum(moved) > sum(agreeing)
     mismatch = sum(Status.RATE_MISMATCH in a.refined.flags for a, _ in own) > len(own) / 2
     # where others settle which of two returns is right, a lost one may still hide in what an ambiguous pair sees
     hidden = [trusted and a.scanned.stats.get("returns", 0.0) > 0 for a, _ in own]

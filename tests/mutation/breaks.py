@@ -1521,6 +1521,14 @@ BREAKS = (
         "a pair's offset is turned into world seconds by the other video's rate",
     ),
     Break(
+        "verdict-overruled-unheard",
+        "otsync/sync/verdict.py",
+        "contradicted |= len(moved) >= max(len(agreeing), 1) and sum(moved) > sum(agreeing)",
+        "contradicted |= False",
+        ("tests/otsync/sync/test_verdict.py",),
+        "a pair that vouched for another time is overruled by a less sure one, and nobody says so",
+    ),
+    Break(
         "verdict-relocated-rate",
         "otsync/sync/verdict.py",
         "tasks.append((link, predicted / rates[e.a], rates[e.b] / rates[e.a]))",

@@ -111,26 +111,28 @@ def test_a_pair_with_forced_matches_is_aligned():
         assert found.refined.flags == kept
 
 
-@pytest.mark.parametrize(("flags", "contradicted"), [((), True), ((Status.AMBIGUOUS,), False)])
-def test_two_pairs_that_vouch_for_different_times_leave_a_video_in_doubt(flags, contradicted):
+@pytest.mark.parametrize(
+    ("sigma", "flags", "contradicted"), [(0.018, (), True), (0.018, (Status.AMBIGUOUS,), False), (0.05, (), False)]
+)
+def test_a_surer_pair_that_vouches_for_another_time_leaves_a_video_in_doubt(sigma, flags, contradicted):
     """Of three pairs of a video one is flagged, and one vouches for a time that the other two overrule: it is fitted
     anew at theirs, and is no witness for it. Of four phones one was 12 frames off so, flagged as coarse alone.
     """
 
-    def told(offset: float, *doubts: Status) -> Alignment:
-        return Alignment(offset, sigma=0.01, fps=30.0, flags=doubts)
+    def told(offset: float, sigma: float, *doubts: Status) -> Alignment:
+        return Alignment(offset, sigma=sigma, fps=30.0, flags=doubts)
 
     def refit(tasks):
-        return [told(offset) for _, offset, _ in tasks]
+        return [told(offset, 0.02) for _, offset, _ in tasks]
 
-    late = {3: 0.5}
+    late, doubt = {3: 0.5}, {(0, 3): (Status.SPREAD,)}
     answers = [
-        Answer(p, NONE, *[told(late.get(p[1], 0.0), *(() if p != (0, 3) else (Status.SPREAD,)))] * 2)
+        Answer(p, NONE, *[told(late.get(p[1], 0.0), 0.02, *doubt.get(p, ()))] * 2)
         for p in itertools.combinations(range(4), 2)
     ]
-    astray = told(-2.0, *flags)
+    astray = told(-2.0, sigma, *flags)
     answers = [Answer(a.pair, NONE, astray, astray) if a.pair == (2, 3) else a for a in answers]
     found = judge(4, answers, 0, 0, Graph(curves=False), Trust(), refit)
-    assert found.x[3] == pytest.approx(0.5, abs=1e-3)
+    assert found.x[3] == pytest.approx(0.5, abs=0.15)
     assert (Status.INCONSISTENT in found.flags[3]) == contradicted
     assert not found.flags[1]
