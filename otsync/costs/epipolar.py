@@ -9,8 +9,8 @@ from jaxtyping import Float, Int
 
 from ..clocks.common import in_space
 from ..clocks.splines import TrackSplines
-from ..geometry import fundamentals, seen_pixels
-from ..types import Clock, TrackSet
+from ..geometry import fundamental_of, seen_pixels
+from ..types import Camera, Clock, TrackSet
 from .positions import all_pairs
 
 
@@ -60,14 +60,13 @@ class EpipolarDistance:
         xa = seen_pixels(a)
         at_b = self.clock.own(a.times)
         xb = TrackSplines(b.times, in_space(seen_pixels(b))).sample(at_b)[..., :2]
-        F = fundamentals(a.camera, b.camera)
-        frame_b = np.clip(np.round(np.interp(at_b, b.times, np.arange(len(b.times)))).astype(int), 0, F.shape[1] - 1)
+        frame_b = np.round(np.interp(at_b, b.times, np.arange(len(b.times)))).astype(int)
+        F = fundamental_of(a.camera.K, a.camera.w2c, b.camera.K, _at(b.camera, frame_b)).reshape(-1, 3, 3)
         fps = (len(a.times) - 1) / max(float(a.times[-1] - a.times[0]), 1e-9) if len(a.times) > 1 else 30.0
         motion, place = paired_epipolar_residuals(
             np.ascontiguousarray(xa),
             np.ascontiguousarray(xb),
             F,
-            frame_b,
             i,
             j,
             max(4, round(self.window * fps)),
@@ -78,3 +77,8 @@ class EpipolarDistance:
             np.log1p(motion / (self.motion_scale * unit) ** 2) + np.log1p(place / (self.position_scale * unit) ** 2)
         )
         return np.where(np.isfinite(cost), np.minimum(cost, self.cap), self.cap)
+
+
+def _at(camera: Camera, frames: Int[np.ndarray, " T"]) -> Float[np.ndarray, "*T 4 4"]:
+    """Its poses in these frames, or the one of a camera that stands still."""
+    return camera.w2c if camera.w2c.ndim == 2 else camera.w2c[frames]

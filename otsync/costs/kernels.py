@@ -100,15 +100,15 @@ def add_frame_distances(A, B, pairs_a, pairs_b, total, count):
 
 
 @kernel()
-def paired_epipolar_residuals(A, B, F, frame_b, pairs_a, pairs_b, window, least):
+def paired_epipolar_residuals(A, B, F, pairs_a, pairs_b, window, least):
     """Signed Sampson residuals of A[i,t] and B[j,t] (pixels, nan unseen) at equal times: (variance, mean square).
 
-    F (Fa,Fb,3,3): one per pose, axes of length 1 when static; ``frame_b``: b's frame at each time. The variance is
-    within windows of ``window`` frames; nan below ``least`` samples.
+    F (T,3,3): at each time, or one (1,3,3) of cameras that stand still. The variance is within windows of ``window``
+    frames; nan below ``least`` samples.
     """
     variance, square = np.full(len(pairs_a), np.nan), np.full(len(pairs_a), np.nan)
     T = A.shape[1]
-    moves_a, moves_b = F.shape[0] > 1, F.shape[1] > 1
+    moves = F.shape[0] > 1
     for p in range(len(pairs_a)):
         i, j = pairs_a[p], pairs_b[p]
         within, raw, n_raw = 0.0, 0.0, 0
@@ -116,7 +116,7 @@ def paired_epipolar_residuals(A, B, F, frame_b, pairs_a, pairs_b, window, least)
         for t in range(T):
             xa, ya, xb, yb = A[i, t, 0], A[i, t, 1], B[j, t, 0], B[j, t, 1]
             if not (np.isnan(xa) or np.isnan(xb)):
-                G = F[t if moves_a else 0, frame_b[t] if moves_b else 0]
+                G = F[t if moves else 0]
                 l0 = G[0, 0] * xa + G[0, 1] * ya + G[0, 2]
                 l1 = G[1, 0] * xa + G[1, 1] * ya + G[1, 2]
                 l2 = G[2, 0] * xa + G[2, 1] * ya + G[2, 2]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -100,26 +100,56 @@ class Lines:
 
 
 @dataclass(frozen=True, eq=False)
-class Views:
-    """The epipolar geometry of all frames of both videos' even clocks; axes of length 1 for cameras that stand still.
+class Rays:
+    """A camera in each of its frames, or in one where it stands still.
 
     Args:
-        F: (Fa,Fb,3,3). turn: (Fb,4,3), of b: see :meth:`Moves.turns`.
+        back: (T,3,3) from pixels (x, y, 1) to rays in the world. line: (T,3,3) from normals of planes through the
+            centre to lines in the picture. centre: (T,3).
     """
 
-    F: Float[np.ndarray, "Fa Fb 3 3"]
-    turn: Float[np.ndarray, "Fb 4 3"]
+    back: Float[np.ndarray, "T 3 3"]
+    line: Float[np.ndarray, "T 3 3"]
+    centre: Float[np.ndarray, "T 3"]
+
+    @classmethod
+    def of(cls, K: Float[np.ndarray, "3 3"], poses: Float[np.ndarray, "T 4 4"]) -> Rays:
+        R, inverse = poses[:, :3, :3], np.linalg.inv(K)
+        back = np.swapaxes(R, 1, 2) @ inverse
+        return cls(back, inverse.T @ R, -np.einsum("tji,tj->ti", R, poses[:, :3, 3]))
+
+    def within(self, frames: slice) -> Rays:
+        """Those of some frames."""
+        return self if len(self.back) == 1 else Rays(self.back[frames], self.line[frames], self.centre[frames])
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """The epipolar geometry of all frames of both videos' even clocks. No matrix for each pair of frames: those of two
+    phones that were held for three minutes would take 2 GB.
+
+    Args:
+        turn: (Tb,4,3), of b: see :meth:`Moves.turns`.
+    """
+
+    a: Rays
+    b: Rays
+    turn: Float[np.ndarray, "Tb 4 3"]
 
     @classmethod
     def of(cls, a: TrackSet, b: TrackSet, fps: float) -> Views:
         moves, times = (Moves.of(a), Moves.of(b)), (on_even_clock(a, fps), on_even_clock(b, fps))
-        poses = [m.at(t) for m, t in zip(moves, times, strict=True)]
-        Ka, Kb = (m.camera.K for m in moves)
-        return cls(fundamental_of(Ka, poses[0][:, None], Kb, poses[1][None]), moves[1].turns(times[1]))
+        one, two = (Rays.of(m.camera.K, m.at(t)) for m, t in zip(moves, times, strict=True))
+        return cls(one, two, moves[1].turns(times[1]))
+
+    def F(self, i: int, j: int) -> Float[np.ndarray, "3 3"]:
+        """The fundamental matrix of a's frame i and b's frame j, 0 of cameras that stand still."""
+        x, y, z = self.a.centre[i] - self.b.centre[j]
+        return self.b.line[j] @ np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ self.a.back[i]
 
     def within(self, frames: slice) -> Views:
         """Those of some frames of a."""
-        return Views(self.F[frames], self.turn) if len(self.F) > 1 else self
+        return replace(self, a=self.a.within(frames))
 
 
 def not_turned(

@@ -275,8 +275,13 @@ def residuals_by_lag(
     many = np.where(long, np.maximum(0, high - low + 1), 0)
     edge = np.concatenate([[0], np.cumsum(many)])
     mean, count = np.full((2, edge[-1]), np.nan), np.zeros((2, edge[-1]))
-    arrays = np.ascontiguousarray(xa), np.ascontiguousarray(xb), views.F, views.turn, pairs, lives_a, lives_b, low, edge
-    epipolar_evidence(*arrays, least, window, least_in_window, APART_BY**-2, mean, count)
+    still = len(views.a.back) == len(views.b.back) == 1
+    F = views.F(0, 0) if still else np.zeros((3, 3))
+    lines = (*(np.ascontiguousarray(x) for rays in (views.a, views.b) for x in (rays.back, rays.line, rays.centre)),)
+    arrays = np.ascontiguousarray(xa), np.ascontiguousarray(xb), F, *lines, views.turn
+    epipolar_evidence(
+        *arrays, pairs, lives_a, lives_b, low, edge, still, least, window, least_in_window, APART_BY**-2, mean, count
+    )
     candidate = np.repeat(np.arange(len(pairs)), many)
     lag = np.arange(edge[-1]) - edge[candidate] + low[candidate] - lags[0]
     return Told(candidate, lag, mean, count, np.full(mean.shape, np.nan))

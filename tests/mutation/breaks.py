@@ -921,8 +921,8 @@ BREAKS = (
     Break(
         "epipolar-pose-of-the-wrong-frame",
         "otsync/epipolar/kernels.py",
-        "G = F[t if F.shape[0] > 1 else 0, t - k if moves_b else 0]",
-        "G = F[t if F.shape[0] > 1 else 0, t % B.shape[1] if moves_b else 0]",
+        "u, v = t if moves_a else 0, t - k if moves_b else 0",
+        "u, v = t if moves_a else 0, t % B.shape[1] if moves_b else 0",
         EPIPOLAR,
         "a moving camera b stands where it stood at a's frame",
     ),

@@ -31,17 +31,21 @@ def test_the_distance_at_equal_times_is_the_mean_over_the_frames_that_both_see(l
     assert (found[:, 3] == 1e9).all() and (found[:, :3] < 1e9).all()
 
 
-def test_epipolar_residuals_are_sampsons_and_vary_within_windows():
+@pytest.mark.parametrize("moves", [False, True])
+def test_epipolar_residuals_are_sampsons_and_vary_within_windows(moves):
     rng = np.random.default_rng(0)
-    first, second = ring(4, width=640, height=360)[:2]
-    F = fundamentals(first, second)
+    first, second, third = ring(4, width=640, height=360)[:3]
+    F = np.repeat(fundamentals(first, second)[0], 25 if moves else 1, 0)
+    if moves:
+        F[::2] = fundamentals(first, third)[0, 0]
     A, B = rng.uniform(0, 300, (3, 25, 2)), rng.uniform(0, 300, (2, 25, 2))
     A[0, 4:9], B[1, ::3] = np.nan, np.nan
     i, j = np.divmod(np.arange(6), 2)
-    motion, place = paired_epipolar_residuals(A, B, F, np.zeros(25, int), i, j, 10, 4)
+    motion, place = paired_epipolar_residuals(A, B, F, i, j, 10, 4)
     for p in range(6):
         known = np.isfinite(A[i[p], :, 0]) & np.isfinite(B[j[p], :, 0])
-        e = np.where(known, sampson(F[0, 0], A[i[p]], B[j[p]]), np.nan)
+        each = [sampson(F[t % len(F)], A[i[p], [t]], B[j[p], [t]])[0] for t in range(25)]
+        e = np.where(known, each, np.nan)
         parts = [e[s : s + 10] for s in (0, 10, 20)]
         spread = sum(np.nansum((part - np.nanmean(part)) ** 2) for part in parts)
         assert motion[p] == pytest.approx(spread / known.sum())

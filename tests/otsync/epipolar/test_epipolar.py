@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from otsync import Alignment, Matches, Status, TrackSet, synchronize
 from otsync.align.peaks import separate_peaks
 from otsync.costs.positions import CurveDistance, MedianPosition, SynchronousDistance, capped, scene_scale
-from otsync.epipolar.poses import Moves, Views, not_turned
+from otsync.epipolar.poses import Moves, Rays, Views, not_turned
 from otsync.epipolar.refine import COMMON_ERRORS, EpipolarRefine
 from otsync.epipolar.residuals import APART_BY, Residuals, Step, detrended
 from otsync.epipolar.scan import TRACK_CAP, EpipolarScan, Told, mixture, residuals_by_lag
@@ -312,7 +312,9 @@ def test_a_moving_camera_stands_at_every_frame_where_its_pose_says():
     A[0, 7:9] = np.nan
     F, pairs = fundamentals(a, moving), np.array([[0, 0], [1, 0]])
     turn = Moves(moving, np.arange(20) / FPS).turns(np.arange(20) / FPS) + 0.01 * rng.normal(size=(20, 4, 3))
-    told = residuals_by_lag(A, B, Views(F, turn), pairs, np.arange(-3, 6), 4, 10, 3)
+    views = Views(Rays.of(a.K, a.w2c[None]), Rays.of(moving.K, poses), turn)
+    np.testing.assert_allclose(views.F(0, 7) / np.linalg.norm(views.F(0, 7)), F[0, 7], atol=1e-12)
+    told = residuals_by_lag(A, B, views, pairs, np.arange(-3, 6), 4, 10, 3)
     mean, count = np.full((2, 2, 9), np.nan), np.zeros((2, 2, 9))
     mean[:, told.candidate, told.lag], count[:, told.candidate, told.lag] = told.mean, told.count
     for m in range(2):
@@ -347,8 +349,9 @@ def test_only_lags_at_which_both_tracks_live_are_asked_and_none_is_forgotten(see
         for track in x:
             begin, end = np.sort(rng.integers(0, len(track) + 1, 2))
             track[:begin], track[end:], track[rng.random(len(track)) < 0.2] = np.nan, np.nan, np.nan
-    F, pairs = rng.normal(size=(1, 1, 3, 3)), np.argwhere(np.ones((3, 3)))
-    views = Views(F, np.zeros((1, 4, 3)))
+    one, two = ring(4, width=640, height=360)[:2]
+    F, pairs = fundamentals(one, two), np.argwhere(np.ones((3, 3)))
+    views = Views(*(Rays.of(c.K, c.w2c[None]) for c in (one, two)), np.zeros((1, 4, 3)))
     lags = np.arange(-frames[1] + 5, frames[0] - 4)
     told = residuals_by_lag(A, B, views, pairs, lags, least, window, within)
     for m, k in zip(told.candidate, told.lag, strict=True):
@@ -470,14 +473,17 @@ def test_a_camera_is_known_at_every_moment():
         None, uv=uv, camera=replace(still, w2c=poses[kept]), timestamps=kept / 30, frame="world", name="a"
     )
     fixed = TrackSet(None, uv=uv, camera=other, fps=30.0, frame="world", name="b")
-    F = Views.of(moving, fixed, 30.0).F
-    assert F.shape == (30, 1, 3, 3)
+    views, back = Views.of(moving, fixed, 30.0), Views.of(fixed, moving, 30.0)
     for k in kept:
-        np.testing.assert_allclose(F[k, 0], fundamental(replace(still, w2c=poses), other, k), atol=1e-12)
+        F = views.F(k, 0)
+        true = fundamental(replace(still, w2c=poses), other, k)
+        np.testing.assert_allclose(F / np.linalg.norm(F), true, atol=1e-12)
+        np.testing.assert_allclose(back.F(0, k), F.T, atol=1e-9 * np.abs(F).max())
     half = (np.arange(10) + 0.5) / 30
     np.testing.assert_allclose(Moves.of(moving).at(half), moving_poses(still, half), atol=2e-3)
     np.testing.assert_allclose(Moves.of(moving).at(np.array([-1.0, 2.0])), poses[[0, -1]])
-    assert Views.of(fixed, moving, 30.0).F.shape == (1, 30, 3, 3) and Views.of(fixed, fixed, 30.0).F.shape[:2] == (1, 1)
+    assert len(views.a.back) == 30 and len(views.b.back) == len(views.turn) == 1
+    assert len(views.within(slice(4, 9)).a.back) == 5 and len(back.within(slice(4, 9)).a.back) == 1
     few = Moves(replace(still, w2c=poses[:3]), kept[:3] / 30)
     np.testing.assert_allclose(few.at(np.array([0.04])), poses[[1]])
 
