@@ -488,6 +488,21 @@ def test_a_camera_is_known_at_every_moment():
     np.testing.assert_allclose(few.at(np.array([0.04])), poses[[1]])
 
 
+def test_views_of_two_cameras_that_move_grow_with_the_clip_and_not_with_its_square():
+    one, two = ring(2, width=640, height=360)
+    sizes = []
+    for frames in (40, 80):
+        t = np.arange(frames) / FPS
+        sets = [
+            TrackSet(None, uv=np.ones((1, frames, 2)), camera=replace(c, w2c=moving_poses(c, t)), fps=FPS, name=n)
+            for c, n in ((one, "a"), (two, "b"))
+        ]
+        views = Views.of(*sets, FPS)
+        arrays = [x for rays in (views.a, views.b) for x in vars(rays).values()]
+        sizes.append(sum(x.nbytes for x in (*arrays, views.turn)))
+    assert sizes[1] == 2 * sizes[0]
+
+
 def moving_poses(camera: Camera, times: np.ndarray) -> np.ndarray:
     """(T,4,4) of a camera that sways by 8 cm and 2 degrees, once a second."""
     from scipy.spatial.transform import Rotation
