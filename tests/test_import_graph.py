@@ -35,6 +35,7 @@ epipolar frames calibrate
 sync
 recordings
 report export bench cli
+__main__
 """
 """Floors of otsync, ground first: a folder (or file) knows what stands on floors below, and what ``BESIDE`` allows."""
 
@@ -49,6 +50,7 @@ features view
 pipeline
 bench
 cli
+__main__
 """
 
 BESIDE = {
