@@ -51,11 +51,15 @@ BESIDE, OFF, OTHERS = 0.45, 1.5 / 30, 10 / 30
 of the answer is the best (46 worlds of mid noise); beside a slow motion that is taken for lost frames one that is 2 to
 7 frames off (10 of 10)."""
 
-SHORT = 0.9
+SHORT = 1.5
 """Seconds below which what its matches differ by does not cover the error of a part: 48 and 79 % of .65 s of mid worlds
 lie within one and two such sigmas, 57 and 87 % of .8 s, 70 and 93 % of 1 s. With what the seconds of the other part
 differ by it is 71 and 93 % of .65 s and 63 and 97 % of .8 s (all on 600 to 629, which it was chosen on). On 640 to 655
-it is 67 and 86, and 56 and 84 %: still too few; and of 1 s, even with it, 56 and 84 %."""
+it is 67 and 86, and 56 and 84 %: still too few; and of 1 s, even with it, 56 and 84 %. A part of 1.2 s was off by .9
+frame at a sigma of .15 (80469), so that a jump was rounded to the wrong frame."""
+
+UNTOLD = 2.0
+"""Times the sigma of a short part beyond which there are no two seconds that could tell how far one is off."""
 
 MOST = 4
 """Breaks that are mended, at most."""
@@ -180,13 +184,17 @@ def _offsets(
 
 
 def sigma_of_part(fit: Fit | None, other: Fit | None, length: float) -> float:
-    """One sigma, s, of the offset of a part that is ``length`` s long. In less than a second all matches err alike, and
-    do not show it: there the seconds of the part beyond the break tell how far one is off that holds so much motion.
+    """One sigma, s, of the offset of a part that is ``length`` s long. In little more than a second all matches err
+    alike, and do not show it: there the seconds of the part beyond the break tell how far one is off that holds so much
+    motion.
     """
     if fit is None:
         return math.nan
     own = math.sqrt(float(fit.covariance[0, 0]))
-    return own if other is None or length >= SHORT else math.hypot(own, other.off_by(fit.information))
+    if other is None or length >= SHORT:
+        return own
+    off = other.off_by(fit.information)
+    return math.hypot(own, off) if off > 0 else UNTOLD * own
 
 
 def _length(a: TrackSplines, b: TrackSplines, part: Part) -> float:

@@ -407,10 +407,11 @@ def test_a_second_is_off_by_as_much_as_other_seconds_differ():
     assert fitted(1, 7.0, wander=0.1).off_by(7.0) == 0.0  # a single second does not differ from itself
 
 
-def test_less_than_a_second_heeds_the_seconds_beyond_its_break():
+def test_little_more_than_a_second_heeds_the_seconds_beyond_its_break():
     short, long = fitted(1, 7.0, sigma=0.003), fitted(4, 28.0, wander=0.01, sigma=0.002)
     assert sigma_of_part(short, long, 0.6) == pytest.approx(np.hypot(0.003, long.off_by(7.0)))
-    assert sigma_of_part(short, long, 1.0) == pytest.approx(0.003)
+    assert sigma_of_part(short, long, 1.6) == pytest.approx(0.003)
+    assert sigma_of_part(short, replace(long, seconds=1), 0.6) == pytest.approx(0.006)  # nothing tells
     assert sigma_of_part(long, short, 4.0) == pytest.approx(0.002)
     assert sigma_of_part(short, None, 0.6) == pytest.approx(0.003)
     assert np.isnan(sigma_of_part(None, long, 0.6))
