@@ -1090,7 +1090,7 @@ BREAKS = (
     Break(
         "few-seconds-do-not-differ",
         "otsync/sync/breaks.py",
-        "return own if other is None or length >= SHORT else math.hypot(own, other.off_by(fit.information))",
+        "return math.hypot(own, off) if off > 0 else UNTOLD * own",
         "return own",
         ("tests/otsync/sync/test_breaks.py",),
         "a second behind a break says that it is known as well as its matches agree",
