@@ -151,7 +151,11 @@ def test_from_videos_alone_to_offsets(handheld, tmp_path, capsys):
     assert np.abs(found.frames - true.frames)[1:].mean() < 0.15
     # once more, from what is kept, with a distance, and without it
     capsys.readouterr()
-    assert main(["calibrate", str(tmp_path / "w"), "--distance", "phone0", "phone1", "4.2"]) == 0
+    measured = main(["calibrate", str(tmp_path / "w"), "--distance", "phone0", "phone1", "4.2"])
+    if handheld:  # phones in hands have no one distance
+        assert measured == 2 and "--distance: expected two static cameras" in capsys.readouterr().err
+        return
+    assert measured == 0
     assert "in metres" not in capsys.readouterr().err
     assert main(["calibrate", str(tmp_path / "w")]) == 0
     assert "the cameras were in metres" in capsys.readouterr().err
