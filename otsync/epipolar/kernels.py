@@ -9,20 +9,20 @@ from ..compute.jit import kernel
 
 @kernel()
 def epipolar_evidence(
-    A, B, F, back_a, line_a, centre_a, back_b, line_b, centre_b, turn, pairs, lives_a, lives_b, low, edge,
-    still, min_frames, window, min_window, prior, mean, count,
-):  # fmt: skip
+    A, B, F, rays_a, rays_b, turn, pairs, lives_a, lives_b, low, edge, still, least, window, prior, mean, count
+):
     """Epipolar residuals of candidate pairs at every lag at which both tracks live.
 
     A (Na,Ta,2), B (Nb,Tb,2): pixels, nan unseen; lives_a (Na,2), lives_b (Nb,2): the frames from which on, and before
-    which, each is seen. F (3,3): of cameras that are ``still``; of others the arrays of :class:`.poses.Rays`, one
-    entry per frame or one. Frame t of a meets frame t - k of b; candidate m is asked at the lags from low[m] on, whose
-    answers stand from edge[m] to edge[m + 1]: in ``mean[0]`` the residuals' mean square per sample, over windows of
-    ``window`` frames (aligned to a's clock) without their mean or, where a camera moves, without what a constant
-    distance of the two points makes of them (``turn`` (Fb,4,3): how b turned; ``prior``: least squares' ridge); in
-    ``mean[1]`` the raw one; nan where fewer than ``min_frames`` samples (``min_window`` per window) exist; and in
-    ``count`` the samples behind each.
+    which, each is seen. F (3,3): of cameras that are ``still``; of others rays_a, rays_b: the arrays of
+    :class:`.poses.Rays` in order, one entry per frame or one. Frame t of a meets frame t - k of b; candidate m is asked
+    at the lags from low[m] on, whose answers stand from edge[m] to edge[m + 1]: in ``mean[0]`` the residuals' mean
+    square per sample, over windows of ``window`` frames (aligned to a's clock) without their mean or, where a camera
+    moves, without what a constant distance of the two points makes of them (``turn`` (Tb,4,3): how b turned;
+    ``prior``: least squares' ridge); in ``mean[1]`` the raw one; nan where fewer samples than ``least`` (in all, and in
+    a window) exist; and in ``count`` the samples behind each.
     """
+    (back_a, line_a, centre_a), (back_b, line_b, centre_b), (min_frames, min_window) = rays_a, rays_b, least
     moves_a, moves_b = back_a.shape[0] > 1, back_b.shape[0] > 1
     for m in range(pairs.shape[0]):
         i, j = pairs[m, 0], pairs[m, 1]

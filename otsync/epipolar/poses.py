@@ -118,6 +118,11 @@ class Rays:
         back = np.swapaxes(R, 1, 2) @ inverse
         return cls(back, inverse.T @ R, -np.einsum("tji,tj->ti", R, poses[:, :3, 3]))
 
+    @property
+    def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """In order, as compiled loops read them."""
+        return np.ascontiguousarray(self.back), np.ascontiguousarray(self.line), np.ascontiguousarray(self.centre)
+
     def within(self, frames: slice) -> Rays:
         """Those of some frames."""
         return self if len(self.back) == 1 else Rays(self.back[frames], self.line[frames], self.centre[frames])

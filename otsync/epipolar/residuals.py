@@ -115,10 +115,10 @@ class Residuals:
         """Sampson distances in pixels, nan where either is unseen."""
         return self._distances(offset)[0]
 
-    def _distances(self, offset: float) -> tuple[Float[np.ndarray, "M T"], Float[np.ndarray, "M T 2"] | None]:
-        """Sampson distances in pixels, nan where either is unseen; and, where a camera moves, how they change with how
-        far apart two points of one body look in b.
-        """
+    def _distances(
+        self, offset: float
+    ) -> tuple[Float[np.ndarray, "M T"], Float[np.ndarray, "M T 2"], Float[np.ndarray, "M T 2"]]:
+        """Sampson distances in pixels, nan where either is unseen; how they change with b's pixels; and these."""
         t = self.times - offset
         xb = self.splines.sample(t)[..., :2]
         hb = homogeneous(xb)
@@ -129,8 +129,7 @@ class Residuals:
             la, lb = np.einsum("tij,mtj->mti", F, homogeneous(self.xa)), np.einsum("tij,mti->mtj", F, hb)
         norm = np.sqrt(la[..., 0] ** 2 + la[..., 1] ** 2 + lb[..., 0] ** 2 + lb[..., 1] ** 2)
         norm = np.maximum(norm, 1e-300)
-        e = (hb * la).sum(2) / norm
-        return e, None if self.lines.still else not_turned(la[..., :2] / norm[..., None], xb, self.lines.b.turns(t))
+        return (hb * la).sum(2) / norm, la[..., :2] / norm[..., None], xb
 
     @cached_property
     def of_a(self) -> Float[np.ndarray, "M T 3"]:
@@ -142,10 +141,14 @@ class Residuals:
         start, step, half = offset, 0.5 / self.fps, max(LEAST_HALF, round(window * self.fps))
         found = nothing = Step(*np.zeros((3, *self.xa.shape[:2])))
         for _ in range(iterations):
-            e, apart = self._distances(offset)
+            e, across, xb = self._distances(offset)
             J = (self.residual(offset + step) - self.residual(offset - step)) / (2 * step)
             known = np.isfinite(e) & np.isfinite(J)
-            R, J = (detrended(x, known, half) if apart is None else without(x, apart, known, half) for x in (e, J))
+            if self.lines.still:
+                R, J = detrended(e, known, half), detrended(J, known, half)
+            else:
+                apart = not_turned(across, xb, self.lines.b.turns(self.times - offset))
+                R, J = without(e, apart, known, half), without(J, apart, known, half)
             enough = known.sum(1) >= MIN_SEEN * self.fps
             known &= enough[:, None]
             if not known.any():

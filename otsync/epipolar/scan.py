@@ -277,11 +277,9 @@ def residuals_by_lag(
     mean, count = np.full((2, edge[-1]), np.nan), np.zeros((2, edge[-1]))
     still = len(views.a.back) == len(views.b.back) == 1
     F = views.F(0, 0) if still else np.zeros((3, 3))
-    lines = (*(np.ascontiguousarray(x) for rays in (views.a, views.b) for x in (rays.back, rays.line, rays.centre)),)
-    arrays = np.ascontiguousarray(xa), np.ascontiguousarray(xb), F, *lines, views.turn
-    epipolar_evidence(
-        *arrays, pairs, lives_a, lives_b, low, edge, still, least, window, least_in_window, APART_BY**-2, mean, count
-    )
+    arrays = np.ascontiguousarray(xa), np.ascontiguousarray(xb), F, views.a.arrays, views.b.arrays, views.turn
+    limits = (least, least_in_window), window, APART_BY**-2
+    epipolar_evidence(*arrays, pairs, lives_a, lives_b, low, edge, still, *limits, mean, count)
     candidate = np.repeat(np.arange(len(pairs)), many)
     lag = np.arange(edge[-1]) - edge[candidate] + low[candidate] - lags[0]
     return Told(candidate, lag, mean, count, np.full(mean.shape, np.nan))

@@ -953,8 +953,8 @@ BREAKS = (
     Break(
         "epipolar-shake-stays",
         "otsync/epipolar/residuals.py",
-        "detrended(x, known, half) if apart is None else without(x, apart, known, half)",
-        "detrended(x, known, half)",
+        "R, J = without(e, apart, known, half), without(J, apart, known, half)",
+        "R, J = detrended(e, known, half), detrended(J, known, half)",
         EPIPOLAR,
         "what a shaking camera makes of two points of one body passes for time",
     ),
