@@ -103,6 +103,17 @@ def seen_pixels(tracks: TrackSet) -> Float[np.ndarray, "N T 2"]:
     return np.where(tracks.seen[..., None], tracks.uv, np.nan).astype(float)
 
 
+def directions(camera: Camera, uv: Float[np.ndarray, "N T 2"]) -> Float[np.ndarray, "N T 3"]:
+    """Whither pixels look: directions in the world, of length 1, so that the turns of a camera that moves are out.
+
+    A moving camera needs one w2c per frame of ``uv``'s second axis.
+    """
+    away = np.concatenate([uv, np.ones((*uv.shape[:2], 1))], 2) @ np.linalg.inv(camera.K).T
+    away /= np.linalg.norm(away, axis=2, keepdims=True)
+    turn = camera.w2c[..., :3, :3]
+    return away @ turn if turn.ndim == 2 else np.einsum("tji,ntj->nti", turn, away)
+
+
 def view_angle(a: Camera, b: Camera, target: Float[np.ndarray, " 3"]) -> float:
     """Degrees between the directions from ``target`` to both cameras (first poses)."""
     va, vb = (np.atleast_2d(c.center)[0] - target for c in (a, b))

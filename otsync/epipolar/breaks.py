@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..clocks.common import nominal_fps, on_clock, within
-from ..clocks.cuts import Steps
+from ..clocks.cuts import CLEAR_PATH, Steps
 from ..clocks.lengths import jumping
 from ..clocks.stillness import pauses
 from ..geometry import seen_pixels
@@ -53,6 +53,9 @@ picture that stood still tells it by itself."""
 AGREED = 1 / 30
 """Seconds within which most of a video's pairs must measure the same jump; what they say they know it to adds to it."""
 
+NEARBY = 5 / 30
+"""Seconds within which what tracks and what the camera show is one cut."""
+
 ROUNDING = 1e-6
 """Seconds by which a frame may lie beside a moment."""
 
@@ -76,10 +79,12 @@ class Moment:
 
     Args:
         start: until then it ran. at: from then on it runs again; later where it stood still between them.
+        sure: whether the path of its camera is cut there. Then both pieces must vouch for the same offset.
     """
 
     start: float
     at: float
+    sure: bool = False
 
     @property
     def still(self) -> float:
@@ -95,7 +100,8 @@ class Found:
     """A video whose clock breaks.
 
     Args:
-        doubt: nats by which another offset suits one of its pieces better. gain: by which two offsets suit both.
+        doubt: nats by which another offset suits one of its pieces better; infinite where its camera's path is cut and
+            the pieces do not vouch for one. gain: nats by which two offsets suit both.
         broke: how its pairs measure it; None where they do not agree, or are too few.
     """
 
@@ -111,10 +117,11 @@ def moments(tracks: TrackSet) -> list[Moment]:
     rests = sorted(pauses(x), key=lambda p: p[0] - p[1])[:MOST_MOMENTS]
     steps = Steps.in_pixels(tracks)
     cuts = sorted(steps.cuts(), key=lambda k: -float(steps.jolts[k - 1]))[:MOST_MOMENTS]
+    sure = [Moment(float(t[k]), float(t[k]), True) for k in Steps.of_camera(tracks).cuts(CLEAR_PATH)]
     told = [Moment(float(t[i]), float(t[j])) for i, j in rests]
-    told += [Moment(float(t[k]), float(t[k])) for k in cuts]
+    told += [Moment(float(t[k]), float(t[k])) for k in cuts if not any(abs(t[k] - m.at) <= NEARBY for m in sure)]
     long = [m for m in told if m.start - t[0] >= LEAST_PIECE - 1e-9 and t[-1] - m.at >= LEAST_PIECE - 1e-9]
-    return long[:MOST_MOMENTS]
+    return [*sure, *long][:MOST_MOMENTS]
 
 
 def find_breaks(
@@ -139,7 +146,8 @@ def find_breaks(
         told = []
         for moment in all_moments:
             pieces = asked.pieces(moment)
-            told.append((*pieces.best(*moment.jumps(1 / nominal_fps(tracks[v]))), pieces.doubt(), moment))
+            doubt = math.inf if moment.sure and not pieces.vouched() else pieces.doubt()
+            told.append((*pieces.best(*moment.jumps(1 / nominal_fps(tracks[v]))), doubt, moment))
         doubt = max((t[3] for t in told), default=0.0)
         if doubt <= DOUBTED:
             continue
@@ -311,7 +319,7 @@ class Evidence:
             least, most: s by which it may be larger.
         """
         fps = 1 / (self.offsets[1] - self.offsets[0])
-        same = round(SAME * fps)
+        same = math.floor(SAME * fps + 1e-6)
         one, _, _ = max(self._joint(d) for d in range(-same, same + 1))
         asked = [d for d in range(math.ceil(least * fps - 1e-6), math.floor(most * fps + 1e-6) + 1) if abs(d) > same]
         two, k, d = max((self._joint(d) for d in asked), default=(-math.inf, 0, 0))
@@ -321,12 +329,18 @@ class Evidence:
         """Nats by which another offset suits one of the pieces better than the one that suits both; of pieces that
         others have filmed, too. What suits a piece no better than nothing (0 nats) is no offset of it.
         """
-        same = round(SAME / (self.offsets[1] - self.offsets[0]))
+        same = math.floor(SAME / (self.offsets[1] - self.offsets[0]) + 1e-6)
         k = int((self.before + self.behind).argmax())
         near = slice(max(0, k - same), k + same + 1)
         pieces = zip((self.before, self.behind), self.shared[:, k] >= LEAST_PIECE, strict=True)
         told = (float(piece.max()) - max(float(piece[near].max()), 0.0) for piece, filmed in pieces if filmed)
         return max([0.0, *told])
+
+    def vouched(self) -> bool:
+        """Whether both pieces, each by itself, tell the same offset."""
+        same = math.floor(SAME / (self.offsets[1] - self.offsets[0]) + 1e-6)
+        one, two = int(self.before.argmax()), int(self.behind.argmax())
+        return abs(one - two) <= same and min(self.before[one], self.behind[two]) > DOUBTED
 
     def _joint(self, d: int) -> tuple[float, int, int]:
         """(most nats of an offset before, and one behind that is d frames larger; the index of the former; d)."""

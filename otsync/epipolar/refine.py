@@ -93,6 +93,7 @@ class EpipolarRefine(Refiner):
             raised.append(Status.MOVED)
         if broken(wander, blur):
             raised.append(Status.BROKEN_CLOCK)
+        rate, rate_sigma = problem.rate(offset, self.windows[0], self.iterations)
         stats = alignment.stats | {
             "moved": abs(offset - alignment.offset),
             "spread": spread,
@@ -102,6 +103,8 @@ class EpipolarRefine(Refiner):
             "blur": blur,
             "fitted_matches": float(len(problem.weight)),
         }
+        if math.isfinite(rate_sigma):
+            stats |= {"fitted_rate": 1 + rate, "rate_sigma": rate_sigma}
         ordered = in_order(raised)
         return replace(
             alignment,

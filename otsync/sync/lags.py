@@ -17,9 +17,11 @@ from jaxtyping import Float, Int
 
 from ..clocks.splines import TrackSplines
 from ..compute.indices import evenly
+from ..compute.medians import known_median
 from ..costs.linear import binary_scale
+from ..geometry import directions
 from ..refine.samples import Pieces, detrended
-from ..types import Status, TrackSet, in_order
+from ..types import Status, TrackSet
 from .verdict import Answer
 
 NEIGHBOURS = 3
@@ -86,6 +88,8 @@ class Lag:
 def lag_of(tracks: TrackSet) -> Lag:
     """How much the tracks of a video lag behind each other; by positions where there are any, otherwise by pixels.
 
+    Of pixels of a camera that moves its own motion is taken out.
+
     With x, y two neighbours, their mean velocity w, all without their means over ± :data:`WINDOW`, a second of delay
     of one makes x - y grow by w. Noise is not late: what a pair says in one second has nothing to do with what it says
     in another, while a delay is the same in all. So the spread² is the mean over pairs, and over all pairs of
@@ -100,6 +104,7 @@ def lag_of(tracks: TrackSet) -> Lag:
     if not len(i):
         return Lag(0.0, 0.0)
     sums, moved = [], np.zeros((3, len(i)))
+    shakes = tracks.xyz is None and tracks.camera is not None and tracks.camera.w2c.ndim == 3
     parts = Pieces.at(frame, len(times), WINDOW)
     index = np.arange(len(times))
     within = (index >= parts.near) & (index < len(times) - parts.near)
@@ -108,6 +113,10 @@ def lag_of(tracks: TrackSet) -> Lag:
         t = times[frames]
         curves = TrackSplines(t, _positions(tracks, frames) / unit)
         x, v, seen = curves.joined(t), curves.velocity(t), curves.support(t)
+        if shakes:
+            # what a hand that sways does to all at once is no motion that two things have in common
+            drift = np.nan_to_num(known_median(np.where(seen[..., None], v, np.nan), 0))
+            x, v = x - np.cumsum(drift, 0) * frame, v - drift
         both = seen[i] & seen[j]
         p, q, w = (detrended(d, both, parts.near) for d in (x[i], x[j], (v[i] + v[j]) / 2))
         # a window that the clip cuts leaves half of a steady motion in, which things have in common by chance
@@ -155,7 +164,11 @@ def _positions(tracks: TrackSet, frames: slice | Int[np.ndarray, " F"]) -> Float
         assert tracks.uv is not None
         seen = tracks.seen[:, frames][some, :, None]
         uv = np.where(seen, tracks.uv[:, frames][some], np.nan)
-        x = np.concatenate([uv, np.where(seen, 0.0, np.nan)], 2)
+        camera = tracks.camera
+        if camera is not None and camera.w2c.ndim == 3:
+            x = camera.K[0, 0] * directions(replace(camera, w2c=camera.w2c[frames]), uv.astype(float))
+        else:
+            x = np.concatenate([uv, np.where(seen, 0.0, np.nan)], 2)
     return np.asarray(x, float)
 
 
@@ -192,5 +205,4 @@ def with_lags(answers: Sequence[Answer], lags: Sequence[Lag], limit: float) -> l
 
 def lagging(answer: Answer) -> Answer:
     """The answer, doubted."""
-    found = answer.refined
-    return replace(answer, refined=replace(found, flags=in_order((*found.flags, Status.LAGGING))))
+    return answer.flagged(Status.LAGGING)

@@ -18,7 +18,7 @@ from ..clocks.cuts import Steps, calm, unexplained
 from ..clocks.lengths import jumping, lasting
 from ..compute.threads import MapLike
 from ..refine.verb import refine
-from ..types import Break, Clock, Status, TrackSet, in_order, mended_times
+from ..types import Break, Clock, Status, TrackSet, mended_times
 from .breaks import (
     AROUND,
     MOST,
@@ -375,10 +375,7 @@ def suspected(verdict: Verdict, tracks: Sequence[TrackSet], fps: Sequence[float]
 
 def doubted(answer: Answer) -> Answer:
     """The answer with the flag of a clock that breaks otherwise than it was mended."""
-    refined = answer.refined
-    return dataclasses.replace(
-        answer, refined=dataclasses.replace(refined, flags=in_order((*refined.flags, Status.BROKEN_CLOCK)))
-    )
+    return answer.flagged(Status.BROKEN_CLOCK)
 
 
 def cut_where_it_holds(

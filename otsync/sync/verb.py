@@ -33,7 +33,7 @@ from .own_frames import Frames, refuse_common, solver_from, synchronize_own
 from .pairs import Job, Refit, run, run_refit, with_rate
 from .parts import broken_part, unvouched
 from .rematching import contested, rematching
-from .verdict import Answer, Verdict, judge
+from .verdict import Answer, Verdict, judge, off_rates
 from .witnesses import contradicted, surest
 
 
@@ -123,6 +123,7 @@ def synchronize(
         if isinstance(aligning, EpipolarScan):
             verdict = _mended_in_pixels(jobs, verdict, tracks, aligning, refining, judged, map, broken)
             verdict = _without_unsteady(verdict, tracks, aligning, judged)
+            verdict = _with_off_rates_told(verdict, judged)
         else:
             verdict = with_parts_checked(verdict, tracks, judged)
             verdict = with_witnesses_heard(verdict, jobs, broken, rematched > 0, refining.trust.parted, judged, map)
@@ -224,6 +225,15 @@ def _without_unsteady(
     if not breaking:
         return verdict
     return judged([doubted(a) if breaking & set(a.pair) else a for a in verdict.answers])
+
+
+def _with_off_rates_told(verdict: Verdict, judged: Callable[[Sequence[Answer]], Verdict]) -> Verdict:
+    """The verdict, with the pairs of videos whose clocks run otherwise than declared flagged, or less sure."""
+    answers = verdict.answers
+    off = off_rates(answers)
+    for clock in off:
+        answers = tuple(clock.told(a) for a in answers)
+    return judged(answers) if off else verdict
 
 
 def with_parts_checked(

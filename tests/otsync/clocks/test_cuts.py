@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from otsync import Matches, Status, synchronize
 from otsync.align.likelihood import LikelihoodScan
 from otsync.bench.trust.worlds import CLASSES
-from otsync.clocks.cuts import BLOCK, Steps, calm, unexplained
+from otsync.clocks.cuts import BLOCK, CLEAR_PATH, Steps, calm, unexplained
 from otsync.refine.splines import SplineRefine
 from otsync.sync.breaks import mended
 from otsync.sync.mending import cut_where_it_holds
@@ -216,3 +218,30 @@ def test_cuts_are_sought_in_what_was_filmed(monkeypatch):
     ((filmed, mended_clock, broken),) = asked
     np.testing.assert_array_equal(filmed, world.tracks[1].times)
     assert len(broken[1]) == 1 and mended_clock[-1] > filmed[-1] + 0.9
+
+
+def in_a_hand(shown: np.ndarray, seed: int = 0) -> TrackSet:
+    """A video of nothing but one point, of a hand that shakes; ``shown``: the frames of the world."""
+    from tests.otsync.epipolar.test_epipolar import moving_poses
+    from tests.recording_world import ring
+
+    still = ring(4, width=640, height=360)[seed % 4]
+    poses = moving_poses(still, shown / 30 + seed)
+    return TrackSet(None, uv=np.full((1, len(shown), 2), 50.0), camera=replace(still, w2c=poses), fps=30.0)
+
+
+@pytest.mark.parametrize("lost", [3, 4, 10])
+@pytest.mark.parametrize("seed", range(4))
+def test_a_hand_that_shakes_shows_where_frames_are_missing(seed, lost):
+    whole = np.arange(90.0)
+    assert not len(Steps.of_camera(in_a_hand(whole, seed)).cuts(CLEAR_PATH))
+    steps = Steps.of_camera(in_a_hand(np.delete(whole, np.arange(40, 40 + lost)), seed))
+    assert steps.cuts(CLEAR_PATH).tolist() == [40]
+
+
+def test_of_a_camera_that_stands_still_nothing_is_known():
+    tracks = in_a_hand(np.arange(90.0))
+    still = replace(tracks.camera, w2c=tracks.camera.w2c[0])
+    repeated = replace(tracks.camera, w2c=np.repeat(tracks.camera.w2c[:1], 90, 0))
+    for camera in (still, repeated, None):
+        assert np.isnan(Steps.of_camera(replace(tracks, camera=camera, uv=tracks.uv)).jolts).all()

@@ -12,6 +12,7 @@ from otsync.epipolar.breaks import Evidence, Found, Moment, find_breaks, moments
 from otsync.epipolar.refine import EpipolarRefine
 from otsync.epipolar.scan import EpipolarScan
 from otsync.types import Break, Matches
+from tests.otsync.epipolar.test_epipolar import moving_poses
 from tests.otsync.epipolar.test_steady import FPS, LATE, filmed, solved
 from tests.recording_world import paths, ring
 
@@ -129,9 +130,61 @@ def test_cameras_that_move_keep_their_poses_on_a_mended_clock(own):
     assert len(offsets.breaks[1]) == 1 and offsets.ok and error(offsets, 4) < 0.1
 
 
+def in_hands(own: np.ndarray, seed: int, seen: slice = slice(None)) -> list[TrackSet]:
+    """Three seconds of four phones in hands, of which the second one shows these frames; ``seen``: of its tracks."""
+    shown = [(own if v == 1 else np.arange(90.0)) + LATE[v] for v in range(4)]
+    rng, sets = np.random.default_rng(seed), []
+    for v, (static, still) in enumerate(zip(filmed(shown, seed), ring(4, width=640, height=360), strict=True)):
+        camera = replace(still, w2c=moving_poses(still, shown[v] / FPS + 7 * v))
+        uv = camera.project(paths(shown[v] / FPS, 40, seed + 5)) + rng.normal(0, 0.3, static.uv.shape)
+        visible = np.ones(uv.shape[:2], bool)
+        if v == 1:
+            visible[:] = False
+            visible[:, seen] = True
+        sets.append(replace(static, uv=uv, camera=camera, visible=visible))
+    return sets
+
+
+@pytest.mark.parametrize("lost", [4, 10])
+@pytest.mark.parametrize("seed", range(3))
+def test_frames_that_a_phone_in_a_hand_lost_are_named(seed, lost):
+    offsets = solved(in_hands(np.delete(np.arange(90.0 + lost), np.arange(40, 40 + lost)), seed))
+    (broke,) = offsets.breaks[1]
+    assert broke.jump * FPS == pytest.approx(lost, abs=0.1) and broke.at * FPS == pytest.approx(40)
+    assert offsets.ok and error(offsets, 4) < 0.15
+
+
+def test_where_its_path_is_cut_and_nothing_was_seen_before_a_video_is_doubted():
+    """Nobody knows what was lost; a hand that is whole is left alone."""
+    lost, whole = np.delete(np.arange(94.0), np.arange(28, 32)), np.arange(90.0)
+    tracks = in_hands(lost, 0, slice(26, None))
+    assert moments(tracks[1])[0] == Moment(28 / FPS, 28 / FPS, sure=True)
+    offsets = solved(tracks)
+    assert Status.BROKEN_CLOCK in offsets.flags[1] and offsets.status[2].ok and offsets.status[3].ok
+    assert solved(in_hands(whole, 0, slice(26, None))).ok
+
+
+def test_both_pieces_vouch_for_one_offset_or_none_does():
+    offsets = np.arange(12.0) / 30 + 1e-9  # as they are summed: no whole frames
+    there = np.eye(12)
+    told = Evidence(offsets, 40 * there[4], 30 * there[6], np.full((2, 12), 2.0))
+    assert told.vouched() and told.doubt() == 0
+    for behind in (30 * there[7], 5 * there[4], 0 * there[4]):
+        assert not replace(told, behind=behind).vouched()
+    assert replace(told, behind=30 * there[7]).doubt() == 30  # three frames are another time
+
+
 @pytest.mark.parametrize("broke", [None, Break(2.0, 0.5)])
 def test_a_break_that_cannot_be_mended_is_flagged(monkeypatch, broke):
     """Nor is one that is found again where it was mended."""
     monkeypatch.setattr("otsync.sync.verb.find_breaks", lambda *job: [Found(1, 30.0, 60.0, broke)])
     offsets = solved(worlds(np.arange(120.0), 4))
     assert Status.BROKEN_CLOCK in offsets.flags[1] and len(offsets.breaks[1]) == (broke is not None)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_rate_that_is_not_the_declared_one_is_told_within_three_seconds(seed):
+    """By what all pairs of a video measure; those that run as declared are trusted."""
+    offsets = solved(in_hands(1.042 * np.arange(86.0), seed))
+    assert Status.RATE_MISMATCH in offsets.flags[1]
+    assert all(offsets.status[v].ok and abs(offsets.seconds[v] * FPS - LATE[v]) < 0.2 for v in (2, 3))

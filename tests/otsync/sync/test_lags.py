@@ -15,6 +15,8 @@ from otsync.simulate import simulate
 from otsync.simulate.effects import Gaps, In, Lag, PositionNoise
 from otsync.sync.lags import lag_of
 from otsync.types import Status, TrackSet
+from tests.otsync.epipolar.test_epipolar import moving_poses
+from tests.recording_world import paths, ring
 
 FPS = 30.0
 LATE = Lag(3 / FPS)
@@ -62,6 +64,25 @@ def test_pixels_tell_as_well_as_positions():
     assert lag_of(flat(film())).told < 0.5 / FPS
     # the pixels of a simulated track follow its positions
     assert lag_of(flat(film(LATE))).told > 0.6 / FPS
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_hand_that_sways_neither_looks_late_nor_hides_what_is(seed):
+    def held(tracks: TrackSet) -> TrackSet:
+        camera = replace(tracks.camera, w2c=moving_poses(tracks.camera, tracks.times))
+        return replace(flat(tracks), uv=camera.project(tracks.positions()), camera=camera)
+
+    assert lag_of(held(film(seed=seed))).told < 0.5 / FPS
+    assert lag_of(held(film(LATE, seed=seed))).told > 0.6 / FPS
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_things_that_go_their_own_ways_do_not_move_together_because_a_hand_sways(seed):
+    rng, t = np.random.default_rng(seed), np.arange(90) / FPS
+    camera = ring(4, width=640, height=360)[1]
+    moving = replace(camera, w2c=moving_poses(camera, t))
+    uv = moving.project(paths(t, 40, seed + 5)) + rng.normal(0, 0.3, (40, 90, 2))
+    assert lag_of(TrackSet(None, uv=uv, camera=moving, fps=FPS)).told == 0
 
 
 @settings(max_examples=10, deadline=None)
