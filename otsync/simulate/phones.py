@@ -64,6 +64,19 @@ class Hand:
         turn = np.radians(self.turn) * _shake(times, rng, 0.2, 1.5)
         return np.stack([look_at(p, TARGET, r) for p, r in zip(place, turn, strict=True)])
 
+    def shaken(
+        self, w2c: Float[np.ndarray, "4 4"], times: Float[np.ndarray, " T"], rng: np.random.Generator
+    ) -> Float[np.ndarray, "T 4 4"]:
+        """A camera that stands still, as if it were held there."""
+        from scipy.spatial.transform import Rotation
+
+        turn = Rotation.from_rotvec(np.radians(self.turn) * _shake(times, rng, 0.2, 1.5)).as_matrix()
+        out = np.repeat(np.asarray(w2c, float)[None], len(times), 0)
+        centre = -w2c[:3, :3].T @ w2c[:3, 3] + self.sway * _shake(times, rng, 0.2, 1.2)
+        out[:, :3, :3] = turn @ out[:, :3, :3]
+        out[:, :3, 3] = -np.einsum("tij,tj->ti", out[:, :3, :3], centre)
+        return out
+
 
 @dataclass(frozen=True)
 class Walk:

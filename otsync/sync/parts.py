@@ -35,9 +35,10 @@ at most. Behind lost frames the true offset suits as usual, .3 to .5."""
 
 SHORT, AS_WELL = 2.0, 0.0
 """Seconds of overlap below which an end must know: little else of it tells, so another offset that suits the end as
-well as the answer is a doubt, and so is an end at which no other can be asked for. Overlaps of 1.75 s under hard noise, a freeze of eight frames behind which half a second
-is left (seeds 91003, 91016): trusted and 8.1 frames off there, gains of .08 and .20. Sound ones (91010 to 91029) have 0
-at most in 20 of 20 under mid noise and in 12 of 15 under hard."""
+well as the answer is a doubt, and so is an end at which no other can be asked for. Of 1.75 s under hard noise two were
+trusted with half a second left behind a freeze of eight frames (seeds 91003 and 91016; gains of .08 and .20), and one
+with few tracks behind ten lost frames (91044). Sound ones (91010 to 91029) have 0 at most in 20 of 20 under mid noise,
+in 12 of 15 under hard."""
 
 AGREES, USUALLY = 0.35, 0.1
 """Share of the samples that agree at an end, over this quantile of the shares within the clip: .57 at least in the same

@@ -121,7 +121,7 @@ def one(job: tuple[str, str, int], changed: Method | None = None) -> list[dict[s
     """
     name, method, seed = job
     world = CLASSES[name](seed)
-    offsets = synchronize(list(world.tracks), method=changed or METHODS[method], **world.options)
+    offsets = synchronize(list(world.tracks), **{"method": changed or METHODS[method], **world.options})
     ends, worst = world.errors(offsets)
     both, sigmas = world.at_ends(offsets), offsets.sigma_ends * FPS
     rows = []

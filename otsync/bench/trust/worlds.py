@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ...recordings.stages import PIXELS
 from ...simulate import PRESETS, Truth, simulate
 from ...simulate.effects import (
     ClockDrift,
@@ -18,6 +19,7 @@ from ...simulate.effects import (
     Drop,
     Effect,
     Freeze,
+    Gaps,
     In,
     Lag,
     LimbDrift,
@@ -29,6 +31,7 @@ from ...simulate.effects import (
     SlowMotion,
     Transient,
 )
+from ...simulate.phones import Hand
 from ...types import Offsets, TrackSet
 from ..sync_worlds import FPS, MOVING
 
@@ -39,6 +42,10 @@ LEVEL = 15
 """Frames over which the error of a clock is averaged: a whole number of turns of what repeats every third or fifth."""
 
 
+PIXEL_NOISE = 0.5
+"""Pixels, of tracks without depth: what flow keeps of a textured thing."""
+
+
 @dataclass(frozen=True, eq=False)
 class World:
     """Videos, and what their frames show.
@@ -46,7 +53,7 @@ class World:
     Args:
         tracks: of every video. shown: per video (T,) seconds of the world; None where there is no true answer, so that
             every answer that is trusted is wrong.
-        options: of :func:`otsync.synchronize`, beside its defaults.
+        options: of :func:`otsync.synchronize`, beside its defaults; a ``method`` of its own goes before others.
     """
 
     tracks: tuple[TrackSet, ...]
@@ -159,6 +166,23 @@ def plain(seed: int, **options: Any) -> World:
     return World(tracks, truth.shown)
 
 
+def in_hands(seed: int, *, rate: float = 1.0, **options: Any) -> World:
+    """Four phones in hands that film three seconds, and no depth: tracks in pixels, the poses of every frame known.
+
+    Args:
+        rate: that the second one's clock runs by, though nobody says so. options: of :func:`drawn`.
+    """
+    known: dict[str, Any] = {"preset": "clean", "videos": 4, "frames": 90, "within": 20, "last": (Gaps(0.2),)}
+    tracks, truth = drawn(seed, rates=[1.0, rate, 1.0, 1.0], **known | options)
+    rng, held = np.random.default_rng([seed, 905]), []
+    for t, shown in zip(tracks, truth.shown, strict=True):
+        assert t.camera is not None
+        camera = replace(t.camera, w2c=Hand().shaken(t.camera.w2c, shown, rng))
+        uv = camera.project(t.positions()) + rng.normal(0, PIXEL_NOISE, (len(t), t.n_frames, 2))
+        held.append(replace(t, xyz=None, uv=uv, camera=camera))
+    return World(tuple(held), truth.shown, {"method": PIXELS})
+
+
 def untrue(seed: int, **options: Any) -> World:
     """A world whose videos share no time."""
     tracks, _ = drawn(seed, **options)
@@ -259,6 +283,14 @@ CLASSES: dict[str, Callable[[int], World]] = {
     "one of two late, frames lost": partial(
         plain, classes=("basketball", "football"), first=(In(1, PartLate()), In(1, Drop(8 / 30)))
     ),
+    "phones in hands": in_hands,
+    "phones in hands, four lost": partial(in_hands, first=(In(1, Drop(4 / 30)),)),
+    "phones in hands, ten lost": partial(in_hands, first=(In(1, Drop(10 / 30)),)),
+    "phones in hands, one frozen": partial(in_hands, first=(In(1, Freeze(8)),)),
+    "phones in hands, rate 4 %": partial(in_hands, rate=1.04),
+    "short overlap": partial(plain, preset="hard", frames=56, within=5),
+    "short overlap, one frozen": partial(plain, preset="hard", frames=56, within=5, first=(In(1, Freeze(8)),)),
+    "short overlap, ten lost": partial(plain, preset="hard", frames=56, within=5, first=(In(1, Drop(10 / 30)),)),
     "exact loop": partial(plain, motion="loop"),
     "strides": partial(plain, motion="strides"),
     "strides, hard": partial(plain, motion="strides", preset="hard"),

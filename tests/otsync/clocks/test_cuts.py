@@ -239,6 +239,14 @@ def test_a_hand_that_shakes_shows_where_frames_are_missing(seed, lost):
     assert steps.cuts(CLEAR_PATH).tolist() == [40]
 
 
+def test_a_hand_that_only_turns_shows_it_too():
+    tracks = in_a_hand(np.delete(np.arange(90.0), np.arange(40, 44)))
+    w2c = tracks.camera.w2c.copy()
+    w2c[:, :3, 3] = -np.einsum("tij,j->ti", w2c[:, :3, :3], tracks.camera.center[0])
+    steps = Steps.of_camera(replace(tracks, camera=replace(tracks.camera, w2c=w2c)))
+    assert steps.cuts(CLEAR_PATH).tolist() == [40]
+
+
 def test_of_a_camera_that_stands_still_nothing_is_known():
     tracks = in_a_hand(np.arange(90.0))
     still = replace(tracks.camera, w2c=tracks.camera.w2c[0])

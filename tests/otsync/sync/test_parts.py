@@ -159,6 +159,17 @@ def test_a_gap_in_a_mended_clock_is_not_asked_about(seed):
     assert found.status[1].ok and world.errors(found)[0].max() < 0.1
 
 
+@pytest.mark.parametrize(("late", "named"), [(2.3, True), (1.7, False)])
+def test_the_end_of_a_short_overlap_must_know(monkeypatch, late, named):
+    """Below two seconds another offset that suits the end as well is a doubt; above, it must suit it clearly better."""
+    monkeypatch.setattr("otsync.sync.parts._others", lambda *job: iter([(0.05, 0.5)]))
+    assert (broken_part(*pair(late=late)) is not None) == named
+    monkeypatch.setattr("otsync.sync.parts._others", lambda *job: iter([]))
+    assert (broken_part(*pair(late=late)) is not None) == named  # nothing can be asked for
+    monkeypatch.setattr("otsync.sync.parts._others", lambda *job: iter([(-0.05, 0.5)]))
+    assert broken_part(*pair(late=late)) is None
+
+
 def test_overlaps_too_short_to_judge_are_left_alone():
     answer, a, b = pair(late=3.0)  # one second in common
     assert broken_part(answer, a, b) is None

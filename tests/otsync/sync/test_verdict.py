@@ -10,7 +10,7 @@ import pytest
 from otsync import Graph, LikelihoodScan, Matches, SplineRefine, Status, TrackSet
 from otsync.sync.graph import FLAGGED
 from otsync.sync.pairs import Job, run
-from otsync.sync.verdict import Answer, Network, Verdict, judge
+from otsync.sync.verdict import Answer, Network, Verdict, judge, off_rates
 from otsync.types import Alignment
 from otsync.types.trust import Trust
 from tests.conftest import wiggle
@@ -136,3 +136,50 @@ def test_a_surer_pair_that_vouches_for_another_time_leaves_a_video_in_doubt(sigm
     assert found.x[3] == pytest.approx(0.5, abs=0.15)
     assert (Status.INCONSISTENT in found.flags[3]) == contradicted
     assert not found.flags[1]
+
+
+def rated(rates: dict[tuple[int, int], float], sigma: float = 0.008, *flagged: tuple[int, int]) -> list[Answer]:
+    """Pairs of two seconds that measured these rates of b's clock, and kept 1."""
+    answers = []
+    for pair, rate in rates.items():
+        known = {"fitted_rate": rate, "rate_sigma": sigma, "overlap": 2.0}
+        flags = (Status.AMBIGUOUS,) if pair in flagged else ()
+        told = Alignment(0.0, sigma=0.002, fps=30.0, stats=known, flags=flags)
+        answers.append(Answer(pair, NONE, told, told))
+    return answers
+
+
+EVERY = list(itertools.combinations(range(4), 2))
+
+
+@pytest.mark.parametrize("who", range(4))
+def test_a_clock_that_runs_otherwise_does_so_in_all_its_pairs(who):
+    """No pair is sure of it by itself; those without it are left alone."""
+    slow = {p: 1.04 if p[1] == who else 1 / 1.04 if p[0] == who else 1.0 for p in EVERY}
+    (off,) = off_rates(rated(slow, 0.018))
+    assert off.video == who and off.drift == pytest.approx(0.04, abs=1e-3)
+    assert off.sure == pytest.approx(np.log(1.04) * np.sqrt(3) / 0.018, rel=1e-3)
+    for answer in rated(slow, 0.018):
+        assert (Status.RATE_MISMATCH in off.told(answer).refined.flags) == (who in answer.pair)
+
+
+def test_a_rate_that_may_be_is_in_sigma_and_one_that_is_not_told_is_not():
+    slow = {p: 1.04 if p[1] == 3 else 1.0 for p in EVERY}
+    (maybe,) = off_rates(rated(slow, 0.03))
+    assert 1.5 < maybe.sure < 3
+    told = maybe.told(rated(slow, 0.03)[EVERY.index((0, 3))]).refined
+    expected = maybe.drift * (maybe.sure - 1.5) / 1.5
+    assert not told.flags and told.sigma == pytest.approx(np.hypot(0.002, expected))
+    assert told.stats["common_error"] == pytest.approx(expected)  # three such pairs know it no better than one
+    assert off_rates(rated(slow, 0.2)) == [] and off_rates([]) == []
+    short = {p: 1.004 if p[1] == 3 else 1.0 for p in EVERY}
+    assert off_rates(rated(short, 1e-4)) == []  # it moves the ends by an eighth of a frame
+
+
+def test_pairs_that_contradict_each_other_or_are_lost_tell_no_rate():
+    contradicting = {(0, 1): 1.0, (0, 2): 1.0, (0, 3): 1.04, (1, 2): 1.0, (1, 3): 0.96, (2, 3): 1.0}
+    assert off_rates(rated(contradicting)) == []
+    lost = {p: 1.3 if p == (0, 3) else 1.0 for p in EVERY}
+    assert off_rates(rated(lost)) == []
+    doubtful = {p: 1.04 if 3 in p else 1.0 for p in EVERY}
+    assert off_rates(rated(doubtful, 0.008, (0, 3), (1, 3), (2, 3))) == []
