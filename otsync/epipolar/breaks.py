@@ -42,6 +42,11 @@ doubted. Basketball (seeds 71900-71929, 73900-73915): of 30 moments at which sou
 jerk, 28 have 0; where ten frames were lost, or fifteen repeated, two cameras have 12 and more in 35 of 36, and four 54
 and more in 25 of 25."""
 
+CLEARLY = 0.2
+"""Share of the evidence of the piece that has less by which one offset must suit both better than any two, where it is
+sure that there is a cut: as of an ambiguous pair. Motion that comes back suits another one nearly as well (.03, "phones
+in hands, ten lost", seed 80477: trusted, ten frames off before the cut)."""
+
 MENDED = 50.0
 """Nats by which two offsets suit the pieces better than one, from which on a clock is mended. Four of those cameras
 have 54 to 660 in 24 of 25, sound ones 0."""
@@ -337,10 +342,11 @@ class Evidence:
         return max([0.0, *told])
 
     def vouched(self) -> bool:
-        """Whether both pieces, each by itself, tell the same offset."""
+        """Whether both pieces, each by itself, tell the same offset, and no two offsets suit them nearly as well."""
         same = math.floor(SAME / (self.offsets[1] - self.offsets[0]) + 1e-6)
         one, two = int(self.before.argmax()), int(self.behind.argmax())
-        return abs(one - two) <= same and min(self.before[one], self.behind[two]) > DOUBTED
+        told = float(min(self.before[one], self.behind[two]))
+        return abs(one - two) <= same and told > DOUBTED and self.best(0.0, REACH)[0] < -CLEARLY * told
 
     def _joint(self, d: int) -> tuple[float, int, int]:
         """(most nats of an offset before, and one behind that is d frames larger; the index of the former; d)."""

@@ -178,7 +178,9 @@ def in_hands(seed: int, *, rate: float = 1.0, **options: Any) -> World:
     for t, shown in zip(tracks, truth.shown, strict=True):
         assert t.camera is not None
         camera = replace(t.camera, w2c=Hand().shaken(t.camera.w2c, shown, rng))
-        uv = camera.project(t.positions()) + rng.normal(0, PIXEL_NOISE, (len(t), t.n_frames, 2))
+        noise = rng.normal(0, PIXEL_NOISE, (len(t), t.n_frames, 2))
+        # a picture that stands still is the same, noise and all
+        uv = camera.project(t.positions()) + noise[:, np.searchsorted(np.unique(shown), shown)]
         held.append(replace(t, xyz=None, uv=uv, camera=camera))
     return World(tuple(held), truth.shown, {"method": PIXELS})
 

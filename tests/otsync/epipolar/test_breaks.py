@@ -172,6 +172,9 @@ def test_both_pieces_vouch_for_one_offset_or_none_does():
     for behind in (30 * there[7], 5 * there[4], 0 * there[4]):
         assert not replace(told, behind=behind).vouched()
     assert replace(told, behind=30 * there[7]).doubt() == 30  # three frames are another time
+    # motion that comes back suits another offset nearly as well
+    assert not replace(told, before=told.before + 39 * there[1]).vouched()
+    assert replace(told, before=told.before + 20 * there[1]).vouched()
 
 
 @pytest.mark.parametrize("broke", [None, Break(2.0, 0.5)])
