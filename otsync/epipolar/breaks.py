@@ -350,10 +350,10 @@ class Evidence:
 
     def _joint(self, d: int) -> tuple[float, int, int]:
         """(most nats of an offset before, and one behind that is d frames larger; the index of the former; d)."""
+        if abs(d) >= len(self.offsets):
+            return -math.inf, 0, d
         first = slice(max(0, -d), len(self.offsets) - max(0, d))
         then = slice(max(0, d), len(self.offsets) + min(0, d))
-        if not len(self.offsets[first]):
-            return -math.inf, 0, d
         total = self.before[first] + self.behind[then]
         k = int(total.argmax())
         return float(total[k]), k + first.start, d
