@@ -104,7 +104,7 @@ def seen_pixels(tracks: TrackSet) -> Float[np.ndarray, "N T 2"]:
 
 
 def directions(camera: Camera, uv: Float[np.ndarray, "N T 2"]) -> Float[np.ndarray, "N T 3"]:
-    """Whither pixels look: directions in the world, of length 1, so that the turns of a camera that moves are out.
+    """The directions in the world, of length 1, in which pixels look: without the turns of a camera that moves.
 
     A moving camera needs one w2c per frame of ``uv``'s second axis.
     """

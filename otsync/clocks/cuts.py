@@ -30,6 +30,9 @@ CLEAR_PATH = 2.5
 """The same of a camera's own path. Twelve films of four phones in hands (seeds 3200 to 3211): without a cut 1.95 at
 most, with four, seven or ten frames missing 3.3 at least, at 144 of 144."""
 
+GAP = 1.5
+"""Usual steps of a clock from which on frames are missing between two."""
+
 CALM = 1.3
 """Up to which no step is a cut. Of videos without one (seeds 80100 to 80103, all classes) five have more, 1.53 at most,
 where a freeze or a slow motion begins, and of few tracks; brutal noise has 1.46 once (80100 to 80107). Of 44 that are
@@ -82,15 +85,16 @@ class Steps:
 
     @classmethod
     def of_camera(cls, tracks: TrackSet) -> Steps:
-        """Of the camera's own path, where it moves: the mean of where it is and whither it looks; of one that stands
-        still nothing is known. A hand never stops, so frames that are missing show there whatever the scene does.
+        """Of the camera's own path, where it moves: the mean of where it is and in which direction it looks; of one
+        that stands still nothing is known. A hand never stops, so frames that are missing show there whatever the scene
+        does. Beside frames that are known to be missing, by the times, nothing is known either.
         """
         n, camera = tracks.n_frames, tracks.camera
         if camera is None or camera.w2c.ndim == 2:
             return cls(tracks.times, np.full(max(n - 1, 0), np.nan))
         paths = camera.center[None], _corners(camera)
         each = [cls._of(tracks, _apart(_some_of(x), n, fewest=1), ROUNDED * np.abs(x).max()).jolts for x in paths]
-        known = np.isfinite(each).sum(0)
+        known = np.isfinite(each).sum(0) * ~_beside_gaps(tracks.times)
         return cls(tracks.times, np.where(known > 0, np.nansum(each, 0) / np.maximum(known, 1), np.nan))
 
     @classmethod
@@ -109,7 +113,8 @@ class Steps:
         """The frames behind the cuts, whose jolts are larger than ``above``.
 
         A recorder that was paused, frames that were lost, a picture that froze and then caught up: whatever happened to
-        the clock, it happened here. A freeze and its end, where the file goes on with what came next, are no cuts.
+        the clock, it happened here. A freeze and its end, where the file goes on with what came next, are no cuts. None
+        is told where there is more than one in :data:`RHYTHM` frames.
         """
         padded = np.pad(np.nan_to_num(self.jolts), BESIDE - 1)
         beside = sliding_window_view(padded, 2 * BESIDE - 1).max(1) if len(self.jolts) else padded
@@ -131,8 +136,15 @@ class Steps:
         return float(self.times[k + 1]), float(self.jolts[k])
 
 
+def _beside_gaps(times: Float[np.ndarray, " T"]) -> Bool[np.ndarray, " T-1"]:
+    """The steps at which lines are laid across frames that are missing by their times."""
+    step = np.diff(times)
+    gap = np.pad(step > GAP * np.median(step) if len(step) else np.zeros(0, bool), BESIDE - 1)
+    return np.asarray(sliding_window_view(gap, 2 * BESIDE - 1).any(1)) if len(step) else np.zeros(0, bool)
+
+
 def _corners(camera: Camera) -> Float[np.ndarray, "4 T 3"]:
-    """Whither the corners of a camera's pictures look."""
+    """In which directions the corners of a camera's pictures look."""
     corners = np.array([(0, 0), (camera.width, 0), (0, camera.height), (camera.width, camera.height)], float)
     return directions(camera, np.repeat(corners[:, None], len(camera.w2c), 1))
 

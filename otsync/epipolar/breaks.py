@@ -43,9 +43,9 @@ jerk, 28 have 0; where ten frames were lost, or fifteen repeated, two cameras ha
 and more in 25 of 25."""
 
 CLEARLY = 0.2
-"""Share of the evidence of the piece that has less by which one offset must suit both better than any two, where it is
-sure that there is a cut: as of an ambiguous pair. Motion that comes back suits another one nearly as well (.03, "phones
-in hands, ten lost", seed 80477: trusted, ten frames off before the cut)."""
+"""Where a camera's path is cut, one offset must beat any two by this share of the weaker piece's evidence: less is
+ambiguous, as of a pair. Motion that comes back suits another one nearly as well (.03, "phones in hands, ten lost", seed
+80477: trusted, ten frames off before the cut)."""
 
 MENDED = 50.0
 """Nats by which two offsets suit the pieces better than one, from which on a clock is mended. Four of those cameras
@@ -71,7 +71,8 @@ MOST_PAIRS = 8
 """Pairs of a video that are asked, at most: the time of all grows with the square of their number."""
 
 MOST_MOMENTS = 6
-"""Moments of a video that are asked about, at most: the longest pauses and the sharpest cuts."""
+"""Moments of a video that are asked about, at most: the longest pauses and the sharpest cuts; and so many more cuts of
+its camera's path."""
 
 
 Span = tuple[float, float]
@@ -122,11 +123,13 @@ def moments(tracks: TrackSet) -> list[Moment]:
     rests = sorted(pauses(x), key=lambda p: p[0] - p[1])[:MOST_MOMENTS]
     steps = Steps.in_pixels(tracks)
     cuts = sorted(steps.cuts(), key=lambda k: -float(steps.jolts[k - 1]))[:MOST_MOMENTS]
-    sure = [Moment(float(t[k]), float(t[k]), True) for k in Steps.of_camera(tracks).cuts(CLEAR_PATH)]
+    path = Steps.of_camera(tracks)
+    shown = sorted(path.cuts(CLEAR_PATH), key=lambda k: -float(path.jolts[k - 1]))[:MOST_MOMENTS]
+    sure = [Moment(float(t[k]), float(t[k]), True) for k in shown]
     told = [Moment(float(t[i]), float(t[j])) for i, j in rests]
     told += [Moment(float(t[k]), float(t[k])) for k in cuts if not any(abs(t[k] - m.at) <= NEARBY for m in sure)]
     long = [m for m in told if m.start - t[0] >= LEAST_PIECE - 1e-9 and t[-1] - m.at >= LEAST_PIECE - 1e-9]
-    return [*sure, *long][:MOST_MOMENTS]
+    return [*sure, *long[:MOST_MOMENTS]]
 
 
 def find_breaks(

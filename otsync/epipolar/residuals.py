@@ -182,8 +182,7 @@ class Residuals:
         """(by how much a second of b is longer than one of a, one sigma of it), fitted together with the offset from
         ``offset`` on; nan where nothing tells.
         """
-        half, most = max(LEAST_HALF, round(window * self.fps)), 1 / self.fps
-        nothing = float("nan"), float("nan")
+        half, nothing = max(LEAST_HALF, round(window * self.fps)), (float("nan"), float("nan"))
         x, p, found, normal = self.times, np.zeros(2), None, np.zeros((2, 2))
         for _ in range(iterations):
             found = self._step(offset + p[0] + p[1] * x, half)
@@ -197,8 +196,9 @@ class Residuals:
                 return nothing
             score = (found.weight * found.slope * found.residual).sum(0)
             move = -np.linalg.solve(normal, [score.sum(), score @ x])
-            p += np.clip(move, -most, most)
-            if np.abs(move).max() < CONVERGED / self.fps:
+            at_ends = float(np.abs(move) @ [1.0, np.abs(x).max()])
+            p += move * min(1.0, 1 / (self.fps * max(at_ends, TINY)))  # no moment by more than a frame
+            if at_ends < CONVERGED / self.fps:
                 break
         assert found is not None
         powers = np.stack([np.ones_like(x), x])

@@ -24,6 +24,7 @@ from ..refine.slot import Rate, Refiner, RefinerLike
 from ..refine.splines import SplineRefine
 from ..types import Alignment, Break, Matches, Offsets, Status, TrackSet
 from ..types.checks import check_whole
+from ..types.trust import Trust
 from .breaks import MOST, SAME_MOMENT, mended
 from .graph import Graph, Pair
 from .lags import Lag, lag_of, lagging, with_lags
@@ -123,7 +124,7 @@ def synchronize(
         if isinstance(aligning, EpipolarScan):
             verdict = _mended_in_pixels(jobs, verdict, tracks, aligning, refining, judged, map, broken)
             verdict = _without_unsteady(verdict, tracks, aligning, judged)
-            verdict = _with_off_rates_told(verdict, judged)
+            verdict = _with_off_rates_told(verdict, refining.trust, judged)
         else:
             verdict = with_parts_checked(verdict, tracks, judged)
             verdict = with_witnesses_heard(verdict, jobs, broken, rematched > 0, refining.trust.parted, judged, map)
@@ -227,10 +228,10 @@ def _without_unsteady(
     return judged([doubted(a) if breaking & set(a.pair) else a for a in verdict.answers])
 
 
-def _with_off_rates_told(verdict: Verdict, judged: Callable[[Sequence[Answer]], Verdict]) -> Verdict:
+def _with_off_rates_told(verdict: Verdict, trust: Trust, judged: Callable[[Sequence[Answer]], Verdict]) -> Verdict:
     """The verdict, with the pairs of videos whose clocks run otherwise than declared flagged, or less sure."""
     answers = verdict.answers
-    off = off_rates(answers)
+    off = off_rates(len(verdict.x), answers, verdict.reference, trust)
     for clock in off:
         answers = tuple(clock.told(a) for a in answers)
     return judged(answers) if off else verdict

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -53,11 +53,11 @@ NOTHING_COMMON = frozenset(
 """A pair with one of these shows no common motion: it makes no video trusted."""
 
 
-MAYBE_RATE, SURE_RATE = 1.5, 3.0
-"""Sigmas of a video's rate, as all its pairs measure it, from which on it may be another than is declared, and from
-which on it is (:func:`off_rates`). Of twelve films of four phones in hands, 3 s (seeds 3200 to 3211), sound videos have
-1.8 at most, of which one pair was wrong altogether 3.6; with a rate of 4.2 % 18 of 24 have 3.1 to 14, others 2.1 to 2.8
-or no pair that vouches."""
+MAYBE_RATE = 1.5
+"""Sigmas of a video's rate, as all its pairs measure it, from which on it may be another than is declared; from
+:attr:`otsync.Trust.rate_sigmas` on it is (:func:`off_rates`). Twelve films of four phones in hands, 3 s (seeds 3200 to
+3211): sound videos have 1.8 at most, but for two of which a pair was wrong altogether; with a rate of 4.2 % 18 of 24
+have 3.1 to 14, the others 2.1 to 2.8 or no pair that vouches."""
 
 LEAST_DRIFT = 0.25 / 30
 """Seconds by which a rate must move the ends of an overlap to be told."""
@@ -235,23 +235,25 @@ def _rates(
 
 @dataclass(frozen=True)
 class OffRate:
-    """A clock that runs otherwise than the others'.
+    """A clock that runs, or may run, otherwise than those of the most.
 
     Args:
-        sure: sigmas by which it does. drift: seconds by which that moves the ends of the longest overlap.
+        video: whose clock it is. sigmas: between its rate and the declared one. drift: seconds by which that moves the
+            ends of the longest overlap. limit: sigmas from which on it is certain.
     """
 
     video: int
-    sure: float
+    sigmas: float
     drift: float
+    limit: float
 
     def told(self, answer: Answer) -> Answer:
-        """A pair of this video: flagged where that is sure, else with a sigma that covers what may be."""
+        """A pair of this video: flagged where the rate is certain, else with a sigma that covers what may be."""
         if self.video not in answer.pair:
             return answer
-        if self.sure >= SURE_RATE:
+        if self.sigmas >= self.limit:
             return answer.flagged(Status.RATE_MISMATCH)
-        found, more = answer.refined, self.drift * (self.sure - MAYBE_RATE) / (SURE_RATE - MAYBE_RATE)
+        found, more = answer.refined, self.drift * (self.sigmas - MAYBE_RATE) / (self.limit - MAYBE_RATE)
         common = math.hypot(found.stats.get("common_error", 0.0), more)  # all pairs of a video err alike
         return replace(
             answer,
@@ -259,41 +261,47 @@ class OffRate:
         )
 
 
-def off_rates(answers: Sequence[Answer]) -> list[OffRate]:
-    """Clocks that run, or may run, otherwise than the others'; the surest first.
+def off_rates(n: int, answers: Sequence[Answer], reference: int, trust: Trust) -> list[OffRate]:
+    """Clocks of ``n`` videos that run, or may run, otherwise than those of the most.
 
-    Read from all pairs that fitted a rate beside the offset and did not keep it. One pair of a few seconds hardly tells
-    a rate, but a clock that runs otherwise does so in all of a video's pairs. What the surest explains is left out for
-    the next.
+    Read from all pairs that fitted a rate beside the offset and kept the declared one. One pair of a few seconds hardly
+    tells a rate, but a clock that runs otherwise does so in all of a video's pairs. Where as many run one way as the
+    other, the reference is right: offsets are on its clock.
     """
-    told = {a.pair: a.refined.stats for a in answers if _tells_rate(a)}
-    found: list[OffRate] = []
-    while told:
-        # of two videos, which are off against each other alike, the later one
-        surest = max((_off_rate(v, told) for v in {v for pair in told for v in pair}), key=lambda r: (r.sure, r.video))
-        if surest.sure <= MAYBE_RATE:
-            break
-        found.append(surest)
-        told = {pair: stats for pair, stats in told.items() if surest.video not in pair}
+    told = [a for a in answers if _tells_rate(a)]
+    edges = [Edge(*a.pair, math.log(a.refined.stats["fitted_rate"]), a.refined.stats["rate_sigma"], True) for a in told]
+    found = []
+    for group in _linked_by(n, edges):
+        anchor = reference if reference in group else group[0]
+        solution = solve(n, edges, anchor)
+        x, sigma = solution.x[group], solution.sigma[group]
+        off = [k for k, e in enumerate(edges) if e.a in group]
+        # pairs that differ by more than they say do not know it better together
+        squares = sum((solution.residual[k] / edges[k].sigma) ** 2 for k in off)
+        sigma = sigma * math.sqrt(max(1.0, squares / max(1, len(off) - len(group) + 1)))
+        sigma[group.index(anchor)] = np.median(np.delete(sigma, group.index(anchor)))
+        usual = x[max(range(len(x)), key=lambda k: ((np.abs(x - x[k]) <= sigma).sum(), group[k] == anchor))]
+        for v, away, known in zip(group, np.abs(x - usual).tolist(), sigma.tolist(), strict=True):
+            drift = away * max(a.refined.stats.get("overlap", 0.0) for a in told if v in a.pair) / 2
+            if drift > LEAST_DRIFT and away > MAYBE_RATE * known:
+                found.append(OffRate(v, away / known, drift, trust.rate_sigmas))
     return found
 
 
-def _off_rate(v: int, told: Mapping[Pair, Mapping[str, float]]) -> OffRate:
-    """As all pairs of a video measure it; not sure at all where it hardly moves the ends."""
-    own = [(pair, stats) for pair, stats in told.items() if v in pair]
-    rate = np.array([math.log(stats["fitted_rate"]) * (1 if v == pair[1] else -1) for pair, stats in own])
-    weight = np.array([stats["rate_sigma"] ** -2 for _, stats in own])
-    mean = float(weight @ rate / weight.sum())
-    # pairs that differ by more than they say do not know it better together
-    misfit = float(weight @ (rate - mean) ** 2) / max(1, len(own) - 1)
-    drift = abs(mean) * max(stats.get("overlap", 0.0) for _, stats in own) / 2
-    return OffRate(v, round(abs(mean) * math.sqrt(weight.sum() / max(1.0, misfit)), 6) * (drift > LEAST_DRIFT), drift)
+def _linked_by(n: int, edges: Sequence[Edge]) -> list[list[int]]:
+    """The videos that edges link, group by group."""
+    group = components(n, edges) if edges else np.arange(n)
+    groups = [np.flatnonzero(group == root).tolist() for root in np.unique(group)]
+    return [members for members in groups if len(members) > 1]
 
 
 def _tells_rate(answer: Answer) -> bool:
-    """Whether a pair fitted a rate that can be one, and vouches for its offset but that it may not hold throughout."""
+    """Whether a pair fitted a rate that can be one and did not keep it, and vouches for its offset but that it may not
+    hold throughout.
+    """
     rate = answer.refined.stats.get("fitted_rate", math.nan)
-    return set(answer.refined.flags) <= {Status.BROKEN_CLOCK} and abs(rate - 1) <= MOST_RATE
+    vouches = set(answer.refined.flags) <= {Status.BROKEN_CLOCK}
+    return vouches and answer.refined.rate == 1.0 and abs(rate - 1) <= MOST_RATE
 
 
 def _first_guess(network: Network) -> Float[np.ndarray, " V"]:

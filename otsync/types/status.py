@@ -25,7 +25,7 @@ class Status(StrEnum):
     )
     RATE_MISMATCH = (
         "The motion contradicts the declared frame rates. Check fps (29.97 against 30, 25 against 30) or the "
-        "container's timestamps, or let the rate be fitted (rate='fit', the default)."
+        "container's timestamps; with depth, let the rate be fitted (rate='fit', the default)."
     )
     BROKEN_CLOCK = (
         "Parts of the overlap seem to have offsets of their own: a video froze, lost frames, was paused or cut, or "

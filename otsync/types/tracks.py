@@ -145,13 +145,18 @@ class TrackSet:
     def check(self, name: str, *, xyz: bool = True, features: bool = False) -> None:
         """Raise ValueError, naming the argument ``name``, unless the contents are fit for use.
 
-        Asked of every set: at least one track, finite visible samples. ``xyz``/``features``: that they are there;
-        features must be finite and not zero.
+        Asked of every set: at least one track, a pose for every frame of a camera that moves, finite visible samples.
+        ``xyz``/``features``: that they are there; features must be finite and not zero.
         """
         if len(self) == 0 or self.n_frames == 0:
             raise ValueError(f"{name}: expected at least one track and one frame; found {len(self)} x {self.n_frames}.")
         if xyz and self.xyz is None:
             raise ValueError(f"{name}.xyz: expected 3D positions; found pixels only. Lift the tracks with depth first.")
+        if self.camera is not None and self.camera.w2c.ndim == 3 and len(self.camera.w2c) != self.n_frames:
+            raise ValueError(
+                f"{name}.camera.w2c: expected one pose, or one for each of {self.n_frames} frames; found "
+                f"{len(self.camera.w2c)}."
+            )
         for field in ("xyz", "uv", "sigma"):
             value = getattr(self, field)
             if value is None:

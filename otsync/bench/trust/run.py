@@ -121,6 +121,8 @@ def one(job: tuple[str, str, int], changed: Method | None = None) -> list[dict[s
     """
     name, method, seed = job
     world = CLASSES[name](seed)
+    if "method" in world.options and (changed is not None or method != "default"):
+        raise ValueError(f"{name}: expected no other method, for these tracks have no depth; found {method!r}.")
     offsets = synchronize(list(world.tracks), **{"method": changed or METHODS[method], **world.options})
     ends, worst = world.errors(offsets)
     both, sigmas = world.at_ends(offsets), offsets.sigma_ends * FPS

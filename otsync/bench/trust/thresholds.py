@@ -31,7 +31,7 @@ from ..record import Row, table, write_rows
 from .diagram import in_sigmas
 from .kept import Kept
 from .run import FIRST_SEED, interval, measured, one, written, wrong
-from .worlds import CLASSES
+from .worlds import CLASSES, WITHOUT_DEPTH
 
 FACTORS = (0.5, 0.7, 0.85, 1.0, 1.2, 1.4, 2.0)
 """A limit is tried at its own value times these."""
@@ -69,14 +69,19 @@ def run(out: Path, *, seeds: int = 3, first_seed: int = TUNED_ON, only: tuple[st
     others = [(name, value) for name, each in tried.items() for value in each if value != now[name]]
     worlds = [(world, first_seed + k) for world in CLASSES for k in range(seeds)]
     # the limits as they are answer once, for all
-    jobs = [(*limit, *world) for limit in [(None, 0.0), *others] for world in worlds]
+    jobs = [(*limit, *world) for limit in [(None, 0.0), *others] for world in worlds if reads(limit[0], world[0])]
     about = {"seeds": seeds, "first_seed": first_seed}
     answers = list(measured(jobs, answered, "thresholds", Kept(out / "thresholds_answers.jsonl")))
     of: dict[tuple[str | None, float], list[Row]] = {}
     for row in answers:
         of.setdefault((row["limit"], row["value"]), []).append(row)
     rows = [
-        summary(name, value, now[name], of[(None, 0.0) if value == now[name] else (name, value)])
+        summary(
+            name,
+            value,
+            now[name],
+            [r for r in of[(None, 0.0) if value == now[name] else (name, value)] if reads(name, r["class"])],
+        )
         for name, each in tried.items()
         for value in each
     ]
@@ -87,6 +92,11 @@ def run(out: Path, *, seeds: int = 3, first_seed: int = TUNED_ON, only: tuple[st
     print(table(rows), flush=True)
     print(f"\nchosen on seeds {first_seed} to {first_seed + seeds - 1}:\n\n{table(told)}", flush=True)
     return 0
+
+
+def reads(name: str | None, world: str) -> bool:
+    """Whether a class is synchronised by what a limit is changed of: of Trust's, those of tracks with depth are."""
+    return name not in LIMITS or world not in WITHOUT_DEPTH
 
 
 def values(now: float) -> list[float]:

@@ -53,7 +53,8 @@ class World:
     Args:
         tracks: of every video. shown: per video (T,) seconds of the world; None where there is no true answer, so that
             every answer that is trusted is wrong.
-        options: of :func:`otsync.synchronize`, beside its defaults; a ``method`` of its own goes before others.
+        options: of :func:`otsync.synchronize`, beside its defaults; a ``method`` of its own is the only one that
+            reads its tracks.
     """
 
     tracks: tuple[TrackSet, ...]
@@ -310,3 +311,6 @@ CLASSES: dict[str, Callable[[int], World]] = {
     "things that jump, hard": partial(plain, motion="portals", preset="hard"),
 }
 """Classes by name: those of the benchmark first, then those that mislead."""
+
+WITHOUT_DEPTH = frozenset(name for name in CLASSES if name.startswith("phones in hands"))
+"""Classes of tracks in pixels, which no other method reads than their own."""

@@ -247,6 +247,14 @@ def test_a_hand_that_only_turns_shows_it_too():
     assert steps.cuts(CLEAR_PATH).tolist() == [40]
 
 
+def test_frames_that_are_known_to_be_missing_are_no_cut():
+    lost = np.delete(np.arange(90.0), np.r_[20:24, 60:64])
+    told = replace(in_a_hand(lost), fps=None, timestamps=lost / 30)
+    assert not len(Steps.of_camera(told).cuts(CLEAR_PATH))
+    wrong = replace(told, timestamps=(lost - 4 * (lost >= 24)) / 30)  # the second gap alone
+    assert Steps.of_camera(wrong).cuts(CLEAR_PATH).tolist() == [20]
+
+
 def test_of_a_camera_that_stands_still_nothing_is_known():
     tracks = in_a_hand(np.arange(90.0))
     still = replace(tracks.camera, w2c=tracks.camera.w2c[0])

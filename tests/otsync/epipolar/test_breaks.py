@@ -191,3 +191,31 @@ def test_a_rate_that_is_not_the_declared_one_is_told_within_three_seconds(seed):
     offsets = solved(in_hands(1.042 * np.arange(86.0), seed))
     assert Status.RATE_MISMATCH in offsets.flags[1]
     assert all(offsets.status[v].ok and abs(offsets.seconds[v] * FPS - LATE[v]) < 0.2 for v in (2, 3))
+
+
+def test_poses_that_are_too_few_are_named():
+    tracks = in_hands(np.arange(90.0), 0)
+    short = replace(tracks[1], camera=replace(tracks[1].camera, w2c=tracks[1].camera.w2c[:80]))
+    with pytest.raises(
+        ValueError, match=r"tracks\[1\].camera.w2c: expected one pose, or one for each of 90 .* found 80"
+    ):
+        solved([tracks[0], short])
+
+
+def test_frames_that_were_lost_and_said_so_are_no_doubt():
+    """Also near an end, where too little is left to vouch."""
+    lost = np.delete(np.arange(94.0), np.arange(8, 12))
+    tracks = in_hands(lost, 0)
+    tracks[1] = replace(tracks[1], fps=None, timestamps=lost / FPS)
+    offsets = solved(tracks)
+    assert offsets.ok and error(offsets, 4) < 0.15
+
+
+def test_many_cuts_of_a_path_leave_room_for_what_stood_still():
+    shown = np.concatenate([np.arange(k * 40, k * 40 + 36) for k in range(12)])
+    shown = np.concatenate([shown[:130], np.full(10, shown[129]), shown[130:]]).astype(float)
+    still = ring(4, width=640, height=360)[0]
+    camera = replace(still, w2c=moving_poses(still, shown / FPS))
+    uv = camera.project(paths(shown / FPS, 40, 5))
+    found = moments(TrackSet(None, uv=uv, camera=camera, fps=FPS))
+    assert sum(m.sure for m in found) == 6 and any(m.still > 0 for m in found)
