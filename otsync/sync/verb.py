@@ -231,7 +231,7 @@ def _without_unsteady(
 def _with_off_rates_told(verdict: Verdict, trust: Trust, judged: Callable[[Sequence[Answer]], Verdict]) -> Verdict:
     """The verdict, with the pairs of videos whose clocks run otherwise than declared flagged, or less sure."""
     answers = verdict.answers
-    off = off_rates(len(verdict.x), answers, verdict.reference, trust)
+    off = off_rates(answers, verdict.reference, trust)
     for clock in off:
         answers = tuple(clock.told(a) for a in answers)
     return judged(answers) if off else verdict

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -261,38 +261,45 @@ class OffRate:
         )
 
 
-def off_rates(n: int, answers: Sequence[Answer], reference: int, trust: Trust) -> list[OffRate]:
-    """Clocks of ``n`` videos that run, or may run, otherwise than those of the most.
+def off_rates(answers: Sequence[Answer], reference: int, trust: Trust) -> list[OffRate]:
+    """Clocks that run, or may run, otherwise than those of the most; the surest first.
 
     Read from all pairs that fitted a rate beside the offset and kept the declared one. One pair of a few seconds hardly
-    tells a rate, but a clock that runs otherwise does so in all of a video's pairs. Where as many run one way as the
-    other, the reference is right: offsets are on its clock.
+    tells a rate, but a clock that runs otherwise does so in all of a video's pairs. The surest is set aside, and the
+    rest is asked again; in the end each is asked by its pairs with those that run as most do, for two that run alike
+    contradict no other less. Where as many run one way as the other, the reference is right: offsets are on its clock.
     """
-    told = [a for a in answers if _tells_rate(a)]
-    edges = [Edge(*a.pair, math.log(a.refined.stats["fitted_rate"]), a.refined.stats["rate_sigma"], True) for a in told]
+    every = {a.pair: a.refined.stats for a in answers if _tells_rate(a)}
+    videos = {v for pair in every for v in pair}
+    told, aside = every, set[int]()
+    while told:
+        asked = (_off_rate(v, told, trust) for v in {v for pair in told for v in pair})
+        surest = max(asked, key=lambda r: (r.sigmas, r.video != reference, r.video))
+        if surest.sigmas <= MAYBE_RATE:
+            break
+        aside.add(surest.video)
+        told = {pair: stats for pair, stats in told.items() if surest.video not in pair}
+    if reference in aside and 2 * len(aside) == len(videos) > 2:
+        aside = videos - aside
     found = []
-    for group in _linked_by(n, edges):
-        anchor = reference if reference in group else group[0]
-        solution = solve(n, edges, anchor)
-        x, sigma = solution.x[group], solution.sigma[group]
-        off = [k for k, e in enumerate(edges) if e.a in group]
-        # pairs that differ by more than they say do not know it better together
-        squares = sum((solution.residual[k] / edges[k].sigma) ** 2 for k in off)
-        sigma = sigma * math.sqrt(max(1.0, squares / max(1, len(off) - len(group) + 1)))
-        sigma[group.index(anchor)] = np.median(np.delete(sigma, group.index(anchor)))
-        usual = x[max(range(len(x)), key=lambda k: ((np.abs(x - x[k]) <= sigma).sum(), group[k] == anchor))]
-        for v, away, known in zip(group, np.abs(x - usual).tolist(), sigma.tolist(), strict=True):
-            drift = away * max(a.refined.stats.get("overlap", 0.0) for a in told if v in a.pair) / 2
-            if drift > LEAST_DRIFT and away > MAYBE_RATE * known:
-                found.append(OffRate(v, away / known, drift, trust.rate_sigmas))
-    return found
+    for v in aside:
+        with_most = {pair: stats for pair, stats in every.items() if v in pair and not (aside - {v}) & set(pair)}
+        found.append(_off_rate(v, with_most or {p: s for p, s in every.items() if v in p}, trust))
+    return sorted((r for r in found if r.sigmas > MAYBE_RATE), key=lambda r: -r.sigmas)
 
 
-def _linked_by(n: int, edges: Sequence[Edge]) -> list[list[int]]:
-    """The videos that edges link, group by group."""
-    group = components(n, edges) if edges else np.arange(n)
-    groups = [np.flatnonzero(group == root).tolist() for root in np.unique(group)]
-    return [members for members in groups if len(members) > 1]
+def _off_rate(v: int, told: Mapping[Pair, Mapping[str, float]], trust: Trust) -> OffRate:
+    """As all pairs of a video measure it; no sigmas where it hardly moves the ends."""
+    own = [(pair, stats) for pair, stats in told.items() if v in pair]
+    rate = np.array([math.log(stats["fitted_rate"]) * (1 if v == pair[1] else -1) for pair, stats in own])
+    weight = np.array([stats["rate_sigma"] ** -2 for _, stats in own])
+    mean = float(weight @ rate / weight.sum())
+    # pairs that differ by more than they say do not know it better together
+    misfit = float(weight @ (rate - mean) ** 2) / max(1, len(own) - 1)
+    drift = abs(mean) * max(stats.get("overlap", 0.0) for _, stats in own) / 2
+    # rounded: of two videos, which are off against each other alike, neither is surer
+    sigmas = round(abs(mean) * math.sqrt(weight.sum() / max(1.0, misfit)), 6) if drift > LEAST_DRIFT else 0.0
+    return OffRate(v, sigmas, drift, trust.rate_sigmas)
 
 
 def _tells_rate(answer: Answer) -> bool:

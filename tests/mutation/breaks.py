@@ -999,12 +999,12 @@ BREAKS = (
         "the rate that was fitted is not followed: each step measures the same again",
     ),
     Break(
-        "sync-rates-by-the-reference",
+        "sync-rate-of-one-side",
         "otsync/sync/verdict.py",
-        "key=lambda k: ((np.abs(x - x[k]) <= sigma).sum(), group[k] == anchor)",
-        "key=lambda k: group[k] == anchor",
+        "(1 if v == pair[1] else -1) for pair, stats in own",
+        "1 for pair, stats in own",
         ("tests/otsync/sync/test_verdict.py",),
-        "the rate of the reference is right, however many others contradict it",
+        "a video that comes first in a pair has the other's rate",
     ),
     Break(
         "cuts-path-unturned",
