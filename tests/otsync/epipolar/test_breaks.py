@@ -171,7 +171,8 @@ def test_both_pieces_vouch_for_one_offset_or_none_does():
     assert told.vouched() and told.doubt() == 0
     for behind in (30 * there[7], 5 * there[4], 0 * there[4]):
         assert not replace(told, behind=behind).vouched()
-    assert replace(told, behind=30 * there[7]).doubt() == 30  # three frames are another time
+    three = replace(told, behind=30 * there[7])  # frames later are another time
+    assert three.doubt() == 30 and three.best(0.0, 0.2)[0] == 30
     # motion that comes back suits another offset nearly as well
     assert not replace(told, before=told.before + 39 * there[1]).vouched()
     assert replace(told, before=told.before + 20 * there[1]).vouched()
