@@ -42,10 +42,11 @@ doubted. Basketball (seeds 71900-71929, 73900-73915): of 30 moments at which sou
 jerk, 28 have 0; where ten frames were lost, or fifteen repeated, two cameras have 12 and more in 35 of 36, and four 54
 and more in 25 of 25."""
 
-CLEARLY = 0.2
+CLEARLY = 0.35
 """Where a camera's path is cut, one offset must beat any two by this share of the weaker piece's evidence: less is
-ambiguous, as of a pair. Motion that comes back suits another one nearly as well (.03, "phones in hands, ten lost", seed
-80477: trusted, ten frames off before the cut)."""
+ambiguous. Motion that comes back suits another one nearly as well ("phones in hands, ten lost": .03, seed 80477, and
+.20 where poses are 5 mm off, 80534; both were trusted, ten frames off on one side). A path is cut where frames are
+missing or a phone was knocked, so little is lost by doubt."""
 
 MENDED = 50.0
 """Nats by which two offsets suit the pieces better than one, from which on a clock is mended. Four of those cameras
