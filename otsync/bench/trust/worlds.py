@@ -46,6 +46,10 @@ PIXEL_NOISE = 0.5
 """Pixels, of tracks without depth: what flow keeps of a textured thing."""
 
 
+POSE_NOISE = 0.005, 0.05
+"""Metres and degrees, one sigma an axis, of the poses of cameras that were found frame by frame."""
+
+
 @dataclass(frozen=True, eq=False)
 class World:
     """Videos, and what their frames show.
@@ -167,11 +171,12 @@ def plain(seed: int, **options: Any) -> World:
     return World(tracks, truth.shown)
 
 
-def in_hands(seed: int, *, rate: float = 1.0, **options: Any) -> World:
+def in_hands(seed: int, *, rate: float = 1.0, off: bool = False, **options: Any) -> World:
     """Four phones in hands that film three seconds, and no depth: tracks in pixels, the poses of every frame known.
 
     Args:
-        rate: that the second one's clock runs by, though nobody says so. options: of :func:`drawn`.
+        rate: that the second one's clock runs by, though nobody says so. off: whether each frame's pose is off by
+            :data:`POSE_NOISE`. options: of :func:`drawn`.
     """
     known: dict[str, Any] = {"preset": "clean", "videos": 4, "frames": 90, "within": 20, "last": (Gaps(0.2),)}
     tracks, truth = drawn(seed, rates=[1.0, rate, 1.0, 1.0], **known | options)
@@ -179,11 +184,22 @@ def in_hands(seed: int, *, rate: float = 1.0, **options: Any) -> World:
     for t, shown in zip(tracks, truth.shown, strict=True):
         assert t.camera is not None
         camera = replace(t.camera, w2c=Hand().shaken(t.camera.w2c, shown, rng))
+        told = replace(camera, w2c=_pushed(rng, t.n_frames) @ camera.w2c) if off else camera
         noise = rng.normal(0, PIXEL_NOISE, (len(t), t.n_frames, 2))
         # a picture that stands still is the same, noise and all
         uv = camera.project(t.positions()) + noise[:, np.searchsorted(np.unique(shown), shown)]
-        held.append(replace(t, xyz=None, uv=uv, camera=camera))
+        held.append(replace(t, xyz=None, uv=uv, camera=told))
     return World(tuple(held), truth.shown, {"method": PIXELS})
+
+
+def _pushed(rng: np.random.Generator, count: int) -> np.ndarray:
+    """(T,4,4) small motions of a camera, each by itself."""
+    from scipy.spatial.transform import Rotation
+
+    out = np.repeat(np.eye(4)[None], count, 0)
+    out[:, :3, :3] = Rotation.from_rotvec(np.radians(POSE_NOISE[1]) * rng.normal(size=(count, 3))).as_matrix()
+    out[:, :3, 3] = POSE_NOISE[0] * rng.normal(size=(count, 3))
+    return out
 
 
 def untrue(seed: int, **options: Any) -> World:
@@ -289,6 +305,7 @@ CLASSES: dict[str, Callable[[int], World]] = {
     "phones in hands": in_hands,
     "phones in hands, four lost": partial(in_hands, first=(In(1, Drop(4 / 30)),)),
     "phones in hands, ten lost": partial(in_hands, first=(In(1, Drop(10 / 30)),)),
+    "phones in hands, poses off, ten lost": partial(in_hands, off=True, first=(In(1, Drop(10 / 30)),)),
     "phones in hands, one frozen": partial(in_hands, first=(In(1, Freeze(8)),)),
     "phones in hands, rate 4 %": partial(in_hands, rate=1.04),
     "short overlap": partial(plain, preset="hard", frames=56, within=5),

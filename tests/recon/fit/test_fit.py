@@ -558,7 +558,7 @@ def test_types_of_motion_are_scaffolds(scene):
 KILLED = """
 import sys
 sys.path.insert(0, {tests!r})
-from tests.recon.test_fit import believed, true_scene
+from tests.recon.fit.test_fit import believed, true_scene
 from recon.fit import fit
 from recon.simulate import synthetic
 capture = synthetic(4, cameras=3, held_out=0, frames=8, size=(48, 32))

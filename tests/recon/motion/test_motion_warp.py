@@ -314,7 +314,7 @@ def test_float32_on_the_cpu_is_what_the_kernels_take():
 def test_a_processor_without_avx_carries_the_same(tmp_path):
     """Compiled for the least x86-64 there is: a row of eight lanes twice instead of sixteen once."""
     env = {**os.environ, "NUMBA_CPU_NAME": "generic", "NUMBA_CACHE_DIR": str(tmp_path)}
-    code = "from recon.raster.cpu.simd import LANES; assert LANES == 8, LANES; import pytest; "
+    code = "from otsync.compute.simd import LANES; assert LANES == 8, LANES; import pytest; "
     code += f"raise SystemExit(pytest.main(['-q', '-x', '-m', 'not slow', {str(Path(__file__))!r}]))"
     root = Path(__file__).parents[3]
     result = subprocess.run([sys.executable, "-c", code], env=env, cwd=root, capture_output=True, text=True)

@@ -113,10 +113,10 @@ def test_a_read_only_installation_works(tmp_path, home):
 @pytest.mark.slow
 def test_a_processor_without_avx_gets_the_same_images(tmp_path):
     """Compiled for the least x86-64 there is: eight lanes, no fused multiply-add."""
-    code = "from recon.raster.cpu.simd import LANES; assert LANES == 8, LANES"
+    code = "from otsync.compute.simd import LANES; assert LANES == 8, LANES"
     env = {"NUMBA_CPU_NAME": "generic", "NUMBA_CACHE_DIR": str(tmp_path)}
     assert python(code, env=env).returncode == 0
-    tests = ["tests/recon/test_raster_oracle.py", "tests/recon/test_raster_hard_cases.py"]
+    tests = ["tests/recon/raster/test_raster_oracle.py", "tests/recon/raster/test_raster_hard_cases.py"]
     code = f"import pytest; raise SystemExit(pytest.main(['-q', '-x', '-m', 'not slow', '-k', 'cpu', *{tests}]))"
     result = python(code, env=env, cwd=ROOT)
     assert result.returncode == 0, result.stdout[-3000:]
