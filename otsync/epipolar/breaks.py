@@ -299,7 +299,7 @@ class Compared:
         found = []
         for span, offset in zip(spans, offsets, strict=True):
             start = Alignment(sign * (offset - self.offset), sigma=1 / fps, fps=fps)
-            piece = refiner(*self.both(within(own, *span)), self.matches, start)
+            piece, _ = refiner.placed(*self.both(within(own, *span)), self.matches, start)
             if not math.isfinite(piece.offset) or {Status.MOVED, Status.NO_OVERLAP} & set(piece.flags):
                 return None
             found.append(piece)

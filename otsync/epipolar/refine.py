@@ -11,7 +11,7 @@ from ..clocks.common import nominal_fps
 from ..refine.slot import JUDGED_BY, Refiner
 from ..types import Alignment, Matches, Status, TrackSet, in_order
 from ..types.trust import Trust
-from .residuals import broken
+from .residuals import Residuals, broken
 from .scan import EpipolarScan
 
 SPREAD_ITERATIONS = 4
@@ -72,13 +72,25 @@ class EpipolarRefine(Refiner):
                 )
 
     def __call__(self, a: TrackSet, b: TrackSet, matches: Matches, alignment: Alignment) -> Alignment:
+        found, problem = self.placed(a, b, matches, alignment)
+        if problem is None:
+            return found
+        rate, sigma = problem.rate(found.offset, self.windows[0], self.iterations)
+        if not math.isfinite(sigma):
+            return found
+        return replace(found, stats=found.stats | {"fitted_rate": 1 + rate, "rate_sigma": sigma})
+
+    def placed(
+        self, a: TrackSet, b: TrackSet, matches: Matches, alignment: Alignment
+    ) -> tuple[Alignment, Residuals | None]:
+        """The answer without the rate that the pair would have, and what it was fitted to."""
         if not np.isfinite(alignment.offset) or len(matches) == 0:
-            return alignment
+            return alignment, None
         fps = min(nominal_fps(a), nominal_fps(b))
         problem = self.scan.residuals(a, b, matches, alignment.offset, fps)
         if problem is None:
             flags = in_order((*alignment.flags, Status.NO_OVERLAP))
-            return replace(alignment, flags=flags)
+            return replace(alignment, flags=flags), None
         offset, found = problem.solve(alignment.offset, self.windows[0], self.iterations, self.reach)
         common = problem.common_error(found, self.windows[0])
         others = [
@@ -93,7 +105,6 @@ class EpipolarRefine(Refiner):
             raised.append(Status.MOVED)
         if broken(wander, blur):
             raised.append(Status.BROKEN_CLOCK)
-        rate, rate_sigma = problem.rate(offset, self.windows[0], self.iterations)
         stats = alignment.stats | {
             "moved": abs(offset - alignment.offset),
             "spread": spread,
@@ -103,13 +114,6 @@ class EpipolarRefine(Refiner):
             "blur": blur,
             "fitted_matches": float(len(problem.weight)),
         }
-        if math.isfinite(rate_sigma):
-            stats |= {"fitted_rate": 1 + rate, "rate_sigma": rate_sigma}
         ordered = in_order(raised)
-        return replace(
-            alignment,
-            offset=float(offset),
-            sigma=float(np.hypot(sigma, LEAST_SIGMA / fps)),
-            flags=ordered,
-            stats=stats,
-        )
+        sigma = float(np.hypot(sigma, LEAST_SIGMA / fps))
+        return replace(alignment, offset=float(offset), sigma=sigma, flags=ordered, stats=stats), problem

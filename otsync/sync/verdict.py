@@ -235,7 +235,7 @@ def _rates(
 
 @dataclass(frozen=True)
 class OffRate:
-    """A clock that runs, or may run, otherwise than those of the most.
+    """A clock that runs, or may run, otherwise than most.
 
     Args:
         video: whose clock it is. sigmas: between its rate and the declared one. drift: seconds by which that moves the
@@ -262,20 +262,22 @@ class OffRate:
 
 
 def off_rates(answers: Sequence[Answer], reference: int, trust: Trust) -> list[OffRate]:
-    """Clocks that run, or may run, otherwise than those of the most; the surest first.
+    """Clocks that run, or may run, otherwise than most; the surest first.
 
     Read from all pairs that fitted a rate beside the offset and kept the declared one. One pair of a few seconds hardly
     tells a rate, but a clock that runs otherwise does so in all of a video's pairs. The surest is set aside, and the
-    rest is asked again; in the end each is asked by its pairs with those that run as most do, for two that run alike
-    contradict no other less. Where as many run one way as the other, the reference is right: offsets are on its clock.
+    rest is asked again. In the end each is measured by its pairs with those that were not set aside: two that run alike
+    do not contradict each other. Where as many run one way as the other, the reference is right: offsets are on its
+    clock.
     """
+    least = min(MAYBE_RATE, trust.rate_sigmas)
     every = {a.pair: a.refined.stats for a in answers if _tells_rate(a)}
     videos = {v for pair in every for v in pair}
     told, aside = every, set[int]()
     while told:
         asked = (_off_rate(v, told, trust) for v in {v for pair in told for v in pair})
         surest = max(asked, key=lambda r: (r.sigmas, r.video != reference, r.video))
-        if surest.sigmas <= MAYBE_RATE:
+        if surest.sigmas <= least:
             break
         aside.add(surest.video)
         told = {pair: stats for pair, stats in told.items() if surest.video not in pair}
@@ -285,7 +287,7 @@ def off_rates(answers: Sequence[Answer], reference: int, trust: Trust) -> list[O
     for v in aside:
         with_most = {pair: stats for pair, stats in every.items() if v in pair and not (aside - {v}) & set(pair)}
         found.append(_off_rate(v, with_most or {p: s for p, s in every.items() if v in p}, trust))
-    return sorted((r for r in found if r.sigmas > MAYBE_RATE), key=lambda r: -r.sigmas)
+    return sorted((r for r in found if r.sigmas > least), key=lambda r: -r.sigmas)
 
 
 def _off_rate(v: int, told: Mapping[Pair, Mapping[str, float]], trust: Trust) -> OffRate:

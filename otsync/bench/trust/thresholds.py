@@ -95,7 +95,7 @@ def run(out: Path, *, seeds: int = 3, first_seed: int = TUNED_ON, only: tuple[st
 
 
 def reads(name: str | None, world: str) -> bool:
-    """Whether a class is synchronised by what a limit is changed of: of Trust's, those of tracks with depth are."""
+    """Whether a limit can change the answers to a class: those of Trust are changed for tracks with depth alone."""
     return name not in LIMITS or world not in WITHOUT_DEPTH
 
 

@@ -41,10 +41,8 @@ BESIDE = 8 / 30
 LEVEL = 15
 """Frames over which the error of a clock is averaged: a whole number of turns of what repeats every third or fifth."""
 
-
 PIXEL_NOISE = 0.5
-"""Pixels, of tracks without depth: what flow keeps of a textured thing."""
-
+"""Pixels, of tracks without depth: what flow leaves on a textured thing."""
 
 POSE_NOISE = 0.005, 0.05
 """Metres and degrees, one sigma an axis, of the poses of cameras that were found frame by frame."""
@@ -185,10 +183,10 @@ def in_hands(seed: int, *, rate: float = 1.0, off: bool = False, **options: Any)
         assert t.camera is not None
         camera = replace(t.camera, w2c=Hand().shaken(t.camera.w2c, shown, rng))
         told = replace(camera, w2c=_pushed(rng, t.n_frames) @ camera.w2c) if off else camera
-        noise = rng.normal(0, PIXEL_NOISE, (len(t), t.n_frames, 2))
+        uv = camera.project(t.positions()) + rng.normal(0, PIXEL_NOISE, (len(t), t.n_frames, 2))
         # a picture that stands still is the same, noise and all
-        uv = camera.project(t.positions()) + noise[:, np.searchsorted(np.unique(shown), shown)]
-        held.append(replace(t, xyz=None, uv=uv, camera=told))
+        _, first, same = np.unique(shown, return_index=True, return_inverse=True)
+        held.append(replace(t, xyz=None, uv=uv[:, first[same]], visible=t.seen[:, first[same]], camera=told))
     return World(tuple(held), truth.shown, {"method": PIXELS})
 
 

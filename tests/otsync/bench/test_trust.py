@@ -11,8 +11,8 @@ import pytest
 
 from otsync.bench.trust import thresholds
 from otsync.bench.trust.diagram import reliability
-from otsync.bench.trust.run import acceptance, interval, run, summarise, wrong
-from otsync.bench.trust.worlds import CLASSES, FPS, World, levelled, plain, steady
+from otsync.bench.trust.run import acceptance, interval, one, run, summarise, wrong
+from otsync.bench.trust.worlds import CLASSES, FPS, WITHOUT_DEPTH, World, levelled, plain, steady
 from otsync.simulate import simulate
 from otsync.simulate.effects import Drop, In, Repeats
 from otsync.types import Break, Offsets
@@ -220,3 +220,21 @@ def test_a_sweep_writes_what_each_value_trusts(tmp_path, monkeypatch):
     assert strict["right"] == 0 and strict["wrong"] == 0 and strict["answers"] == now["answers"] == 2
     assert len(json.loads((tmp_path / "thresholds_answers.json").read_text())["rows"]) == 4
     assert json.loads((tmp_path / "thresholds_chosen.json").read_text())["rows"][0]["chosen"] == now["value"]
+
+
+def test_tracks_without_depth_take_no_other_method_and_no_limit_of_one():
+    assert len(WITHOUT_DEPTH) == 6
+    for name in WITHOUT_DEPTH:
+        with pytest.raises(ValueError, match=f"{name}: expected no other method, .*; found 'paper'"):
+            one((name, "paper", 500))
+        assert not thresholds.reads("blur", name) and thresholds.reads("sync.parts.SUITS_BETTER", name)
+    assert thresholds.reads("blur", "mid") and thresholds.reads(None, "phones in hands")
+
+
+def test_phones_in_hands_repeat_a_frozen_picture_and_know_where_they_were():
+    world = CLASSES["phones in hands, one frozen"](500)
+    uv, still = world.tracks[1].uv, np.flatnonzero(np.diff(world.shown[1]) == 0)
+    assert len(still) == 8 and all(np.array_equal(uv[:, k], uv[:, k + 1], equal_nan=True) for k in still)
+    off, true = (CLASSES[f"phones in hands, {name}ten lost"](500).tracks[0] for name in ("poses off, ", ""))
+    assert np.allclose(off.uv, true.uv, atol=10, equal_nan=True) and not np.allclose(off.camera.w2c, true.camera.w2c)
+    assert np.abs(off.camera.center - true.camera.center).max() < 0.05

@@ -189,6 +189,8 @@ def test_a_rate_that_may_be_is_in_sigma_and_one_that_is_not_told_is_not():
     assert not told.flags and told.sigma == pytest.approx(np.hypot(0.002, expected))
     assert told.stats["common_error"] == pytest.approx(expected)  # three such pairs know it no better than one
     assert off_rates(rated(slow, 0.2), 0, Trust()) == off_rates([], 0, Trust()) == []
+    (strict,) = off_rates(rated(slow, 0.05), 0, Trust(rate_sigmas=1.0))  # 1.4 sigmas
+    assert strict.told(rated(slow)[EVERY.index((0, 3))]).refined.flags == (Status.RATE_MISMATCH,)
     (limited,) = off_rates(rated(slow, 0.008), 0, Trust(rate_sigmas=100.0))
     assert not limited.told(rated(slow)[EVERY.index((0, 3))]).refined.flags
     short = {p: 1.004 if p[1] == 3 else 1.0 for p in EVERY}
