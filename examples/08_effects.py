@@ -9,6 +9,7 @@ with the effect's model in its tuple and once without. An effect that is not in 
 from __future__ import annotations
 
 import argparse
+import math
 import time
 
 import numpy as np
@@ -19,12 +20,19 @@ from recon.evaluate.views import view
 from recon.fit.verb import fit
 from recon.observe.effects import MotionBlur
 from recon.observe.recorded import optics, with_declared
+from recon.observe.vignetting import Vignetting
 from recon.scene.seed import Seeding
 from recon.simulate.capture import Capture, synthetic
-from recon.simulate.effects import Blur, Rolling, Sheen
+from recon.simulate.effects import Blur, DarkCorners, Rolling, Sheen
 from recon.simulate.recording import initial_scene
 
-FILMED = {"none": (), "rolling": (Rolling(0.025),), "blur": (Blur(0.025),), "sheen": (Sheen(0.4),)}
+FILMED = {
+    "none": (),
+    "rolling": (Rolling(0.025),),
+    "blur": (Blur(0.025),),
+    "sheen": (Sheen(0.4),),
+    "corners": (DarkCorners(0.3),),
+}
 
 
 def modelled(effect: str, capture: Capture) -> tuple[tuple, Seeding]:
@@ -33,6 +41,8 @@ def modelled(effect: str, capture: Capture) -> tuple[tuple, Seeding]:
         return with_declared((), [f.readout for f in capture.footage]), Seeding()
     if effect == "blur":
         return (MotionBlur(0.025),), Seeding()
+    if effect == "corners":  # as a static part tells it
+        return (Vignetting(math.log(0.7)),), Seeding()
     return (), Seeding(sh_degree=1) if effect == "sheen" else Seeding()
 
 

@@ -20,9 +20,10 @@ from torch import Tensor
 
 from otsync.compute.indices import evenly
 from otsync.progress import bar
+from recon.backdrop.colours import first_colours
 from recon.backdrop.seeds import seed_discs, surface_of
 from recon.backdrop.stills import Still, stills_of
-from recon.backdrop.surroundings import Floor, Lookup, surroundings
+from recon.backdrop.surroundings import Floor, surroundings
 from recon.fit.optimize import Adam, Decay
 from recon.fit.options import check_length
 from recon.footage.depth import Depths
@@ -30,6 +31,8 @@ from recon.footage.footage import Footage
 from recon.losses.ssim import photometric
 from recon.losses.window import SMALL
 from recon.observe.cameras import draw
+from recon.observe.effects import Lens
+from recon.observe.vignetting import NO_FALLOFF, Falloff
 from recon.scene.device import device_of
 from recon.scene.gaussians import Gaussians
 
@@ -46,6 +49,7 @@ RATES: Mapping[str, float] = {
     "opacity_logits": 0.03,
     "sh": 0.018,
     "gains": 2e-3,
+    "falloff": 2e-3,
 }
 """Adam's steps at the start; of means in footprints. Slower means would stay on the seeds' surface, a guess."""
 
@@ -68,9 +72,6 @@ STEPS = 1500
 WARM, TIMED = 10, 30
 """With a budget in seconds: the step at which compilation is over, and the one up to which the pace is measured."""
 
-GAIN_POINTS, GAIN_ROUNDS = 4000, 20
-"""Surface points that the first gains compare at most, and rounds of medians in which they settle."""
-
 MEDIAN_FRAMES, CHANGED, RARELY = 50, 14, 0.02
 """A fixed camera without masks: frames of its median image; levels of 255 by which a changed pixel differs from it; and
 the share of frames in which an unchanging pixel may."""
@@ -87,6 +88,7 @@ class StaticFit:
     Args:
         gaussians: on the CPU, without a graph.
         gains: (V,3) factors from the Gaussians' colours to every video's; 1 for videos that took no part.
+        falloff: of the vignetting that all cameras share; zeros where the pictures show none.
         near: near plane to render with, world units.
         psnr: (V,) dB over the seen background of every video, gains applied; nan for videos that took no part.
         floor: as given or as found; None where there is none.
@@ -98,6 +100,7 @@ class StaticFit:
     near: float
     psnr: Float[np.ndarray, " V"]
     floor: Floor | None = None
+    falloff: Falloff = NO_FALLOFF
     stats: dict[str, float] = field(default_factory=dict)
 
     def __repr__(self) -> str:
@@ -152,41 +155,19 @@ def fit_backdrop(
     around = surroundings([stills[i] for i in evenly(len(stills), SEARCHED)], points, floor)
     near = NEAR_SHARE * around.distance
     surfaces = [surface_of(s, around, near) for s in stills]
-    gains = first_gains(stills, np.concatenate([s.at for s in surfaces]), len(footage))
+    gains, falloff = first_colours(stills, np.concatenate([s.at for s in surfaces]), len(footage))
     start, sharpest = seed_discs(stills, surfaces, around, near, gains).gaussians(sh_degree)
     log.info("backdrop: %d seeds, near plane %.3g", len(start), near)
-    fit = _BackdropFit(start, sharpest.to(device), stills, gains, near, around.distance, rates, seed, device)
+    fit = _BackdropFit(start, sharpest.to(device), stills, gains, falloff, near, around.distance, rates, seed, device)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # torch's pool would compete with the rasterizer's
     try:
         loss = fit.run(total, budget if at_most is None else at_most, progress)
     finally:
         torch.set_num_threads(threads)
-    gains, scores = fit.result()
+    gains, falloff, scores = fit.result()
     stats = {"seconds": time.perf_counter() - started, "steps": fit.step, "seeds": len(start), "loss": loss}
-    return StaticFit(fit.gaussians().detach(), gains, near, scores, around.floor, stats)
-
-
-def first_gains(stills: Sequence[Still], points: Float[np.ndarray, "N 3"], videos: int) -> Float[np.ndarray, "V 3"]:
-    """Gains of the videos, of geometric mean 1, from the colours in which they show the same surface points.
-
-    Occlusion and misplaced points change colours too, but not all in one direction: medians are taken.
-    """
-    looks = [Lookup.of(still).look(points[:: max(1, len(points) // GAIN_POINTS)]) for still in stills]
-    colors = np.where(np.stack([k for _, k in looks])[..., None], np.stack([c for c, _ in looks]), np.nan)
-    twice = np.isfinite(colors[..., 0]).sum(0) >= 2
-    shift, video = np.zeros((videos, 3)), np.array([s.video for s in stills])
-    if not twice.any():
-        return np.ones((videos, 3))
-    for _ in range(GAIN_ROUNDS):
-        apart = colors[:, twice] - shift[video][:, None]
-        apart = apart - np.nanmean(apart, 0)
-        for v in np.unique(video):
-            own = apart[video == v].reshape(-1, 3)
-            own = own[np.isfinite(own[:, 0])]
-            shift[v] += np.median(own, 0) if len(own) else 0.0
-    taking_part = np.isin(np.arange(videos), video)
-    return np.where(taking_part[:, None], np.exp(shift - shift[taking_part].mean(0)), 1.0)
+    return StaticFit(fit.gaussians().detach(), gains, near, scores, around.floor, falloff, stats)
 
 
 def colour_gain(
@@ -211,6 +192,8 @@ def backdrop_of(
     with torch.no_grad():
         w2c, K = (torch.as_tensor(a, dtype=torch.float32)[None] for a in (footage.pose(frame), footage.K))
         seen = _render(fit.gaussians, w2c, K, footage.size, fit.near)[0].numpy()
+    if any(fit.falloff):
+        seen = seen * fit.falloff.shade(Lens.of(footage.K, footage.size), (0, 0, *footage.size))
     return (seen if gain is None else seen * np.asarray(gain, np.float32)).clip(0, 1)
 
 
@@ -255,6 +238,7 @@ class _BackdropFit:
         sharpest: Tensor,
         stills: Sequence[Still],
         gains: np.ndarray,
+        falloff: Falloff,
         near: float,
         distance: float,
         rates: Mapping[str, float],
@@ -264,6 +248,8 @@ class _BackdropFit:
         self.sharpest, self.near, self.stills, self.seed, self.step = sharpest, near, stills, seed, 0
         footprint = distance / float(np.median([s.K[0, 0] for s in stills]))
         values = {**vars(start), "gains": torch.as_tensor(gains - 1, dtype=torch.float32)}
+        # one that was not seen is not fitted either: a few pictures would be fitted by it in place of their colours
+        values["falloff"] = torch.tensor(falloff if any(falloff) else (), dtype=torch.float32)
         groups = {name: value.to(device) for name, value in values.items()}
         learned = {name: rate for name, rate in rates.items() if groups[name].numel()}
         self.adam = Adam(groups, learned, footprint, frame_step=1.0)
@@ -275,6 +261,10 @@ class _BackdropFit:
                 torch.as_tensor(s.where, device=device),
             )
             for s in stills
+        ]
+        whole = [(Lens.of(s.K, s.size), (0, 0, *s.size)) for s in stills]
+        self.radii = [
+            torch.as_tensor(lens.squared_radii(box), dtype=torch.float32, device=device) for lens, box in whole
         ]
 
     def gaussians(self) -> Gaussians:
@@ -288,6 +278,9 @@ class _BackdropFit:
         w2c, K, image, where = self.views[i]
         still = self.stills[i]
         seen = _render(self.gaussians(), w2c, K, still.size, self.near)[0] * (1 + self.groups["gains"][still.video])
+        if len(falloff := self.groups["falloff"]):
+            r2 = self.radii[i]
+            seen = seen * (r2 * (falloff[0] + falloff[1] * r2)).exp()[..., None]
         return seen, image.to(seen) / 255, where.to(seen)
 
     def cover(self) -> Tensor:
@@ -344,8 +337,8 @@ class _BackdropFit:
         self.step += 1
         return value
 
-    def result(self) -> tuple[np.ndarray, np.ndarray]:
-        """(gains [V,3], PSNR [V])."""
+    def result(self) -> tuple[np.ndarray, Falloff, np.ndarray]:
+        """(gains [V,3], falloff, PSNR [V])."""
         videos = len(self.groups["gains"])
         error, weight = np.zeros(videos), np.zeros(videos)
         with torch.no_grad():
@@ -357,7 +350,8 @@ class _BackdropFit:
             scores = -10 * np.log10(error / weight)
         gains = 1 + self.groups["gains"].detach().cpu().numpy().astype(float)
         gains[weight == 0] = 1
-        return gains, np.where(weight > 0, scores, np.nan)
+        falloff = self.groups["falloff"].detach().cpu().tolist()
+        return gains, Falloff(*falloff) if falloff else NO_FALLOFF, np.where(weight > 0, scores, np.nan)
 
 
 def _render(gaussians: Gaussians, w2c: Tensor, K: Tensor, size: tuple[int, int], near: float) -> Tensor:

@@ -280,14 +280,21 @@ class Lookup:
         u, v = still.pixels(max(1, still.size[0] // RAYS))
         return cls(np.log(blurred + 0.02), still.where, still.K, still.w2c, still.center, still.rays(u, v))
 
+    def project(self, points: Float[np.ndarray, "N 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(columns, rows, depths) [N] of points in the image; where the depth is not above 0, columns and rows say
+        nothing.
+        """
+        cam = points @ self.w2c[:3, :3].T + self.w2c[:3, 3]
+        z = np.maximum(cam[:, 2], 1e-9)
+        return cam[:, 0] / z * self.K[0, 0] + self.K[0, 2], cam[:, 1] / z * self.K[1, 1] + self.K[1, 2], cam[:, 2]
+
     def look(self, points: Float[np.ndarray, "N 3"]) -> tuple[Float[np.ndarray, "N 3"], Bool[np.ndarray, " N"]]:
         """(log colours of points, which of them are in view)."""
-        cam = points @ self.w2c[:3, :3].T + self.w2c[:3, 3]
         h, w = self.seen.shape
-        z = np.maximum(cam[:, 2], 1e-9)
-        u = np.floor(cam[:, 0] / z * self.K[0, 0] + self.K[0, 2]).clip(-1, w).astype(int)
-        v = np.floor(cam[:, 1] / z * self.K[1, 1] + self.K[1, 2]).clip(-1, h).astype(int)
-        inside = (cam[:, 2] > 0) & (u >= 0) & (v >= 0) & (u < w) & (v < h)
+        x, y, z = self.project(points)
+        u = np.floor(x).clip(-1, w).astype(int)
+        v = np.floor(y).clip(-1, h).astype(int)
+        inside = (z > 0) & (u >= 0) & (v >= 0) & (u < w) & (v < h)
         u, v = np.where(inside, u, 0), np.where(inside, v, 0)
         return self.colors[v, u], inside & self.seen[v, u]
 

@@ -229,7 +229,7 @@ def measure(
     device = device_of(plan.device)
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
-    effects = with_declared(plan.effects, [f.readout for f in ready.footage], ready.gains)
+    effects = with_declared(plan.effects, [f.readout for f in ready.footage], ready.gains, ready.falloff)
     options = replace(plan.fit, effects=effects, seed=plan.fit.seed + seed)
     options = options if options.budget is not None else replace(options, steps=steps)
     began = time.perf_counter(), time.process_time()

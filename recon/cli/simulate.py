@@ -35,6 +35,8 @@ class Simulate:
     """Largest offset, in frames."""
     gain: float = 0.0
     """Cameras differ in exposure and white balance: standard deviation of the logarithm. 0, like all below: absent."""
+    vignetting: float = 0.0
+    """Share of light that the corners of images lose, below 1."""
     noise: float = 0.0
     """White noise beyond the usual 1 %, in 0..1."""
     exposure: float = 0.0
@@ -55,7 +57,7 @@ class Simulate:
 
     def _run(self) -> int:
         from recon.simulate.capture import synthetic
-        from recon.simulate.effects import Blur, Exposure, MoreNoise, Rolling, Sheen
+        from recon.simulate.effects import Blur, DarkCorners, Exposure, MoreNoise, Rolling, Sheen
         from recon.simulate.recording import write_capture
         from recon.simulate.sync_nerf import write_sync_nerf
 
@@ -64,8 +66,11 @@ class Simulate:
             (Blur, self.exposure),
             (Rolling, self.readout),
             (Exposure, self.gain),
+            (DarkCorners, self.vignetting),
             (MoreNoise, self.noise),
         )
+        if not 0 <= self.vignetting < 1:
+            raise ValueError(f"--vignetting: expected a share of 0 or more, below 1; found {self.vignetting:g}.")
         if not all(0 <= size < math.inf for _, size in wanted):
             raise ValueError("--gain, --noise, --exposure, --readout, --sheen: expected numbers of 0 or more.")
         capture = synthetic(

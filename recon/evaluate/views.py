@@ -23,7 +23,7 @@ from recon.evaluate.figures import mean_scores, score_image
 from recon.evaluate.lpips import Lpips
 from recon.footage.footage import Footage
 from recon.observe.cameras import Box, Clip, draw
-from recon.observe.effects import Effect, Rendered, Shot, compose
+from recon.observe.effects import Effect, Rendered, Shot, compose, on_still
 from recon.observe.recorded import optics as optics_of
 from recon.raster import Rendering
 from recon.scene.gaussians import Gaussians
@@ -97,7 +97,8 @@ def view(
     """
     own = np.ones(3) if gain is None else gain
     optics = optics_of((), footage.readout) if optics is None else optics
-    looking = CameraView(scene, footage, clock or Clock(0.0), own, _static_views(scene, footage), layered, optics)
+    static = _static_views(scene, footage, optics)
+    looking = CameraView(scene, footage, clock or Clock(0.0), own, static, layered, optics)
     if gain is None:
         looking = looking.with_gain()
     return looking.scanned() if clock is None else looking
@@ -109,7 +110,7 @@ class CameraView:
 
     Args:
         clock: where the camera stands in world time. gain: factors of R, G, B from the scene's colours to its images.
-        static: [1 or T,h,w,3] the static Gaussians as it sees them, without gain; None: black.
+        static: [1 or T,h,w,3] the static Gaussians as it sees them through its optics, without gain; None: black.
         layered: draw what moves over what is static, as fits of fixed cameras do. Nothing but parallax tells the depth
             of the floor's splats, which would otherwise hide the feet that stand on them. False: one rendering of both,
             as fits with moving cameras do.
@@ -162,7 +163,15 @@ class CameraView:
             return Rendered(out.colors[0], out.alphas[0])
 
         w, h = self.footage.size
-        shot = Shot(0, torch.tensor(t, dtype=torch.float64), box or (0, 0, w, h), h, frame, rate=self.clock.rate)
+        shot = Shot(
+            0,
+            torch.tensor(t, dtype=torch.float64),
+            box or (0, 0, w, h),
+            h,
+            frame,
+            rate=self.clock.rate,
+            lens=self._clip.lens,
+        )
         seen = compose(observe, self.optics, {})(shot)
         return seen.rgb, seen.alpha
 
@@ -300,13 +309,14 @@ class CameraView:
         )
 
 
-def _static_views(scene: Gaussians4D, footage: Footage) -> Tensor | None:
-    """The static Gaussians [1 or T,h,w,3] as the camera sees them, without gain."""
+def _static_views(scene: Gaussians4D, footage: Footage, optics: tuple[Effect, ...]) -> Tensor | None:
+    """The static Gaussians [1 or T,h,w,3] as the camera sees them through its optics, without gain."""
     if scene.static is None:
         return None
     clip, whole = Clip.of(footage), (0, 0, *footage.size)
     poses = range(len(clip.w2c))
-    return torch.stack([_draw(scene.static, clip, k, scene.near, whole).colors[0] for k in poses])
+    seen = torch.stack([_draw(scene.static, clip, k, scene.near, whole).colors[0] for k in poses])
+    return on_still(optics, seen, clip.lens)
 
 
 def _draw(gaussians: Gaussians, clip: Clip, frame: int, near: float, box: Box, later: float = 0.0) -> Rendering:

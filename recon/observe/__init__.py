@@ -5,8 +5,9 @@ own.
 """
 
 from recon.observe.effects import Effect, Gain, MotionBlur, RollingShutter
+from recon.observe.vignetting import Vignetting
 
-EFFECTS: tuple[type[Effect], ...] = (MotionBlur, RollingShutter, Gain)
+EFFECTS: tuple[type[Effect], ...] = (MotionBlur, RollingShutter, Gain, Vignetting)
 """Our own effects, the one nearest to the scene first."""
 
-__all__ = ["EFFECTS", "Effect", "Gain", "MotionBlur", "RollingShutter"]
+__all__ = ["EFFECTS", "Effect", "Gain", "MotionBlur", "RollingShutter", "Vignetting"]

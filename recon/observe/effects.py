@@ -17,6 +17,7 @@ camera looks through it once the fit is done (``alone``), and how ``run.json`` k
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
@@ -33,6 +34,31 @@ from recon.scene.groups import Group
 Params = Mapping[str, Tensor]
 
 
+@dataclass(frozen=True)
+class Lens:
+    """Where the middle of a camera's images is.
+
+    Args:
+        x, y: the principal point, pixels of the working image. reach: half of the image's diagonal, pixels.
+    """
+
+    x: float
+    y: float
+    reach: float
+
+    @classmethod
+    def of(cls, K: Any, size: tuple[int, int]) -> Lens:
+        """Of a camera matrix [3,3] and the image's (width, height)."""
+        return cls(float(K[0, 2]), float(K[1, 2]), math.hypot(*size) / 2)
+
+    def squared_radii(self, box: tuple[int, int, int, int]) -> np.ndarray:
+        """Squared distances [h,w] of the pixels in ``box`` (x0, y0, x1, y1) from the middle, in ``reach``."""
+        x0, y0, x1, y1 = box
+        x = (np.arange(x0, x1) + 0.5 - self.x) / self.reach
+        y = (np.arange(y0, y1) + 0.5 - self.y) / self.reach
+        return x * x + (y * y)[:, None]
+
+
 @dataclass(frozen=True, eq=False)
 class Shot:
     """One observation that is asked for.
@@ -45,6 +71,7 @@ class Shot:
         frame: index of the frame. later: seconds of the camera's own clock that the instant comes after the frame's; a
             camera that moves looks from where it is then.
         rate: world seconds per second of the camera's own clock.
+        lens: of the camera; None: not known.
     """
 
     video: int
@@ -54,6 +81,7 @@ class Shot:
     frame: int = 0
     later: float = 0.0
     rate: Tensor | float = 1.0
+    lens: Lens | None = None
 
     def after(self, seconds: float) -> Shot:
         """The same a little later (or earlier, below 0) by the camera's own clock."""
@@ -85,10 +113,12 @@ class Recorded:
     Args:
         readouts: seconds from the first to the last row that each video's camera declares; None where it declares none.
         gains: (V,3) factors from the scene's colours to each video's, from the fit of the static part; None: not known.
+        falloff: of all cameras' vignetting, from the same; zeros where it shows none; None: not known.
     """
 
     readouts: tuple[float | None, ...]
     gains: np.ndarray | None = None
+    falloff: tuple[float, float] | None = None
 
 
 class Effect(ABC):
@@ -133,6 +163,10 @@ class Effect(ABC):
         """
         return None if self.groups else self
 
+    def on_still(self, image: Tensor, lens: Lens) -> Tensor:
+        """What it makes of a picture [...,h,w,3] of what stands still, beyond a gain; shutters change nothing there."""
+        return image
+
     def check(self, times: np.ndarray) -> None:
         """ValueError where it cannot be of a camera whose frames are at these seconds of its own clock."""
         return
@@ -168,6 +202,13 @@ def initial_parameters(effects: Sequence[Effect], n_videos: int) -> dict[str, Te
             )
         out.update(own)
     return out
+
+
+def on_still(effects: Sequence[Effect], image: Tensor, lens: Lens) -> Tensor:
+    """A picture [...,h,w,3] of what stands still through all effects, the first one nearest to the scene."""
+    for effect in effects:
+        image = effect.on_still(image, lens)
+    return image
 
 
 def prior(effects: Sequence[Effect], params: Params) -> Tensor | None:

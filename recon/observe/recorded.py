@@ -24,7 +24,10 @@ def all_effects() -> dict[str, type[Effect]]:
 
 
 def with_declared(
-    effects: Sequence[Effect], readouts: Sequence[float | None], gains: np.ndarray | None = None
+    effects: Sequence[Effect],
+    readouts: Sequence[float | None],
+    gains: np.ndarray | None = None,
+    falloff: tuple[float, float] | None = None,
 ) -> tuple[Effect, ...]:
     """``effects`` as a fit of these videos begins with them, and after them those that the recording calls for.
 
@@ -32,8 +35,9 @@ def with_declared(
 
     Args:
         readouts: that the videos' cameras declare. gains: (V,3) of the videos, where the static part tells them.
+        falloff: of the cameras' vignetting, where it tells that.
     """
-    recorded = Recorded(tuple(readouts), gains)
+    recorded = Recorded(tuple(readouts), gains, falloff)
     begun = [effect.begun(recorded) for effect in effects]
     missing = [kind for kind in all_effects().values() if not any(isinstance(effect, kind) for effect in begun)]
     added = [effect for kind in missing if (effect := kind.called_for(recorded)) is not None]

@@ -19,6 +19,7 @@ from otsync.types import Clock, Offsets, TrackSet
 from recon.backdrop.fit import StaticFit, with_backdrop
 from recon.footage.footage import Footage
 from recon.observe.recorded import check_effects
+from recon.observe.vignetting import Falloff
 from recon.pipeline.feature_maps import maps_from
 from recon.pipeline.intake import readable, split
 from recon.pipeline.plan import Plan
@@ -45,7 +46,8 @@ class Prepared:
         footage: of the training videos, in the order of ``offsets``. held_out: of the others.
         clocks: of the held-out videos, where the given offsets tell.
         offsets: of the training videos alone.
-        initial: scene before any refinement. gains: (V,3) factors from its colours to each video's.
+        initial: scene before any refinement. gains: (V,3) factors from its colours to each video's. falloff: of the
+            vignetting that the static part shows; None without one.
         frame: name of the world frame. left_out: videos that have no offset.
     """
 
@@ -58,6 +60,7 @@ class Prepared:
     gains: np.ndarray
     frame: str
     left_out: tuple[str, ...] = ()
+    falloff: Falloff | None = None
 
     @property
     def layered(self) -> bool:
@@ -160,5 +163,6 @@ def prepare(
     wanted = read_by(plan.fit.losses, plan.features)
     if wanted:
         footage = with_readings(wanted, train, footage, tracks, initial, offsets, plan.width, maps)
+    falloff = None if static is None else static.falloff
     left_out = tuple(n for n in scene.names if n not in train.names and n not in held_out)
-    return Prepared(footage, held, clocks, offsets, tuple(tracks), initial, gains, scene.frame, left_out)
+    return Prepared(footage, held, clocks, offsets, tuple(tracks), initial, gains, scene.frame, left_out, falloff)

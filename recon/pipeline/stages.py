@@ -28,6 +28,7 @@ from recon.backdrop.fit import StaticFit, fit_backdrop
 from recon.features.tracks import FeatureMaps
 from recon.footage.depth import working_depth
 from recon.footage.footage import Footage, footage_of
+from recon.observe.vignetting import Falloff
 from recon.pipeline.feature_maps import key_of, with_features
 from recon.pipeline.intake import only
 from recon.pipeline.plan import Plan
@@ -200,7 +201,13 @@ def backdrop_of_scene(
                 f"budget: the static part takes {static.stats['steps']:.0f} steps in place of {plan.backdrop_steps}"
             )
         parts = {n: getattr(static.gaussians, n).numpy() for n in GAUSSIAN}
-        return {**parts, "gains": static.gains, "near": np.array(static.near), "psnr": static.psnr}
+        return {
+            **parts,
+            "gains": static.gains,
+            "falloff": np.array(static.falloff),
+            "near": np.array(static.near),
+            "psnr": static.psnr,
+        }
 
     key = (*scene_key(scene, tracks, stages), plan.width, plan.backdrop_steps, plan.fit.seed)
     if plan.device != "cpu":  # rounds otherwise
@@ -208,13 +215,16 @@ def backdrop_of_scene(
     if deadline is not None:
         key = (*key, "budget", deadline.seconds)
     try:
-        kept = cache.arrays("backdrop", key, build)
+        kept = cache.arrays("backdrop", (*key, "with falloff"), build)
     except ValueError as error:
         progress.note(f"no static part: {error}")
         return None
     gaussians = Gaussians(*(torch.from_numpy(np.array(kept[n])) for n in GAUSSIAN))
     progress.tell(f"backdrop: {len(gaussians)} Gaussians, {np.nanmean(kept['psnr']):.2f} dB")
-    return StaticFit(gaussians, kept["gains"], float(kept["near"]), kept["psnr"])
+    falloff = Falloff(*kept["falloff"].tolist())
+    if any(falloff):
+        progress.tell(f"backdrop: corners of images are {100 * (1 - falloff.corner):.0f} % darker than their middle")
+    return StaticFit(gaussians, kept["gains"], float(kept["near"]), kept["psnr"], falloff=falloff)
 
 
 BACKDROP_SHARE = 0.25

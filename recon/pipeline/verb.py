@@ -145,7 +145,7 @@ def reconstruct(
         deadline=deadline,
     )
     true = None if truth is None else true_seconds(truth, ready.offsets)
-    effects = with_declared(plan.effects, [f.readout for f in ready.footage], ready.gains)
+    effects = with_declared(plan.effects, [f.readout for f in ready.footage], ready.gains, ready.falloff)
     options = replace(plan.fit, effects=effects)
     if deadline is not None:
         progress.note(f"budget: {deadline.left:.0f} of {deadline.seconds:.0f} s are left for the fit")

@@ -17,6 +17,8 @@ from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
+from jaxtyping import UInt8
+from torch import Tensor
 
 from otsync.files.arrays import read_json, write_json
 from otsync.files.strict import checked, in_words
@@ -25,7 +27,7 @@ from otsync.types.camera import matrix_of
 from otsync.types.clock import Source
 from recon.evaluate.views import ViewScore
 from recon.footage.footage import Footage
-from recon.observe.effects import Effect
+from recon.observe.effects import Effect, Lens, on_still
 from recon.observe.recorded import kept, restored
 from recon.result.layout import MAX_SIDE, RunFile
 from recon.scene.gaussians4d import Gaussians4D
@@ -67,6 +69,16 @@ class FilmedBy:
         held_out: bool = False,
     ) -> FilmedBy:
         return cls(footage.name, footage.camera, clock, gain, footage.times, held_out, optics)
+
+    def coloured(self, image: Tensor, camera: Camera | None = None) -> UInt8[np.ndarray, "h w 3"]:
+        """An image of the scene, 0..1, in this camera's colours: with its gain, and as its lens darkens it.
+
+        Args:
+            camera: that the image is of, if of another size than this one's.
+        """
+        camera = camera or self.camera
+        seen = on_still(self.optics, image, Lens.of(camera.K, (camera.width, camera.height))).numpy()
+        return (255 * seen * self.gain).clip(0, 255).round().astype(np.uint8)
 
     def pose(self, t: float) -> np.ndarray:
         """w2c (4,4) at world second ``t``: of a moving camera that of the nearest frame."""
@@ -116,7 +128,7 @@ class SavedReconstruction:
         video = self.videos[0] if camera is None else self.video(camera)
         times = np.linspace(*self.scene.span, moments + 2)[1:-1]
         views = [self.scene.seen_by(replace(video.camera, w2c=video.pose(t)), t, layered=self.layered) for t in times]
-        pictures = [(255 * view.numpy() * video.gain).clip(0, 255).round().astype(np.uint8) for view in views]
+        pictures = [video.coloured(view) for view in views]
         return moments_figure(video.name, times.tolist(), pictures)
 
     def video(self, name: str) -> FilmedBy:

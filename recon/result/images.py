@@ -31,17 +31,20 @@ def rendered(
     """
     if camera is not None:
         video = result.video(camera)
-        lens, gain = at_width(video.camera, width), video.gain
+        lens = at_width(video.camera, width)
         poses = [video.pose(t) for t in times]
     else:
-        lens, gain = at_width(result.videos[0].camera, width), np.ones(3)
+        video, lens = None, at_width(result.videos[0].camera, width)
         with torch.no_grad():
             moving = result.scene.moving(float(times[len(times) // 2]))
             middle = moving.means.median(0).values.double().numpy()
         poses = list(orbit([v.camera for v in result.videos], middle, len(times), turns=turns))
     for t, pose in zip(times, poses, strict=True):
         image = seen_by(result, replace(lens, w2c=pose), float(t))
-        yield (image.numpy() * gain * 255).clip(0, 255).round().astype(np.uint8)
+        if video is not None:
+            yield video.coloured(image, lens)
+        else:
+            yield (image.numpy() * 255).clip(0, 255).round().astype(np.uint8)
 
 
 def seen_by(result: SavedReconstruction, camera: Camera, t: float) -> Tensor:

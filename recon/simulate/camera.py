@@ -13,7 +13,7 @@ from otsync.simulate.observation import stream
 from otsync.types import Camera
 from recon.raster import render, sh
 from recon.scene.gaussians import Gaussians
-from recon.simulate.effects import Blur, Effect, Exposure, Instant, MoreNoise, Rolling, See, Sheen
+from recon.simulate.effects import Blur, DarkCorners, Effect, Exposure, Instant, MoreNoise, Rolling, See, Sheen
 from recon.simulate.world import NOISE, STATIC_NEAR, World
 
 MOVING_NEAR = 0.01
@@ -35,17 +35,18 @@ class Frames:
 
 @dataclass(frozen=True, eq=False)
 class FilmingCamera:
-    """One camera in front of a world, with its effects, gain and sources of noise."""
+    """One camera in front of a world, with its effects, gain, falloff and sources of noise."""
 
     world: World
     camera: Camera
     effects: tuple[Effect, ...]
     gain: Float[np.ndarray, " 3"]
+    shade: Float[np.ndarray, "h w 1"]
     noise: tuple[tuple[float, np.random.Generator], ...]
 
     @classmethod
     def of(cls, world: World, camera: Camera, c: int, effects: tuple[Effect, ...], seed: int) -> FilmingCamera:
-        gain, noise = np.ones(3), [(NOISE, stream(seed, c, "noise"))]
+        gain, shade, noise = np.ones(3), np.ones((1, 1, 1)), [(NOISE, stream(seed, c, "noise"))]
         seen: Counter[str] = Counter()
         for effect in effects:
             name = type(effect).__name__
@@ -53,11 +54,13 @@ class FilmingCamera:
             seen[name] += 1
             if isinstance(effect, Exposure):
                 gain = gain * effect.draw(rng)
+            elif isinstance(effect, DarkCorners):
+                shade = shade * effect.shade(camera)
             elif isinstance(effect, MoreNoise):
                 noise.append((effect.size, rng))
             elif isinstance(effect, Rolling):
                 camera = replace(camera, readout=effect.readout)
-        return cls(world, camera, effects, gain, tuple(noise))
+        return cls(world, camera, effects, gain, shade, tuple(noise))
 
     def film(self, times: Float[np.ndarray, " T"]) -> Frames:
         """Frames at world ``times`` (s). Depth has no blur, but its rows are those of a rolling shutter."""
@@ -68,7 +71,7 @@ class FilmingCamera:
             images, masks, depths = [], [], []
             for t in times:
                 seen = see(float(t))
-                image = (seen.rgb + (1 - seen.alpha) * backdrop.rgb).numpy() * self.gain
+                image = (seen.rgb + (1 - seen.alpha) * backdrop.rgb).numpy() * self.gain * self.shade
                 for size, rng in self.noise:
                     image = image + size * rng.standard_normal(image.shape)
                 images.append(np.rint(255 * image.clip(0, 1)).astype(np.uint8))

@@ -1,4 +1,4 @@
-"""Effects of simulated cameras: gain, noise, blur, rolling shutter, and a lamp that shines on what they film."""
+"""Effects of simulated cameras: gain, vignetting, noise, blur, rolling shutter, and a lamp on what they film."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from otsync.types import Camera
+from recon.observe.effects import Lens
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +39,21 @@ class Exposure:
     def draw(self, rng: np.random.Generator) -> Float[np.ndarray, " 3"]:
         """Factors of R, G and B."""
         return np.exp(self.size * rng.standard_normal(3))
+
+
+@dataclass(frozen=True)
+class DarkCorners:
+    """Vignetting: colours times ``(1 - size) ** r^2``, r from the middle of the image in half diagonals.
+
+    The corners lose the share ``size`` of their light.
+    """
+
+    size: float = 0.2
+
+    def shade(self, camera: Camera) -> Float[np.ndarray, "h w 1"]:
+        """The factor of every pixel."""
+        lens = Lens.of(camera.K, (camera.width, camera.height))
+        return ((1 - self.size) ** lens.squared_radii((0, 0, camera.width, camera.height)))[..., None]
 
 
 @dataclass(frozen=True)
@@ -107,4 +123,4 @@ class Sheen:
         return self.size * np.maximum((normals * half).sum(1, keepdims=True), 0) ** self.sharpness
 
 
-Effect = Exposure | MoreNoise | Blur | Rolling | Sheen
+Effect = Exposure | DarkCorners | MoreNoise | Blur | Rolling | Sheen

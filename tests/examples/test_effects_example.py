@@ -23,7 +23,7 @@ def figures(effect: str, steps: int) -> dict[str, list[float]]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("effect", ["none", "blur", "sheen"])
+@pytest.mark.parametrize("effect", ["none", "blur", "sheen", "corners"])
 def test_every_effect_is_fitted(effect):
     found = figures(effect, 30)
     assert set(found) == {"with", "without"}

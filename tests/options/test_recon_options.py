@@ -392,11 +392,13 @@ EFFECT_FIELDS = {
     "motion-blur": {"exposure": 0.02, "samples": 2},
     "rolling-shutter": {"readout": 0.02, "bands": 2},
     "gain": {"start": None, "weight": 9.0, "white_balance": False},
+    "vignetting": {"second": -0.3, "fourth": -0.2},
 }
 BEGIN = {
     "scale-hinge": {"limit": 1.0},  # the usual one holds nothing back here
     "motion-blur": {"exposure": 0.01},
     "rolling-shutter": {"readout": 0.01, "bands": 3},
+    "vignetting": {"second": -0.1},
 }
 """What a loss or an effect is compared beside, where its defaults say nothing."""
 
@@ -421,7 +423,7 @@ def prepared(world, home, fitted) -> Prepared:
     tracks = [TrackSet.load(p) for p in sorted((world / "tracks").glob("*.npz"))]
     start, cache = Offsets.load(world / "start.json"), Cache(home / "stages")
     ready = prepare(open_scene(world), start, tracks, plan=plan, held_out=("held0",), cache=cache)
-    effects = with_declared((), [f.readout for f in ready.footage], ready.gains)
+    effects = with_declared((), [f.readout for f in ready.footage], ready.gains, ready.falloff)
     assert [type(e).__name__ for e in effects] == ["Gain"]
     return ready
 
@@ -869,6 +871,7 @@ def test_options_of_simulate(home):
         ["--height", "32"],
         ["--max-offset", "0.2"],
         ["--gain", "0.2"],
+        ["--vignetting", "0.3"],
         ["--noise", "0.1"],
         ["--exposure", "0.02"],
         ["--readout", "0.02"],
@@ -958,7 +961,8 @@ def rows() -> set[str]:
         "export": "result format at fps out",
         "demo": "out seed steps",
         "view": "what port stages allow_outside",
-        "simulate": "out layout cameras held_out frames width height max_offset gain noise exposure readout sheen seed",
+        "simulate": "out layout cameras held_out frames width height max_offset gain vignetting noise exposure readout "
+        "sheen seed",
     }
     slots = {f"run {o}" for o in options_of(SYNC["sync"]) if slotted(o)}
     shared = (

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from otsync.compute.threads import get_threads
-from recon.backdrop.fit import RATES, backdrop_of, colour_gain, first_gains, fit_backdrop, unchanging, with_backdrop
+from recon.backdrop.colours import Compared, first_gains
+from recon.backdrop.fit import RATES, backdrop_of, colour_gain, fit_backdrop, unchanging, with_backdrop
 from recon.backdrop.seeds import facing, fillers, normals_of_depth, seed_discs, surface_of, underlay
 from recon.backdrop.stills import stills_of
 from recon.backdrop.surroundings import (
@@ -250,9 +251,9 @@ def test_first_gains_need_no_fit(capture):
     around = surroundings(stills)
     points = np.concatenate([surface_of(s, around, 0.6).at for s in stills])
     true = capture.gains[:5]
-    found = first_gains(stills, points, 6)
+    found = first_gains(Compared.of(stills, points), 6)
     assert found[:5] / found[:5].mean(0) == pytest.approx(true / true.mean(0), abs=0.04) and (found[5] == 1).all()
-    assert (first_gains(stills[:1], points, 1) == 1).all()
+    assert (first_gains(Compared.of(stills[:1], points), 1) == 1).all()
 
 
 def test_what_a_fit_says(capture, fitted):

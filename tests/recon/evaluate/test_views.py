@@ -11,9 +11,10 @@ import torch
 from otsync.types import Clock
 from recon.evaluate.views import view
 from recon.motion import HermiteSpline, PerGaussian
+from recon.observe import Vignetting
 from recon.scene.gaussians4d import Gaussians4D
 from recon.simulate.capture import synthetic
-from recon.simulate.effects import Rolling
+from recon.simulate.effects import DarkCorners, Rolling
 from tests.recon.worlds import CAMERAS, FRAMES, SIZE, capture
 
 STEP = 1 / 30
@@ -88,3 +89,17 @@ def test_a_declared_readout_is_looked_through(truth):
     through, plain = view(truth, rolled, Clock(0.0)), view(truth, rolled, Clock(0.0), optics=())
     assert through.score(most=6).mean["mask_psnr"] > plain.score(most=6).mean["mask_psnr"] + 1
     assert abs(view(truth, rolled).clock.offset) < 0.06 * STEP
+
+
+@pytest.mark.parametrize("layered", [True, False])
+def test_dark_corners_are_looked_through(truth, layered):
+    """What stands still and what moves: as good as through an even lens."""
+    world = {"cameras": CAMERAS, "held_out": 1, "frames": FRAMES, "size": SIZE, "offsets": 0.8}
+    dark, even = synthetic(5, **world, effects=(DarkCorners(0.4),)).held_out[0], synthetic(5, **world).held_out[0]
+
+    def score(footage, *optics) -> dict[str, float]:
+        return view(truth, footage, Clock(0.0), layered=layered, optics=optics).score(most=6).mean
+
+    through, plain, best = score(dark, Vignetting(float(np.log(0.6)))), score(dark), score(even)
+    assert through["psnr"] > plain["psnr"] + 5 and through["mask_psnr"] > plain["mask_psnr"]
+    assert through["psnr"] > best["psnr"] - 0.5 and through["mask_psnr"] > best["mask_psnr"] - 0.5

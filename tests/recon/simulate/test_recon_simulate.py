@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from recon.evaluate.figures import psnr
 from recon.raster import render, sh
 from recon.simulate.capture import synthetic
-from recon.simulate.effects import Blur, Exposure, MoreNoise, Rolling, Sheen
+from recon.simulate.effects import Blur, DarkCorners, Exposure, MoreNoise, Rolling, Sheen
 from recon.simulate.estimates import DEPTH_NOISE, TRACK_NOISE
 from recon.simulate.world import FPS, STATIC_NEAR
 
@@ -198,6 +198,16 @@ def test_depth_is_that_of_the_rows(capture):
         # the errors of whole frames and pixels are the same draws
         np.testing.assert_allclose(rolled[4, rows][known], shifted[4, rows][known], rtol=1e-3)
     assert not np.allclose(rolled, capture.depth[1], rtol=1e-3)
+
+
+def test_corners_are_dark_in_images_alone(capture):
+    dark = synthetic(3, **SMALL, effects=(DarkCorners(0.5),))
+    np.testing.assert_array_equal(dark.depth, capture.depth)
+    for plain, other in zip(capture.footage, dark.footage, strict=True):
+        np.testing.assert_array_equal(plain.masks, other.masks)
+        ratio = other.images.astype(float).mean((0, 3)) / np.maximum(plain.images.astype(float).mean((0, 3)), 1)
+        h, w = ratio.shape
+        assert ratio[h // 2, w // 2] > 0.97 and ratio[0, 0] == pytest.approx(0.5, abs=0.06)
 
 
 def test_sheen_is_brightest_half_way_between_lamp_and_camera():
