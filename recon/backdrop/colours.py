@@ -22,6 +22,11 @@ LEAST_FALLOFF, SURE = 0.02, 3.0
 OUTLYING = 3.0
 """Colours further from the falloff than this many robust deviations are of points that are hidden or misplaced."""
 
+ALIKE = 0.4
+"""A falloff is told by points whose colours differ between pictures by less than this share of how much colours differ
+overall: .1 to .26 of points on the true floor and shell (the Panoptic dome, simulated rooms), .6 to 1 on a wrong one,
+where the middles of images are compared with other images' margins, whatever they show."""
+
 LEAST_STILLS = 3
 """Pictures from which a falloff is told: with fewer none can be left out to see how much it depends on each."""
 
@@ -99,7 +104,7 @@ def first_falloff(compared: Compared, videos: int) -> Falloff:
     others = np.array([sum(_fitted(compared.leaving_out(s), videos)) for s in range(n)])
     sigma = np.sqrt((n - 1) / n * ((others - others.mean()) ** 2).sum())
     size = abs(np.expm1(sum(found)))
-    sound = all(abs(x) <= STRONGEST for x in found)
+    sound = all(abs(x) <= STRONGEST for x in found) and _unlike(compared.without(found), videos) < ALIKE
     return found if sound and size >= LEAST_FALLOFF and abs(sum(found)) > SURE * sigma else NO_FALLOFF
 
 
@@ -135,6 +140,16 @@ def _fitted(compared: Compared, videos: int) -> Falloff:
             good = left <= OUTLYING * 1.4826 * np.median(left)
         falloff = Falloff(float(solved[0]), float(solved[1]))
     return falloff
+
+
+def _unlike(compared: Compared, videos: int) -> float:
+    """How much the same points differ in colour between pictures, as a share of how much colours differ overall."""
+    colors = compared.colors - _shifts(compared, videos)[compared.video][:, None]
+    count = np.isfinite(colors[..., 0]).sum(0)
+    # n samples lie nearer to their own mean than to the truth
+    within = np.nansum(np.abs(_apart(colors)) * np.sqrt(count / (count - 1))[None, :, None])
+    overall = np.nansum(np.abs(colors - np.nanmedian(colors, (0, 1))))
+    return float(within / max(overall, 1e-12))
 
 
 def _apart(values: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ from recon.simulate.capture import synthetic
 from recon.simulate.effects import DarkCorners, Exposure
 
 
-def made(seed: int, falloff: Falloff, stills: int = 6, outlying: float = 0.2) -> tuple[Compared, np.ndarray]:
+def made(seed: int, falloff: Falloff, stills: int = 6, outlying: float = 0.08) -> tuple[Compared, np.ndarray]:
     """Points of random colours in pictures that show each at a random place; a share of colours is of other things."""
     rng = np.random.default_rng(seed)
     colors = np.broadcast_to(rng.uniform(-2, 0, (400, 3)), (stills, 400, 3)).copy()
@@ -49,6 +49,16 @@ def test_none_is_made_up(seed):
 def test_nothing_in_common_tells_nothing():
     nothing = Compared(np.zeros((4, 0, 3)), np.zeros((4, 0)), np.arange(4))
     assert first_falloff(nothing, 5) == NO_FALLOFF and (first_gains(nothing, 5) == 1).all()
+
+
+@pytest.mark.parametrize("seed", range(12, 18))
+def test_points_that_look_unlike_tell_nothing(seed):
+    """Of a wrong surface: other things in each picture, whose margins are dark by themselves."""
+    compared, _ = made(seed, Falloff(-0.5, 0.0), outlying=0.0)
+    rng = np.random.default_rng([seed, 1])
+    unlike = np.where(rng.random(compared.radii.shape) < 0.5, 0.0, rng.uniform(-2, 2, compared.radii.shape))
+    others = Compared(compared.colors + unlike[..., None], compared.radii, compared.video)
+    assert first_falloff(compared, 6) != NO_FALLOFF and first_falloff(others, 6) == NO_FALLOFF
 
 
 @pytest.mark.parametrize("lost", [0.0, 0.3])
