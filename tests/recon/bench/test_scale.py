@@ -96,11 +96,11 @@ def test_a_size_that_there_is_not_is_refused(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_runs_are_measured_and_kept(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(scale, "SIZES", ((5, 45), (5, 60), (6, 45)))
+    monkeypatch.setattr(scale, "SIZES", ((5, 90), (6, 90), (6, 120)))
     monkeypatch.setattr(scale, "STEPS", 20)
     assert main(["bench", "scale", "--first-seed", "3", "--out", str(tmp_path)]) == 0
     told = json.loads((tmp_path / "scale.json").read_text())
-    assert [row["frames"] for row in told["rows"]] == [45, 60, 45]
+    assert [row["frames"] for row in told["rows"]] == [90, 90, 120]
     for row in told["rows"]:
         assert row["wall s"] > 1 and row["CPU s"] > 1 and row["memory MB"] > 100 and row["error"] < 0.5
     assert np.isfinite(list(told["laws"]["wall s"].values())).all()

@@ -208,7 +208,7 @@ def test_a_run_with_features_from_the_shell(recording, tmp_path):
     losses = ["photometric", "mask", "scale-hinge", "arap", "length", "velocity", "acceleration", "feature"]
     trained, held = (
         shown_by(otsync, [*args, *more, "--losses", *losses], tmp_path / f"{len(more)}")
-        for more in ([], ["--rates", "features=0"])
+        for more in ([], ["--freeze", "features"])
     )
     assert trained.shape == held.shape and not np.array_equal(trained, held)
     lengths = np.linalg.norm(held, axis=1)
