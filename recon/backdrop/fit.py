@@ -31,8 +31,8 @@ from recon.footage.footage import Footage
 from recon.losses.ssim import photometric
 from recon.losses.window import SMALL
 from recon.observe.cameras import draw
-from recon.observe.effects import Lens
-from recon.observe.vignetting import NO_FALLOFF, Falloff
+from recon.observe.effects import ImageCircle
+from recon.observe.vignetting import NO_FALLOFF, Falloff, darkening_
 from recon.scene.device import device_of
 from recon.scene.gaussians import Gaussians
 
@@ -116,6 +116,7 @@ def fit_backdrop(
     depth: Sequence[Depths | None] | None = None,
     points: Float[np.ndarray, "N 3"] | None = None,
     floor: Floor | None = None,
+    falloff: Falloff | None = None,
     steps: int | None = None,
     budget: float | None = None,
     at_most: float | None = None,
@@ -131,6 +132,8 @@ def fit_backdrop(
         depth: per video, maps that include the background, of some frames at least; None: unknown.
         points: (N,3) some positions of what moves: they tell scale and floor where the cameras alone do not.
         floor: the ground plane, where it is known; else it is searched for.
+        falloff: of the cameras' vignetting, where it is known: it stays as it is, and zeros mean none. None: told by
+            points that several cameras show, and then fitted; none where that is not sure.
         steps, budget: a number of steps, or wall seconds. Default: 1500 steps.
         at_most: wall seconds; fewer steps are taken where they would take longer. Not beside ``budget``.
         sh_degree: of the view-dependent colour. With 14 cameras degree 1 fits them better, but new views worse.
@@ -155,19 +158,22 @@ def fit_backdrop(
     around = surroundings([stills[i] for i in evenly(len(stills), SEARCHED)], points, floor)
     near = NEAR_SHARE * around.distance
     surfaces = [surface_of(s, around, near) for s in stills]
-    gains, falloff = first_colours(stills, np.concatenate([s.at for s in surfaces]), len(footage))
-    start, sharpest = seed_discs(stills, surfaces, around, near, gains).gaussians(sh_degree)
+    gains, start_falloff = first_colours(stills, np.concatenate([s.at for s in surfaces]), len(footage), falloff)
+    start, sharpest = seed_discs(stills, surfaces, around, near, gains, start_falloff).gaussians(sh_degree)
     log.info("backdrop: %d seeds, near plane %.3g", len(start), near)
-    fit = _BackdropFit(start, sharpest.to(device), stills, gains, falloff, near, around.distance, rates, seed, device)
+    if falloff is not None:
+        rates = {name: rate for name, rate in rates.items() if name != "falloff"}
+    looks = stills, gains, start_falloff
+    fit = _BackdropFit(start, sharpest.to(device), *looks, near, around.distance, rates, seed, device)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # torch's pool would compete with the rasterizer's
     try:
         loss = fit.run(total, budget if at_most is None else at_most, progress)
     finally:
         torch.set_num_threads(threads)
-    gains, falloff, scores = fit.result()
+    gains, fitted, scores = fit.result()
     stats = {"seconds": time.perf_counter() - started, "steps": fit.step, "seeds": len(start), "loss": loss}
-    return StaticFit(fit.gaussians().detach(), gains, near, scores, around.floor, falloff, stats)
+    return StaticFit(fit.gaussians().detach(), gains, near, scores, around.floor, falloff or fitted, stats)
 
 
 def colour_gain(
@@ -193,7 +199,7 @@ def backdrop_of(
         w2c, K = (torch.as_tensor(a, dtype=torch.float32)[None] for a in (footage.pose(frame), footage.K))
         seen = _render(fit.gaussians, w2c, K, footage.size, fit.near)[0].numpy()
     if any(fit.falloff):
-        seen = seen * fit.falloff.shade(Lens.of(footage.K, footage.size), (0, 0, *footage.size))
+        seen = seen * fit.falloff.shade(ImageCircle.of(footage.K, footage.size), (0, 0, *footage.size))
     return (seen if gain is None else seen * np.asarray(gain, np.float32)).clip(0, 1)
 
 
@@ -262,10 +268,9 @@ class _BackdropFit:
             )
             for s in stills
         ]
-        whole = [(Lens.of(s.K, s.size), (0, 0, *s.size)) for s in stills]
-        self.radii = [
-            torch.as_tensor(lens.squared_radii(box), dtype=torch.float32, device=device) for lens, box in whole
-        ]
+        shaded = stills if any(falloff) else ()
+        whole = [ImageCircle.of(s.K, s.size).squared_radii((0, 0, *s.size)) for s in shaded]
+        self.radii = [torch.as_tensor(r2, dtype=torch.float32, device=device) for r2 in whole]
 
     def gaussians(self) -> Gaussians:
         """The Gaussians as they are drawn, no sharper than they were seen."""
@@ -334,6 +339,8 @@ class _BackdropFit:
             )
         gradients = torch.autograd.grad(total, list(self.adam.groups.values()), allow_unused=True)
         self.adam.step(dict(zip(self.adam.groups, gradients, strict=True)), DECAY(progress))
+        if "falloff" in self.adam.groups:
+            darkening_(self.adam.groups["falloff"])
         self.step += 1
         return value
 

@@ -13,6 +13,8 @@ from torch import Tensor
 
 from recon.backdrop.stills import Still
 from recon.backdrop.surroundings import Surroundings
+from recon.observe.effects import ImageCircle
+from recon.observe.vignetting import NO_FALLOFF, Falloff
 from recon.raster import sh
 from recon.scene.gaussians import Gaussians
 
@@ -76,12 +78,14 @@ class Discs:
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """The surface in one picture, ray by ray: points, normals and colours [N,3]; [N] whether depth was given."""
+    """The surface in one picture, ray by ray: points, normals and colours [N,3]; [N] whether depth was given, and
+    squared distances of the pixels from the principal point, in half diagonals."""
 
     at: Float[np.ndarray, "N 3"]
     normal: Float[np.ndarray, "N 3"]
     color: Float[np.ndarray, "N 3"]
     measured: Bool[np.ndarray, " N"]
+    radii: Float[np.ndarray, " N"]
 
 
 def surface_of(still: Still, around: Surroundings, near: float) -> Surface:
@@ -101,7 +105,8 @@ def surface_of(still: Still, around: Surroundings, near: float) -> Surface:
         at[given] = still.lift(u[given], v[given], z[given])
         normal = np.where(given[:, None], normals_of_depth(still, u, v), normal)
     keep = (known | given) & ((at - still.center) @ still.w2c[2, :3] > near)
-    return Surface(at[keep], normal[keep], still.image[v, u][keep] / 255, given[keep])
+    radii = ImageCircle.of(still.K, still.size).squared_radii((0, 0, *still.size))[v, u]
+    return Surface(at[keep], normal[keep], still.image[v, u][keep] / 255, given[keep], radii[keep])
 
 
 def seed_discs(
@@ -110,10 +115,11 @@ def seed_discs(
     around: Surroundings,
     near: float,
     gains: Float[np.ndarray, "V 3"] | None = None,
+    falloff: Falloff = NO_FALLOFF,
 ) -> Discs:
     """Discs on the surfaces of all pictures, one per voxel, and coarser ones behind them.
 
-    gains: factors of the videos' colours, which are divided out.
+    gains: factors of the videos' colours, which are divided out. falloff: of the cameras' vignetting, too.
     """
     at, normal, given = (np.concatenate([getattr(s, n) for s in surfaces]) for n in ("at", "normal", "measured"))
     if not len(at):
@@ -121,9 +127,8 @@ def seed_discs(
             f"footage: expected background beyond the near plane ({near:.3g}); found none. Check that depth and poses "
             "have one unit."
         )
-    color = np.concatenate(
-        [s.color if gains is None else s.color / gains[t.video] for s, t in zip(surfaces, stills, strict=True)]
-    ).clip(0, 1)
+    each = [s.color if gains is None else s.color / gains[t.video] for s, t in zip(surfaces, stills, strict=True)]
+    color = (np.concatenate(each) / falloff.at(np.concatenate([s.radii for s in surfaces]))[:, None]).clip(0, 1)
     pixel = _nearest_pixel(stills, at, near)
     # sides of voxels are the smallest one times a power of two: far things are seeded no finer than they are seen
     base = np.percentile(pixel, 1)

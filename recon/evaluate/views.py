@@ -114,7 +114,7 @@ class CameraView:
         layered: draw what moves over what is static, as fits of fixed cameras do. Nothing but parallax tells the depth
             of the floor's splats, which would otherwise hide the feet that stand on them. False: one rendering of both,
             as fits with moving cameras do.
-        optics: what blurs and slants moving things in its images.
+        optics: what blurs and slants moving things in its images, and darkens its corners.
     """
 
     scene: Gaussians4D
@@ -170,7 +170,7 @@ class CameraView:
             h,
             frame,
             rate=self.clock.rate,
-            lens=self._clip.lens,
+            circle=self._clip.circle,
         )
         seen = compose(observe, self.optics, {})(shot)
         return seen.rgb, seen.alpha
@@ -316,7 +316,7 @@ def _static_views(scene: Gaussians4D, footage: Footage, optics: tuple[Effect, ..
     clip, whole = Clip.of(footage), (0, 0, *footage.size)
     poses = range(len(clip.w2c))
     seen = torch.stack([_draw(scene.static, clip, k, scene.near, whole).colors[0] for k in poses])
-    return on_still(optics, seen, clip.lens)
+    return on_still(optics, seen, clip.circle)
 
 
 def _draw(gaussians: Gaussians, clip: Clip, frame: int, near: float, box: Box, later: float = 0.0) -> Rendering:

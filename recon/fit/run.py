@@ -98,7 +98,7 @@ class Run:
         """What is asked for of a frame: the box where something may move, at the world time that its clock gives."""
         clip, rate = self.problem.clips[video], values["clock_rates"][video]
         t = self.world_time(values, video, frame)
-        return Shot(video, t, clip.box(frame), clip.size[1], frame, rate=rate, lens=clip.lens)
+        return Shot(video, t, clip.box(frame), clip.size[1], frame, rate=rate, circle=clip.circle)
 
     def advance(self, map: MapLike, densify: Densify | None) -> None:
         """A step, and what is due after it: all of it, or none."""

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from recon.footage.footage import Footage
-from recon.observe.effects import Lens, Observe, Rendered, Shot
+from recon.observe.effects import ImageCircle, Observe, Rendered, Shot
 from recon.raster import Rendering, render, sh
 from recon.scene.gaussians import Gaussians
 from recon.scene.gaussians4d import Gaussians4D, join
@@ -60,9 +60,9 @@ class Clip:
         return int(self.images.shape[2]), int(self.images.shape[1])
 
     @cached_property
-    def lens(self) -> Lens:
+    def circle(self) -> ImageCircle:
         """Where the middle of its images is."""
-        return Lens.of(self.footage.K, self.size)
+        return ImageCircle.of(self.footage.K, self.size)
 
     def box(self, frame: int) -> Box:
         """(x0, y0, x1, y1) of the part of a frame where something may move."""

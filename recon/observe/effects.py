@@ -8,7 +8,8 @@ The moment of a frame is the middle of its exposure and of its readout, as in th
 ``t``. Sensors that stamp the beginning shift all frames of a video alike, which is absorbed by the video's offset.
 
 Effects act on what is rendered, *before* a cached backdrop is put behind it: the backdrop is a picture by the camera
-itself and has been through its effects already.
+itself and has been through its effects already. A camera that was held out has no such picture: what is static is
+rendered for it, and put through the effects by ``on_still``.
 
 An effect is one class, which says all that others must know of it: what it learns (``groups``, ``parameters``,
 ``prior``), how it acts (``wrap``), whether a recording calls for it by itself (``called_for``, ``begun``), how one
@@ -35,27 +36,28 @@ Params = Mapping[str, Tensor]
 
 
 @dataclass(frozen=True)
-class Lens:
-    """Where the middle of a camera's images is.
+class ImageCircle:
+    """Where the principal point of a camera's images is, and how far their corners are from their middle.
 
     Args:
-        x, y: the principal point, pixels of the working image. reach: half of the image's diagonal, pixels.
+        x, y: the principal point, pixels of the working image. radius: half of the image's diagonal, pixels.
     """
 
     x: float
     y: float
-    reach: float
+    radius: float
 
     @classmethod
-    def of(cls, K: Any, size: tuple[int, int]) -> Lens:
+    def of(cls, K: Any, size: tuple[int, int]) -> ImageCircle:
         """Of a camera matrix [3,3] and the image's (width, height)."""
         return cls(float(K[0, 2]), float(K[1, 2]), math.hypot(*size) / 2)
 
     def squared_radii(self, box: tuple[int, int, int, int]) -> np.ndarray:
-        """Squared distances [h,w] of the pixels in ``box`` (x0, y0, x1, y1) from the middle, in ``reach``."""
+        """Squared distances [h,w] of the pixels in ``box`` (x0, y0, x1, y1) from the principal point, in half
+        diagonals."""
         x0, y0, x1, y1 = box
-        x = (np.arange(x0, x1) + 0.5 - self.x) / self.reach
-        y = (np.arange(y0, y1) + 0.5 - self.y) / self.reach
+        x = (np.arange(x0, x1) + 0.5 - self.x) / self.radius
+        y = (np.arange(y0, y1) + 0.5 - self.y) / self.radius
         return x * x + (y * y)[:, None]
 
 
@@ -71,7 +73,7 @@ class Shot:
         frame: index of the frame. later: seconds of the camera's own clock that the instant comes after the frame's; a
             camera that moves looks from where it is then.
         rate: world seconds per second of the camera's own clock.
-        lens: of the camera; None: not known.
+        circle: of the camera; None: not known.
     """
 
     video: int
@@ -81,7 +83,7 @@ class Shot:
     frame: int = 0
     later: float = 0.0
     rate: Tensor | float = 1.0
-    lens: Lens | None = None
+    circle: ImageCircle | None = None
 
     def after(self, seconds: float) -> Shot:
         """The same a little later (or earlier, below 0) by the camera's own clock."""
@@ -163,7 +165,7 @@ class Effect(ABC):
         """
         return None if self.groups else self
 
-    def on_still(self, image: Tensor, lens: Lens) -> Tensor:
+    def on_still(self, image: Tensor, circle: ImageCircle) -> Tensor:
         """What it makes of a picture [...,h,w,3] of what stands still, beyond a gain; shutters change nothing there."""
         return image
 
@@ -204,10 +206,10 @@ def initial_parameters(effects: Sequence[Effect], n_videos: int) -> dict[str, Te
     return out
 
 
-def on_still(effects: Sequence[Effect], image: Tensor, lens: Lens) -> Tensor:
+def on_still(effects: Sequence[Effect], image: Tensor, circle: ImageCircle) -> Tensor:
     """A picture [...,h,w,3] of what stands still through all effects, the first one nearest to the scene."""
     for effect in effects:
-        image = effect.on_still(image, lens)
+        image = effect.on_still(image, circle)
     return image
 
 

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from recon.observe.effects import Effect, Lens, Observe, Params, Recorded, Rendered, Shot
+from recon.observe.effects import Effect, ImageCircle, Observe, Params, Recorded, Rendered, Shot
 
 STRONGEST = 5.0
 """Coefficients of a falloff beyond this are those of no lens: corners would be 150 times darker than the middle."""
@@ -32,10 +33,13 @@ class Falloff(NamedTuple):
         """The factor at r = 1: in the corners of an image whose principal point is its middle."""
         return math.exp(self.second + self.fourth)
 
-    def shade(self, lens: Lens, box: tuple[int, int, int, int]) -> np.ndarray:
+    def shade(self, circle: ImageCircle, box: tuple[int, int, int, int]) -> np.ndarray:
         """V [h,w,1] float32 of the pixels in ``box`` (x0, y0, x1, y1)."""
-        r2 = lens.squared_radii(box)
-        return np.exp(self.second * r2 + self.fourth * r2 * r2).astype(np.float32)[..., None]
+        return self.at(circle.squared_radii(box)).astype(np.float32)[..., None]
+
+    def at(self, r2: np.ndarray) -> np.ndarray:
+        """V at squared distances of r."""
+        return np.exp(self.second * r2 + self.fourth * r2 * r2)
 
 
 NO_FALLOFF = Falloff(0.0, 0.0)
@@ -76,6 +80,13 @@ class Vignetting(Effect):
         """As the static part tells, unless it has coefficients of its own."""
         return self if self.second is not None or recorded.falloff is None else type(self)(*recorded.falloff)
 
+    @classmethod
+    def restored(cls, kept: Mapping[str, Any]) -> Vignetting:
+        """From both coefficients. ValueError without them."""
+        if kept.keys() != {"second", "fourth"} or not all(type(x) in (int, float) for x in kept.values()):
+            raise ValueError(f"vignetting: expected the numbers second and fourth; found {dict(kept)}.")
+        return cls(float(kept["second"]), float(kept["fourth"]))
+
     def _known(self) -> Falloff:
         if self.second is None:
             raise ValueError(
@@ -87,16 +98,33 @@ class Vignetting(Effect):
     def wrap(self, observe: Observe, params: Params) -> Observe:
         """Multiply the colours by the falloff."""
         falloff = self._known()
+        if not any(falloff):
+            return observe
 
         def shaded(shot: Shot) -> Rendered:
             seen = observe(shot)
-            if shot.lens is None:
-                raise ValueError("shot: expected the lens that vignetting is of; found none. Give Shot.lens.")
-            return replace(seen, rgb=seen.rgb * torch.from_numpy(falloff.shade(shot.lens, shot.box)).to(seen.rgb))
+            if shot.circle is None:
+                raise ValueError("shot: expected the circle that vignetting is of; found none. Give Shot.circle.")
+            return replace(seen, rgb=seen.rgb * torch.from_numpy(falloff.shade(shot.circle, shot.box)).to(seen.rgb))
 
         return shaded
 
-    def on_still(self, image: Tensor, lens: Lens) -> Tensor:
+    def on_still(self, image: Tensor, circle: ImageCircle) -> Tensor:
         """The same for a picture of what stands still."""
+        if not any(self._known()):
+            return image
         height, width = image.shape[-3:-1]
-        return image * torch.from_numpy(self._known().shade(lens, (0, 0, width, height))).to(image)
+        return image * torch.from_numpy(self._known().shade(circle, (0, 0, width, height))).to(image)
+
+
+def darkening_(falloff: Tensor) -> None:
+    """Bring coefficients [2], in place, to those of images that darken all the way from their middle to r = 1."""
+    with torch.no_grad():
+        falloff[0].clamp_(-STRONGEST, 0)
+        falloff[1].clamp_(-STRONGEST, float(-falloff[0] / 2))
+
+
+def own_falloff(effects: Sequence[Effect]) -> Falloff | None:
+    """The falloff that somebody gave; None where it is left to the static part."""
+    given = [e for e in effects if isinstance(e, Vignetting) and e.second is not None]
+    return Falloff(float(given[0].second or 0.0), given[0].fourth) if given else None

@@ -18,8 +18,9 @@ from otsync.sync.breaks import mended
 from otsync.types import Clock, Offsets, TrackSet
 from recon.backdrop.fit import StaticFit, with_backdrop
 from recon.footage.footage import Footage
+from recon.observe.effects import Effect
 from recon.observe.recorded import check_effects
-from recon.observe.vignetting import Falloff
+from recon.observe.vignetting import Falloff, Vignetting, own_falloff
 from recon.pipeline.feature_maps import maps_from
 from recon.pipeline.intake import readable, split
 from recon.pipeline.plan import Plan
@@ -66,6 +67,25 @@ class Prepared:
     def layered(self) -> bool:
         """Whether the fit draws what moves over backgrounds, rather than together with what is static."""
         return all(f.background is not None for f in self.footage)
+
+
+def check_vignetting(effects: Sequence[Effect], static: StaticFit | None, progress: Progress) -> None:
+    """ValueError for a vignetting that nothing tells, or another one than the static part was fitted with."""
+    if not any(isinstance(effect, Vignetting) for effect in effects):
+        return
+    given = own_falloff(effects)
+    if given is None and static is None:
+        raise ValueError(
+            "effects: expected a static part that tells the vignetting; found none. Give vignetting second and fourth, "
+            "or leave it out."
+        )
+    if given is None and static is not None and not any(static.falloff):
+        progress.note("vignetting was asked for, but the static part shows none: nothing is darkened")
+    if given is not None and static is not None and static.falloff != given:
+        raise ValueError(
+            f"backdrop: expected one fitted with the vignetting of the plan, {tuple(given)}; found "
+            f"{tuple(static.falloff)}. Fit it with falloff={tuple(given)}, or leave vignetting out of the effects."
+        )
 
 
 def prepare(
@@ -146,6 +166,7 @@ def prepare(
         static = backdrop
         if static is None:
             static = backdrop_of_scene(train, tracks, footage, plan, cache, progress, deadline, stages)
+        check_vignetting(plan.effects, static, progress)
     with progress.stage("initial scene"):
         gains = np.ones((len(footage), 3)) if static is None else static.gains
         given = Given(train, offsets, tuple(tracks), footage, gains, plan, cache, map, progress, stages)

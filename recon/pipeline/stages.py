@@ -28,7 +28,7 @@ from recon.backdrop.fit import StaticFit, fit_backdrop
 from recon.features.tracks import FeatureMaps
 from recon.footage.depth import working_depth
 from recon.footage.footage import Footage, footage_of
-from recon.observe.vignetting import Falloff
+from recon.observe.vignetting import Falloff, own_falloff
 from recon.pipeline.feature_maps import key_of, with_features
 from recon.pipeline.intake import only
 from recon.pipeline.plan import Plan
@@ -182,6 +182,7 @@ def backdrop_of_scene(
 ) -> StaticFit | None:
     """Static Gaussians fitted to what the cameras see behind the things that move, kept; None where nothing shows."""
     at_most = None if deadline is None else BACKDROP_SHARE * deadline.left
+    given = own_falloff(plan.effects)
 
     def build() -> dict[str, np.ndarray]:
         lifted = [t.positions()[t.seen] for t in tracks]
@@ -191,6 +192,7 @@ def backdrop_of_scene(
             footage,
             depth=None if all(d is None for d in depth) else depth,
             points=points,
+            falloff=given,
             steps=plan.backdrop_steps,
             at_most=at_most,
             seed=plan.fit.seed,
@@ -215,7 +217,7 @@ def backdrop_of_scene(
     if deadline is not None:
         key = (*key, "budget", deadline.seconds)
     try:
-        kept = cache.arrays("backdrop", (*key, "with falloff"), build)
+        kept = cache.arrays("backdrop", (*key, "falloff", given), build)
     except ValueError as error:
         progress.note(f"no static part: {error}")
         return None

@@ -27,7 +27,7 @@ from otsync.types.camera import matrix_of
 from otsync.types.clock import Source
 from recon.evaluate.views import ViewScore
 from recon.footage.footage import Footage
-from recon.observe.effects import Effect, Lens, on_still
+from recon.observe.effects import Effect, ImageCircle, on_still
 from recon.observe.recorded import kept, restored
 from recon.result.layout import MAX_SIDE, RunFile
 from recon.scene.gaussians4d import Gaussians4D
@@ -77,7 +77,7 @@ class FilmedBy:
             camera: that the image is of, if of another size than this one's.
         """
         camera = camera or self.camera
-        seen = on_still(self.optics, image, Lens.of(camera.K, (camera.width, camera.height))).numpy()
+        seen = on_still(self.optics, image, ImageCircle.of(camera.K, (camera.width, camera.height))).numpy()
         return (255 * seen * self.gain).clip(0, 255).round().astype(np.uint8)
 
     def pose(self, t: float) -> np.ndarray:

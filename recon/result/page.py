@@ -27,6 +27,7 @@ import torch
 from otsync.files.arrays import atomic_write, read_json
 from recon.backdrop.surroundings import up_axis
 from recon.motion import PerGaussian, Scaffold, Static
+from recon.observe.vignetting import NO_FALLOFF, own_falloff
 from recon.raster import sh
 from recon.raster.rendering import ALPHA_MIN, Settings
 from recon.result.export import Exporter
@@ -245,6 +246,7 @@ def _camera(
         "last": float(video.times[-1]),
         "shots": _shots(video.times),
         "gain": [float(g) for g in video.gain],
+        "falloff": list(own_falloff(video.optics) or NO_FALLOFF),
         "held_out": video.held_out,
         **_trust(video, result),
     }

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from otsync.types import Camera
-from recon.observe.effects import Lens
+from recon.observe.effects import ImageCircle
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,17 +43,21 @@ class Exposure:
 
 @dataclass(frozen=True)
 class DarkCorners:
-    """Vignetting: colours times ``(1 - size) ** r^2``, r from the middle of the image in half diagonals.
+    """Vignetting: colours times ``(1 - size) ** r^2``, r from the principal point in half diagonals.
 
     The corners lose the share ``size`` of their light.
     """
 
     size: float = 0.2
 
+    def __post_init__(self) -> None:
+        if not 0 <= self.size < 1:
+            raise ValueError(f"size: expected a share of 0 or more, below 1; found {self.size}.")
+
     def shade(self, camera: Camera) -> Float[np.ndarray, "h w 1"]:
         """The factor of every pixel."""
-        lens = Lens.of(camera.K, (camera.width, camera.height))
-        return ((1 - self.size) ** lens.squared_radii((0, 0, camera.width, camera.height)))[..., None]
+        circle = ImageCircle.of(camera.K, (camera.width, camera.height))
+        return ((1 - self.size) ** circle.squared_radii((0, 0, camera.width, camera.height)))[..., None]
 
 
 @dataclass(frozen=True)

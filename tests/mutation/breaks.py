@@ -36,6 +36,7 @@ MOTION_LOSSES = ("tests/recon/losses/test_motion_losses.py",)
 WARP = ("tests/recon/motion/test_motion_warp.py",)
 SOLVE = ("tests/recon/motion/test_motion_solve.py",)
 OBSERVE = ("tests/recon/observe",)
+COLOURS = ("tests/recon/backdrop/test_colours.py",)
 DEPTH = ("tests/otsync/priors/test_depth_scale.py",)
 AUDIT = ("tests/otsync/recordings/test_audit.py",)
 TIED = ("tests/otsync/recordings/test_learned_depth.py",)
@@ -1728,6 +1729,70 @@ BREAKS = (
         "np.cross((omega[i] + omega[j]) / 2, places[j] - places[i])",
         SOLVE,
         "hidden nodes turn against their body",
+    ),
+    Break(
+        "vignetting-crop",
+        "recon/observe/effects.py",
+        "(np.arange(x0, x1) + 0.5 - self.x)",
+        "(np.arange(x1 - x0) + 0.5 - self.x)",
+        OBSERVE,
+        "a crop is darkened as if it began at the image's left edge",
+    ),
+    Break(
+        "vignetting-powers",
+        "recon/observe/vignetting.py",
+        "self.fourth * r2 * r2)",
+        "self.fourth * r2)",
+        OBSERVE,
+        "the fourth power of the distance is taken for the second",
+    ),
+    Break(
+        "vignetting-brightens",
+        "recon/observe/vignetting.py",
+        "float(-falloff[0] / 2)",
+        "STRONGEST",
+        COLOURS,
+        "a learned falloff may brighten towards the corners",
+    ),
+    Break(
+        "vignetting-still",
+        "recon/evaluate/views.py",
+        "return on_still(optics, seen, clip.circle)",
+        "return seen",
+        ("tests/recon/evaluate/test_views.py",),
+        "what stands still is not darkened in held-out cameras",
+    ),
+    Break(
+        "vignetting-pictures",
+        "recon/backdrop/colours.py",
+        "keep = self.video != video",
+        "keep = np.arange(len(self.video)) != video",
+        COLOURS,
+        "single pictures are left out in place of videos, whose pictures are no witnesses of their own",
+    ),
+    Break(
+        "vignetting-seen-once",
+        "recon/backdrop/colours.py",
+        "self.video[keep]).shared()",
+        "self.video[keep])",
+        COLOURS,
+        "points that one picture alone shows stay, and hold gains and falloff where they are",
+    ),
+    Break(
+        "vignetting-seeds",
+        "recon/backdrop/seeds.py",
+        "/ falloff.at(np.concatenate([s.radii for s in surfaces]))[:, None]",
+        "/ falloff.at(np.concatenate([0 * s.radii for s in surfaces]))[:, None]",
+        COLOURS,
+        "seeds from corners begin too dark",
+    ),
+    Break(
+        "vignetting-own",
+        "recon/pipeline/stages.py",
+        "falloff=given,",
+        "falloff=None,",
+        ("tests/recon/pipeline/test_vignetting.py",),
+        "coefficients that somebody gave do not reach the static part",
     ),
     Break(
         "observe-rolling-first-row",

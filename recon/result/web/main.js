@@ -115,6 +115,7 @@ class Page {
       ...this.layers,
       seconds: this.seconds,
       gain: filming ? filming.gain : [1, 1, 1],
+      falloff: filming ? filming.falloff : [0, 0],
       camera,
       poses,
       own,

@@ -24,6 +24,7 @@ uniform vec3 gain;         // of the colours
 uniform sampler2D bands;   // spherical harmonics beyond the constant, one texel each
 uniform int degree;        // of the spherical harmonics; 0: colours do not depend on the view
 out vec2 across;           // standard deviations from the middle
+out vec2 from_axis;        // from the principal point, in half diagonals of the image
 flat out vec4 paint;
 flat out float reach2;
 
@@ -117,21 +118,25 @@ void main() {
   vec3 tint = texelFetch(looks, at + ivec2(1, 0), 0).rgb;
   if (degree > 0) tint = max(tint + shade(index, normalize(place + transpose(turn) * shift)), 0.0);
   paint = vec4(tint * gain, look.w);
+  from_axis = (pixel - lens.zw) / (0.5 * length(bounds.zw - bounds.xy));
   gl_Position = vec4(2.0 * pixel.x / size.x - 1.0, 1.0 - 2.0 * pixel.y / size.y, 0.0, 1.0);
 }`;
 
 const SPLAT_FRAGMENT = `#version 300 es
 precision highp float;
 in vec2 across;
+in vec2 from_axis;
 flat in vec4 paint;
 flat in float reach2;
+uniform vec2 falloff;      // of the colours: log V = falloff.x * r^2 + falloff.y * r^4
 out vec4 color;
 
 void main() {
   float distance2 = dot(across, across);
   if (distance2 > reach2) discard;
   float alpha = min(0.999, paint.a * exp(-0.5 * distance2));
-  color = vec4(paint.rgb * alpha, alpha);
+  float r2 = dot(from_axis, from_axis);
+  color = vec4(paint.rgb * exp(r2 * (falloff.x + r2 * falloff.y)) * alpha, alpha);
 }`;
 
 /** A compiled program with the places of its uniforms. Errors name the stage that does not compile. */
@@ -262,8 +267,11 @@ class Splats {
     this.count = drawn;
   }
 
-  /** Draws into the present framebuffer; `shot` is a Shot of view.js, `gain` three factors. */
-  draw(shot, gain) {
+  /**
+   * Draws into the present framebuffer; `shot` is a Shot of view.js, `gain` three factors, `falloff` the coefficients of
+   * the lens's vignetting.
+   */
+  draw(shot, gain, falloff) {
     const { gl } = this;
     const { made, uniforms } = this.program;
     gl.useProgram(made);
@@ -276,6 +284,7 @@ class Splats {
     gl.uniform4fv(uniforms.bounds, shot.bounds);
     gl.uniform1f(uniforms.blur, shot.blur);
     gl.uniform3fv(uniforms.gain, gain);
+    gl.uniform2fv(uniforms.falloff, falloff);
     gl.uniform1i(uniforms.degree, this.degree);
     gl.uniform1i(uniforms.bands, 2);
     gl.uniform1i(uniforms.order, 3);

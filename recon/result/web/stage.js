@@ -95,7 +95,7 @@ class Stage {
     this.tried = (this.tried ?? 0) + 1;
   }
 
-  /** Draws everything. `look`: which layers, the gain, the seconds that are shown, the camera looked through. */
+  /** Draws everything. `look`: which layers, the gain and falloff, the seconds that are shown, the camera looked through. */
   draw(shot, look) {
     if ((this.tried ?? 0) < 2) this.#tryOut(() => this.#draw(shot, look)); // shaders are compiled on the first one
     else this.#draw(shot, look);
@@ -106,7 +106,7 @@ class Stage {
     gl.viewport(0, 0, shot.width, shot.height);
     gl.clearColor(0, 0, 0, 1);
     gl.clear(gl.COLOR_BUFFER_BIT);
-    this.splats.draw(shot, look.gain);
+    this.splats.draw(shot, look.gain, look.falloff);
     const near = 1e-3 * this.about.radius;
     if (look.paths) this.lines.draw('paths', shot, { trail: [look.seconds, TRAIL.before, TRAIL.after], near });
     if (look.ghosts) this.lines.draw('ghosts', shot, { dot: Math.max(4, shot.height / 110), near });

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from otsync.types import Camera, Clock
-from recon.observe.effects import Lens, Recorded, Rendered, RollingShutter, Shot, compose, on_still
+from recon.observe.effects import ImageCircle, Recorded, Rendered, RollingShutter, Shot, compose, on_still
 from recon.observe.recorded import kept, optics, restored, with_declared
 from recon.observe.vignetting import NO_FALLOFF, Falloff, Vignetting
 from recon.result.folder import FilmedBy
@@ -20,7 +20,7 @@ from recon.simulate.effects import DarkCorners
 
 WIDTH, HEIGHT = 64, 48
 K = np.array([[50.0, 0, 30], [0, 50, 25], [0, 0, 1]])
-LENS = Lens.of(K, (WIDTH, HEIGHT))
+CIRCLE = ImageCircle.of(K, (WIDTH, HEIGHT))
 WHOLE = (0, 0, WIDTH, HEIGHT)
 
 coefficients = st.floats(-1, 1)
@@ -32,7 +32,7 @@ def bright(shot: Shot) -> Rendered:
 
 
 def shot(box=WHOLE) -> Shot:
-    return Shot(0, torch.tensor(0.0, dtype=torch.float64), box, HEIGHT, lens=LENS)
+    return Shot(0, torch.tensor(0.0, dtype=torch.float64), box, HEIGHT, circle=CIRCLE)
 
 
 @given(coefficients, coefficients, st.integers(0, WIDTH - 1), st.integers(0, HEIGHT - 1))
@@ -55,7 +55,7 @@ def test_a_crop_shows_what_the_image_does():
 def test_what_stands_still_is_darkened_alike():
     effect = Vignetting(-0.3, 0.1)
     pictures = torch.rand(2, HEIGHT, WIDTH, 3)
-    shaded = on_still((RollingShutter(0.02), effect), pictures, LENS)
+    shaded = on_still((RollingShutter(0.02), effect), pictures, CIRCLE)
     assert torch.equal(shaded, pictures * effect.wrap(bright, {})(shot()).rgb)
     assert Falloff(-0.3, 0.1).corner == pytest.approx(math.exp(-0.2))
 
@@ -82,8 +82,9 @@ def test_a_file_keeps_it():
     assert restored(kept((effect,))) == (effect,)
     with pytest.raises(ValueError, match="second"):
         restored([{"name": "vignetting", "second": 1e9, "fourth": 0.0}])
-    with pytest.raises((ValueError, TypeError)):
-        restored([{"name": "vignetting", "falloff": 3}])
+    for row in ({"falloff": 3}, {"second": None, "fourth": 0.0}, {"second": True, "fourth": 0.0}, {"second": -0.1}):
+        with pytest.raises(ValueError, match="expected the numbers second and fourth"):
+            restored([{"name": "vignetting", **row}])
 
 
 @pytest.mark.parametrize(
@@ -99,8 +100,8 @@ def test_no_lens_is_like_that(second, fourth, named):
 def test_what_it_lacks_it_names():
     with pytest.raises(ValueError, match="second: expected a coefficient, since no static part tells"):
         Vignetting().wrap(bright, {})
-    with pytest.raises(ValueError, match="shot: expected the lens"):
-        Vignetting(0.1, 0.0).wrap(bright, {})(replace(shot(), lens=None))
+    with pytest.raises(ValueError, match="shot: expected the circle"):
+        Vignetting(0.1, 0.0).wrap(bright, {})(replace(shot(), circle=None))
 
 
 def test_a_camera_of_a_result_shows_its_colours():
@@ -112,7 +113,7 @@ def test_a_camera_of_a_result_shows_its_colours():
     own = video.coloured(torch.full((HEIGHT, WIDTH, 3), 0.8))
     middle, corner = own[25, 30], own[0, 0]
     assert middle.tolist() == [102, 204, 204]
-    r2 = float(LENS.squared_radii((0, 0, 1, 1))[0, 0])
+    r2 = float(CIRCLE.squared_radii((0, 0, 1, 1))[0, 0])
     assert corner[1] == pytest.approx(204 * math.exp(-0.4 * r2), abs=1)
     double = replace(camera, K=K * np.array([[2.0], [2.0], [1.0]]), width=2 * WIDTH, height=2 * HEIGHT)
     large = video.coloured(torch.full((2 * HEIGHT, 2 * WIDTH, 3), 0.8), double)
@@ -124,3 +125,5 @@ def test_simulated_corners_lose_what_was_asked_for():
     shade = DarkCorners(0.3).shade(camera)
     assert shade.shape == (HEIGHT, WIDTH, 1) and shade.max() == pytest.approx(1, abs=1e-3)
     assert shade[0, 0, 0] == pytest.approx(0.7, abs=0.02)
+    with pytest.raises(ValueError, match="size: expected a share"):
+        DarkCorners(1.0)

@@ -17,6 +17,7 @@ import pytest
 import torch
 
 from recon.motion import HermiteSpline, Sampled
+from recon.observe import Vignetting
 from recon.result import Page
 from recon.result.export import export_result
 from recon.result.images import rendered
@@ -161,8 +162,10 @@ def scene_page(tmp_path_factory) -> Path:
     ],
 )
 def test_pixels_are_those_of_the_rasterizer(browser, tmp_path, kind, options):
-    """Three times and two views, one of a camera that moves."""
+    """Three times and two views, one of a camera that moves; through lenses that lose two thirds in the corners."""
     result = reconstruction(kind, **options)
+    dark = Vignetting(-0.8, -0.3)
+    result = replace(result, videos=tuple(replace(v, optics=(dark,)) for v in result.videos), optics=(dark,))
     export_result(result, Page(), tmp_path / "p.html")
     shown = Opened(browser, SIZE)
     for name in ("b", "c"):
