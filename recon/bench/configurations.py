@@ -156,6 +156,11 @@ def per_video(plan: Plan) -> Plan:
     return replace(plan, scaffold=replace(plan.scaffold, per_video=True))
 
 
+def hermite(plan: Plan) -> Plan:
+    """Nodes on the paper's splines."""
+    return replace(plan, scaffold=replace(plan.scaffold, spline="hermite"))
+
+
 def images_alone(plan: Plan) -> Plan:
     """No losses on the motion, and more Gaussians where the images ask for them."""
     fit = replace(plan.fit, losses=ON_IMAGES, densify=plan.fit.densify or Densify())
@@ -212,6 +217,7 @@ OWN: Mapping[str, Configuration] = {
     "ours": Configuration(),
     "fixed": Configuration(change=held),
     "true time": Configuration("true", held),
+    "Hermite spline": Configuration(change=hermite),
     "w/o spline": Configuration(change=held, motion=sampled),
     "w/o spline, true time": Configuration("true", held, motion=sampled),
     "w/o scaffold": Configuration(**APART),

@@ -1,7 +1,7 @@
 """Motion: a scaffold of splined nodes, and its ablations, in one slot.
 
 motion.py        Motion: the slot, as a fit uses it
-paths.py         HermiteSpline, Sampled: curves in time as sums over four knots
+paths.py         BSpline, HermiteSpline, Sampled: curves in time as sums over four knots
 scaffold.py      Scaffold: nodes, and binding Gaussians to them; binding.py: which nodes carry which Gaussian
 warp.py          carrying Gaussians with nodes: the definition in torch
 fused.py         the same, poses and motion losses in compiled kernels: *_kernels.py
@@ -14,12 +14,13 @@ density.py       more nodes where they are needed, fewer where they are not
 from recon.motion.binding import Binding
 from recon.motion.build import ScaffoldOptions, build_scaffold
 from recon.motion.motion import Motion, motion_from_arrays
-from recon.motion.paths import HermiteSpline, Path, Sampled
+from recon.motion.paths import BSpline, HermiteSpline, Path, Sampled
 from recon.motion.per_gaussian import PerGaussian, Static
 from recon.motion.scaffold import Scaffold
 from recon.motion.track_curves import TrackCurves
 
 __all__ = [
+    "BSpline",
     "Binding",
     "HermiteSpline",
     "Motion",

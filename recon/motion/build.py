@@ -13,7 +13,7 @@ from otsync.types import TrackSet
 from recon.motion import nodes as picking
 from recon.motion.binding import Binding
 from recon.motion.nodes import Grid
-from recon.motion.paths import HermiteSpline
+from recon.motion.paths import SPLINES, Path
 from recon.motion.scaffold import Scaffold
 from recon.motion.solve import FRAME, Coupling, Observations, Smoothness, neighbourhood_rotations, solve_curves
 from recon.motion.warp import BLENDS, LINEAR
@@ -33,7 +33,8 @@ class ScaffoldOptions:
         unit: spacing of the nodes; None: 7.5, or less (down to 2) where that gives fewer than `fewest` nodes, or more
             where it gives more than `most`. Give `unit` or `fewest`, not both.
         second_pick: spacing of the second pick, on full curves, as a share of `unit`.
-        spacing: of the knots in time. margin: seconds of knots beyond both ends: the largest believable offset.
+        spline: "b-spline", or "hermite", the paper's. spacing: of its knots in time. margin: seconds of knots beyond
+            both ends: the largest believable offset.
         per_video: one scaffold per video, each on its own clock, as in the paper; else one in world time.
         neighbours: of a node. reach: D_track, in units, from which nodes are no neighbours.
         robust: distance at which a sample counts half, in footprints.
@@ -45,6 +46,7 @@ class ScaffoldOptions:
     second_pick: float = 0.8
     fewest: int = FEWEST
     most: int = 1800
+    spline: str = "b-spline"
     spacing: float = 4 * FRAME
     margin: float = 4 * FRAME
     per_video: bool = False
@@ -67,6 +69,12 @@ class ScaffoldOptions:
             raise ValueError("margin, neighbours, fewest, most: expected margin >= 0, 1 neighbour, fewest <= most.")
         if self.blend not in BLENDS:
             raise ValueError(f"blend: expected one of {', '.join(BLENDS)}; found {self.blend!r}.")
+        if self.spline not in SPLINES:
+            raise ValueError(f"spline: expected one of {', '.join(SPLINES)}; found {self.spline!r}.")
+
+    def path(self, first: float, last: float) -> Path:
+        """The curve in time for a motion from one second to another, with no values yet."""
+        return SPLINES[self.spline].of(first, last, self.spacing, self.margin)
 
 
 UNIT, LEAST_UNIT, MOST_UNIT, GROWTH = 7.5, 2.0, 750.0, 1.25  # footprints; the last: the factor between two tries
@@ -96,7 +104,7 @@ def build_scaffold(
     offsets = np.asarray(offsets, float)
     if not options.per_video:
         grid = Grid.of(tracks, offsets, frame_step, rates)
-        path = HermiteSpline.of(grid.times[0], grid.times[-1], options.spacing, options.margin)
+        path = options.path(grid.times[0], grid.times[-1])
         return _assemble(path, [_nodes(grid, path, footprint, options, seed)], options)
     clocks = picking.world_clocks(tracks, offsets, rates)
     rates = np.ones(len(tracks)) if rates is None else np.asarray(rates, float)
@@ -105,7 +113,7 @@ def build_scaffold(
         raise ValueError("tracks: expected at least one visible sample; found none in any of the videos.")
     first, last = min(clocks[v][0] for v in usable), max(clocks[v][-1] for v in usable)
     own = (np.array([first, last])[:, None] - offsets[usable]) / rates[usable]
-    path = HermiteSpline.of(own.min(), own.max(), options.spacing, options.margin)
+    path = options.path(own.min(), own.max())
     parts = []
     for v in usable:
         grid = Grid.of([tracks[v]], np.zeros(1), frame_step / rates[v])
@@ -122,7 +130,7 @@ def build_scaffold(
 
 @dataclass(frozen=True, eq=False)
 class _Nodes:
-    """Nodes of one clock: knots [P,M,3], rotations [P,M,3,3], neighbours [M,K] with weights, spacing."""
+    """Nodes of one clock: knots [P,M,3], rotations then [P,M,3,3], neighbours [M,K] with weights, spacing."""
 
     curves: np.ndarray
     rotations: np.ndarray
@@ -131,10 +139,10 @@ class _Nodes:
     unit: float
 
 
-def _assemble(path: HermiteSpline, parts: Sequence[_Nodes], options: ScaffoldOptions) -> Scaffold:
+def _assemble(path: Path, parts: Sequence[_Nodes], options: ScaffoldOptions) -> Scaffold:
     before = np.cumsum([0] + [part.curves.shape[1] for part in parts])
     knots = torch.from_numpy(np.concatenate([part.curves for part in parts], 1)).float()
-    quats = continuous(quaternions(np.concatenate([part.rotations for part in parts], 1)))
+    quats = path.through(continuous(quaternions(np.concatenate([part.rotations for part in parts], 1))))
     edges = np.concatenate([part.neighbours + b for part, b in zip(parts, before, strict=False)])
     weights = np.concatenate([part.weights for part in parts])
     return Scaffold(
@@ -149,7 +157,7 @@ def _assemble(path: HermiteSpline, parts: Sequence[_Nodes], options: ScaffoldOpt
     )
 
 
-def _nodes(grid: Grid, path: HermiteSpline, footprint: float, options: ScaffoldOptions, seed: int) -> _Nodes:
+def _nodes(grid: Grid, path: Path, footprint: float, options: ScaffoldOptions, seed: int) -> _Nodes:
     """Pick, solve, pick again on the full curves, solve again, turn."""
     picked, unit = _first_pick(grid, footprint, options, seed)
     nodes = _PickedTracks(grid, path, picked, unit, footprint, options)
@@ -164,7 +172,7 @@ def _nodes(grid: Grid, path: HermiteSpline, footprint: float, options: ScaffoldO
     full = nodes.on_grid(curves)
     neighbours, distances = picking.neighbours(full, every[again], options.neighbours)
     weights = picking.edge_weights(distances, unit, options.reach)
-    turned = neighbourhood_rotations(curves, neighbours, weights, unit)
+    turned = neighbourhood_rotations(path.at_knots(curves), neighbours, weights, unit)
     logger.info("%d nodes of %d tracks, %.3g world units apart", len(again), len(grid), unit)
     return _Nodes(curves, turned, neighbours, weights, unit)
 
@@ -209,7 +217,7 @@ class _PickedTracks:
     def __init__(
         self,
         grid: Grid,
-        path: HermiteSpline,
+        path: Path,
         picked: np.ndarray,
         unit: float,
         footprint: float,

@@ -67,10 +67,16 @@ def grow(
         def carried(positions: Tensor, quats: Tensor) -> tuple[Tensor, Tensor]:
             return warping.blend(bound, positions, quats, places, upright, scaffold.blend)
 
-        # a path runs through its knots, and the nodes of a Gaussian share a clock: knots are poses at one time
-        knots, turns = zip(*map(carried, scaffold.knots, unit(scaffold.knot_quats)), strict=True)
+        # the nodes of a Gaussian share a clock: at the seconds of the knots all have poses of one time
+        path = scaffold.path
+        places_then, turned_then = (
+            path.at_knots(x.detach().cpu().numpy()) for x in (scaffold.knots, scaffold.knot_quats)
+        )
+        then = torch.as_tensor(places_then).to(means), unit(torch.as_tensor(turned_then).to(means))
+        moved, turns = zip(*map(carried, *then), strict=True)
         rests = [carried(p, q) for p, q in zip(scaffold.rest_positions, scaffold.rest_quats, strict=True)]
-        signed = torch.from_numpy(continuous(torch.stack(turns).cpu().numpy())).to(scaffold.knot_quats)
+        signed = torch.from_numpy(path.through(continuous(torch.stack(turns).cpu().numpy()))).to(scaffold.knot_quats)
+        knots = torch.from_numpy(path.through(torch.stack(moved).cpu().numpy())).to(scaffold.knots)
         binding = replace(
             scaffold.binding,
             positions=torch.cat([scaffold.rest_positions, torch.stack([x for x, _ in rests])], 1),
@@ -79,7 +85,7 @@ def grow(
         owner = bound.nodes[:, 0]
         grown = replace(
             scaffold,
-            knots=torch.cat([scaffold.knots, torch.stack(knots)], 1),
+            knots=torch.cat([scaffold.knots, knots], 1),
             knot_quats=torch.cat([scaffold.knot_quats, signed], 1),
             edges=torch.cat([scaffold.edges, scaffold.edges[owner]]),
             edge_weights=torch.cat([scaffold.edge_weights, scaffold.edge_weights[owner]]),

@@ -1,4 +1,5 @@
-"""Curves in time as weighted sums of a few values: cubic Hermite splines, and samples (the "w/o spline" ablation).
+"""Curves in time as weighted sums of a few values: cubic B-splines, the paper's cubic Hermite splines, and samples (the
+"w/o spline" ablation).
 
 A path is a uniform grid of knots in seconds. At any time it is a sum over four consecutive knots,
 
@@ -19,6 +20,7 @@ from typing import Self
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.linalg import solve_banded
 from torch import Tensor
 
 from recon.motion.arrays import numbers
@@ -108,6 +110,14 @@ class Path(ABC):
         window = first[..., None] + torch.arange(WINDOW, device=knots.device)
         return torch.einsum("...a,...ax->...x", w, knots.flatten(1)[window]).reshape(*first.shape, *knots.shape[1:])
 
+    def through(self, values: np.ndarray) -> np.ndarray:
+        """Knots [P,...] of the curve that has these values at the seconds of the knots."""
+        return values
+
+    def at_knots(self, knots: np.ndarray) -> np.ndarray:
+        """Values [P,...] of the curve of ``knots`` at the seconds of the knots: what :meth:`through` undoes."""
+        return knots
+
     def design(self, t: Float[np.ndarray, " S"]) -> Float[np.ndarray, "S P"]:
         """The weights of all knots at S times, dense."""
         first, w, _ = self.basis(t)
@@ -141,7 +151,19 @@ def _hermite_matrices() -> Float[np.ndarray, "5 4 4"]:
     )
 
 
+def _bspline_matrices() -> Float[np.ndarray, "5 4 4"]:
+    """As :func:`_hermite_matrices`, of the uniform cubic B-spline that goes on straight: the knot before the first lies
+    on the line through the first two, and so behind the last."""
+    inner = np.array([[1, -3, 3, -1], [4, 0, -6, 3], [1, 3, 3, -3], [0, 0, 0, 1]]) / 6
+    begin, end = np.zeros((4, 4)), np.zeros((4, 4))
+    begin[:3], end[1:] = inner[1:], inner[:3]
+    begin[:2] += np.outer([2, -1], inner[0])
+    end[2:] += np.outer([-1, 2], inner[3])
+    return np.stack([_HERMITE[0], begin, inner, end, _HERMITE[4]])
+
+
 _HERMITE = _hermite_matrices()
+_BSPLINE = _bspline_matrices()
 _FIRST_OF_KIND = np.array([0, 0, -1, -2, -3])  # the window's first knot, counted from the knot where u = 0
 _ONE_HOT = np.zeros((4, 4, 4))
 _ONE_HOT[np.arange(4), np.arange(4), 0] = 1  # knot k of the window, whatever u
@@ -153,19 +175,55 @@ class HermiteSpline(Path):
 
     Equals scipy.interpolate.CubicHermiteSpline with those tangents. Beyond the ends it goes on in a straight line with
     the end's tangent, so that the derivative in time, by which offsets are refined, stays alive and bounded there.
+
+    The paper's. Its error falls with the third power of the spacing only: between its knots a limb that swings is up to
+    1 % of its swing off at 1 Hz, and 9 % at 2 Hz, with knots every .133 s.
     """
 
     def _windows(self, t: np.ndarray | float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        s = (np.asarray(t, float) - self.start) / self.spacing
-        last = self.count - 1
-        # the knot where u = 0; an infinite or absurd time is continued like the end
-        i = np.clip(np.nan_to_num(np.floor(s)), -1, last).astype(np.int64)
-        kind = np.where(i < 0, 0, np.where(i == 0, 1, np.where(i < last - 1, 2, np.where(i < last, 3, 4))))
-        origin = np.maximum(i, 0)
-        return origin + _FIRST_OF_KIND[kind], _HERMITE[kind], origin
+        return _intervals(self, t, _HERMITE)
 
     def step(self, seconds: float) -> float:
         return seconds
+
+
+@dataclass(frozen=True, repr=False)
+class BSpline(Path):
+    """Uniform cubic B-spline, C2, which passes near its knots; of natural ends, and beyond them a straight line.
+
+    Equals scipy.interpolate.BSpline on the knots and one more at either end, on the straight line through the last two.
+    As smooth as four knots allow, its error falls with the fourth power of the spacing: of a swing of 1 Hz .2 %, of one
+    of 2 Hz 3 %, where :class:`HermiteSpline` has 1 and 9.
+    """
+
+    def _windows(self, t: np.ndarray | float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return _intervals(self, t, _BSPLINE)
+
+    def through(self, values: np.ndarray) -> np.ndarray:
+        """Solves the banded system of the knots' own weights."""
+        flat = np.asarray(values, float).reshape(self.count, -1)
+        bands = np.repeat([[1 / 6], [2 / 3], [1 / 6]], self.count, 1)
+        bands[0, 1] = bands[2, -2] = 0.0  # the ends of a natural spline are its first and last knot
+        bands[1, 0] = bands[1, -1] = 1.0
+        return solve_banded((1, 1), bands, flat).reshape(np.shape(values))
+
+    def at_knots(self, knots: np.ndarray) -> np.ndarray:
+        knots = np.asarray(knots, float)
+        return np.concatenate([knots[:1], (knots[:-2] + 4 * knots[1:-1] + knots[2:]) / 6, knots[-1:]])
+
+    def step(self, seconds: float) -> float:
+        return seconds
+
+
+def _intervals(path: Path, t: np.ndarray | float, of_kind: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What :meth:`Path._windows` gives, of a spline with these matrices [5,4,4] for the five kinds of interval."""
+    s = (np.asarray(t, float) - path.start) / path.spacing
+    last = path.count - 1
+    # the knot where u = 0; an infinite or absurd time is continued like the end
+    i = np.clip(np.nan_to_num(np.floor(s)), -1, last).astype(np.int64)
+    kind = np.where(i < 0, 0, np.where(i == 0, 1, np.where(i < last - 1, 2, np.where(i < last, 3, 4))))
+    origin = np.maximum(i, 0)
+    return origin + _FIRST_OF_KIND[kind], of_kind[kind], origin
 
 
 @dataclass(frozen=True, repr=False)
@@ -182,6 +240,16 @@ class Sampled(Path):
         return max(1, round(seconds / self.spacing)) * self.spacing
 
 
+def resampled(knots: Tensor, path: Path, other: Path) -> Tensor:
+    """Knots on another path of the curve that has the same values at that one's seconds."""
+    values = path.at(knots, torch.as_tensor(other.times, device=knots.device))
+    return torch.as_tensor(other.through(values.detach().cpu().numpy())).to(values)
+
+
+SPLINES: dict[str, type[Path]] = {"b-spline": BSpline, "hermite": HermiteSpline}
+"""Splines that a motion may be built of, by their names in the shell."""
+
+
 def path_arrays(path: Path) -> dict[str, np.ndarray]:
     """A path as plain arrays, for a checkpoint."""
     numbers = np.array([path.start, path.spacing, path.count], float)
@@ -190,7 +258,7 @@ def path_arrays(path: Path) -> dict[str, np.ndarray]:
 
 def path_from_arrays(arrays: Mapping[str, np.ndarray]) -> Path:
     """The path whose :func:`path_arrays` these are; KeyError where one is missing, ValueError where they make none."""
-    kinds = {kind.__name__: kind for kind in (HermiteSpline, Sampled)}
+    kinds = {kind.__name__: kind for kind in (BSpline, HermiteSpline, Sampled)}
     name, (start, spacing, count) = str(arrays["path"]), numbers(arrays, "path_knots", (3,)).double().tolist()
     if name not in kinds:
         raise ValueError(f"path: expected one of {sorted(kinds)}; found {name!r}.")

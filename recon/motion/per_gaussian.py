@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from recon.motion.arrays import indices, numbers
-from recon.motion.paths import Path, path_arrays, path_from_arrays
+from recon.motion.paths import Path, path_arrays, path_from_arrays, resampled
 from recon.motion.track_curves import TrackCurves
 from recon.rotations import product, unit
 
@@ -66,9 +66,8 @@ class PerGaussian:
 
     def on(self, path: Path) -> PerGaussian:
         """The same motion on another path, sampled at its knots."""
-        times = torch.as_tensor(path.times, device=self.own_knots.device)
-        quats = None if self.own_quats is None else self.path.at(self.own_quats, times)
-        return replace(self, path=path, own_knots=self.path.at(self.own_knots, times), own_quats=quats)
+        quats = None if self.own_quats is None else resampled(self.own_quats, self.path, path)
+        return replace(self, path=path, own_knots=resampled(self.own_knots, self.path, path), own_quats=quats)
 
     def turning(self) -> PerGaussian:
         """The same motion, which may learn to turn every Gaussian."""

@@ -15,7 +15,7 @@ from recon.motion import fused
 from recon.motion import warp as warping
 from recon.motion.arrays import indices, numbers, scalar
 from recon.motion.binding import NODES, Binding
-from recon.motion.paths import WINDOW, Path, path_arrays, path_from_arrays
+from recon.motion.paths import WINDOW, Path, path_arrays, path_from_arrays, resampled
 from recon.rotations import unit
 
 LEAST_WEIGHT = 1e-6  # before normalisation: a point far from all of its nodes still follows them
@@ -218,10 +218,8 @@ class Scaffold:
     def on(self, path: Path) -> Scaffold:
         """The same motion on another path, sampled at its knots; on :class:`Sampled`, the "w/o spline" ablation."""
         with torch.no_grad():
-            times = torch.as_tensor(path.times, device=self.knots.device)
-            return replace(
-                self, path=path, knots=self.path.at(self.knots, times), knot_quats=self.path.at(self.knot_quats, times)
-            )
+            knots, quats = (resampled(x, self.path, path) for x in (self.knots, self.knot_quats))
+            return replace(self, path=path, knots=knots, knot_quats=quats)
 
     def to(self, device: torch.device | str) -> Scaffold:
         """The same scaffold on another device."""

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import sparse
 
-from recon.motion.paths import HermiteSpline
+from recon.motion.paths import Path
 
 FRAME = 1 / 30  # seconds: the study's frame, in which its weights are given
 TOLERANCE, ROUGH = 1e-7, 1e-4  # of the energy norm, relative to that of the solution; ROUGH between reweightings
@@ -69,7 +69,7 @@ class Coupling:
 
 
 def solve_curves(
-    path: HermiteSpline,
+    path: Path,
     observed: Sequence[Observations],
     coupling: Coupling,
     smooth: Smoothness,

@@ -19,7 +19,7 @@ from otsync.recordings.stages import Stages
 from otsync.types import Offsets, TrackSet
 from recon.footage.depth import working_depth
 from recon.footage.footage import Footage
-from recon.motion import HermiteSpline, Motion, PerGaussian, TrackCurves, build_scaffold
+from recon.motion import Motion, PerGaussian, TrackCurves, build_scaffold
 from recon.pipeline.plan import Plan
 from recon.pipeline.track_sets import of_every_video
 from recon.scene.gaussians4d import Gaussians4D
@@ -98,7 +98,7 @@ class OnScaffold(Start):
 class OnTracks(Start):
     """Gaussians seeded from depth, each on a spline of its own that begins as that of a track near it; no scaffold.
 
-    Of the options of a scaffold, those of a single curve hold: spacing, margin, robust and smooth.acceleration.
+    Of the options of a scaffold, those of a single curve hold: spline, spacing, margin, robust and smooth.acceleration.
     """
 
     ignores: ClassVar[tuple[str, ...]] = tuple(
@@ -114,7 +114,7 @@ class OnTracks(Start):
         curves = TrackCurves.of(
             of_every_video(given.tracks, offsets.names),
             offsets.seconds,
-            HermiteSpline.of(*given.span, options.spacing, options.margin),
+            options.path(*given.span),
             robust=options.robust * footprint,
             acceleration=options.smooth.acceleration,
             rates=offsets.rates,
@@ -146,8 +146,7 @@ class FromImages(Start):
             given.offsets,
             frame_step=given.frame_step,
             span=given.span,
-            spacing=options.spacing,
-            margin=options.margin,
+            path=options.path(*given.span),
             gains=given.gains,
             options=given.plan.seeding,
         )

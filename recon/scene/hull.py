@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 from otsync.geometry import common_target
 from otsync.types import Camera, Offsets
 from recon.footage.footage import FOREGROUND, Footage
-from recon.motion import HermiteSpline, PerGaussian
+from recon.motion import Path, PerGaussian
 from recon.scene.gaussians4d import Gaussians4D
 from recon.scene.seed import Seeding, balls, shown_at
 
@@ -53,23 +53,20 @@ def hull_scene(
     *,
     frame_step: float,
     span: tuple[float, float],
-    spacing: float,
-    margin: float,
+    path: Path,
     gains: Float[np.ndarray, "V 3"] | None = None,
     options: Seeding | None = None,
 ) -> Gaussians4D:
     """Gaussians on the visual hull at the middle of the clip, each on a spline of its own that follows the hull.
 
     Args:
-        offsets: believed clocks, by name. span: (first, last) world seconds.
-        spacing, margin: seconds between the knots of the splines, and of knots beyond both ends.
+        offsets: believed clocks, by name. span: (first, last) world seconds. path: of each Gaussian, over the span.
         gains: factors of the videos' colours.
 
     Footprints are those at the point that the cameras look at. ValueError where fewer than two videos show the middle,
     and where no voxel lies in the masks of two then.
     """
     options = options or Seeding()
-    path = HermiteSpline.of(*span, spacing, margin)
     middle = int(np.abs(path.times - np.mean(span)).argmin())
     view = _View.of(footage, offsets, float(path.times[middle]), frame_step)
     if view is None:
@@ -90,7 +87,7 @@ def hull_scene(
         now = _View.of(footage, offsets, float(t), frame_step) if span[0] <= t <= span[1] else None
         hulls.append(np.zeros((0, 3)) if now is None else now.surface(focus, distance, voxel))
     means = torch.as_tensor(points, dtype=torch.float32)
-    moved = torch.as_tensor(followed(points, hulls, middle), dtype=torch.float32)
+    moved = torch.as_tensor(path.through(followed(points, hulls, middle)), dtype=torch.float32)
     logger.info("hull of %d videos at %.3f s: %d seeds", len(view.cameras), path.times[middle], len(means))
     images = [footage[v].images[k] / 255 / (1.0 if gains is None else gains[v]) for v, k in view.frames]
     dynamic = balls(means, _colors(points, view.cameras, images, voxel), voxel, options)

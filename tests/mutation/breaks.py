@@ -36,6 +36,7 @@ MOTION_LOSSES = ("tests/recon/losses/test_motion_losses.py",)
 WARP = ("tests/recon/motion/test_motion_warp.py",)
 SOLVE = ("tests/recon/motion/test_motion_solve.py",)
 OBSERVE = ("tests/recon/observe",)
+PATHS = ("tests/recon/motion/test_motion_paths.py", "tests/recon/motion/test_motion_build.py")
 COLOURS = ("tests/recon/backdrop/test_colours.py",)
 DEPTH = ("tests/otsync/priors/test_depth_scale.py",)
 AUDIT = ("tests/otsync/recordings/test_audit.py",)
@@ -1969,5 +1970,29 @@ BREAKS = (
         "noise / np.array([*(x for v in loose for x in (within[v], BEND)), 1e-6]),",
         BOARD,
         "a board that was printed a per cent too wide turns cameras by three of their sigmas",
+    ),
+    Break(
+        "bspline-ends",
+        "recon/motion/paths.py",
+        "begin[:2] += np.outer([2, -1], inner[0])",
+        "begin[:2] += np.outer([1, 0], inner[0])",
+        PATHS,
+        "a B-spline bends back at its first knot",
+    ),
+    Break(
+        "bspline-through",
+        "recon/motion/paths.py",
+        "bands[0, 1] = bands[2, -2] = 0.0",
+        "bands[0, 1] = bands[2, -2] = 0.1",
+        PATHS,
+        "the ends of a curve through given values miss them",
+    ),
+    Break(
+        "bspline-poses",
+        "recon/motion/build.py",
+        "neighbourhood_rotations(path.at_knots(curves), neighbours",
+        "neighbourhood_rotations(curves, neighbours",
+        PATHS,
+        "a B-spline's knots are taken for places on its curve: what swings turns too far",
     ),
 )

@@ -96,6 +96,7 @@ PLAN = {
     "scaffold.smooth.acceleration": "--scaffold.smooth.acceleration 1",
     "scaffold.smooth.still": "--scaffold.smooth.still 0.1",
     "scaffold.blend": "--scaffold.blend dual-quaternion",
+    "scaffold.spline": "--scaffold.spline hermite",
     "seeding.voxel": "--voxel 4",
     "seeding.support": "--seeding.support 3",
     "seeding.share": "--seeding.share 0.9",

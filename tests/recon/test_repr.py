@@ -45,7 +45,7 @@ def test_gaussians(scene):
 def test_motions(scene):
     motion = scene.motion
     text = line(motion)
-    assert text.startswith(f"Scaffold({len(motion)} nodes, {len(scene)} Gaussians, world time, HermiteSpline(")
+    assert text.startswith(f"Scaffold({len(motion)} nodes, {len(scene)} Gaussians, world time, BSpline(")
     assert line(motion.binding).startswith(f"Binding({len(scene)} Gaussians to {len(motion)} nodes, ")
     clocks = {"clock": torch.zeros(len(motion), dtype=torch.int64), "offsets": torch.zeros(1), "rates": torch.ones(1)}
     assert ", the videos' own times, " in line(replace(motion, **clocks))

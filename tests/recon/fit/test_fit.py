@@ -26,7 +26,7 @@ from recon.fit.verb import Calibration, fit
 from recon.losses import ImageLoss
 from recon.losses.image import Mask, Photometric
 from recon.losses.motion import Velocity
-from recon.motion import HermiteSpline, Scaffold, Static, build_scaffold
+from recon.motion import BSpline, Scaffold, Static, build_scaffold
 from recon.observe.cameras import Clip, observer
 from recon.observe.effects import Gain, MotionBlur, RollingShutter, Shot
 from recon.observe.recorded import with_declared
@@ -552,7 +552,7 @@ def test_a_spline_far_beyond_its_knots_still_renders(capture, scene):
 
 
 def test_types_of_motion_are_scaffolds(scene):
-    assert isinstance(scene.motion, Scaffold) and isinstance(scene.motion.path, HermiteSpline)
+    assert isinstance(scene.motion, Scaffold) and isinstance(scene.motion.path, BSpline)
 
 
 KILLED = """

@@ -56,6 +56,27 @@ def test_orientations_turn_with_the_bodies(scaffold):
     assert np.median(np.abs(angle - 1.2 * 0.7)) < 0.1
 
 
+@pytest.mark.parametrize("spline", ["b-spline", "hermite"])
+def test_nodes_of_a_bar_that_swings_turn_with_it(spline):
+    """To and fro at 1.2 Hz; knots of a B-spline are no poses: taken for such they are .17 radians off."""
+    t = np.arange(75) / 30
+    at = np.random.default_rng(3).uniform(-1, 1, (120, 3)) * [0.1, 0.6, 0.1]
+
+    def angles(t):
+        return 0.8 * np.sin(2 * np.pi * 1.2 * t)
+
+    c, s = np.cos(angles(t)), np.sin(angles(t))
+    xyz = np.stack(
+        [at[:, :1] * c - at[:, 1:2] * s, at[:, :1] * s + at[:, 1:2] * c, np.repeat(at[:, 2:], len(t), 1)], -1
+    )
+    found = build_scaffold([tracks_of(xyz)], np.zeros(1), options=ScaffoldOptions(spline=spline), **UNITS)
+    times = np.linspace(0.4, 2.0, 97)
+    R = rotation_matrices(found.nodes(torch.from_numpy(times))[1]).numpy()
+    R = R @ R[:1].transpose(0, 1, 3, 2)
+    turned = np.arctan2(R[..., 1, 0], R[..., 0, 0]) - (angles(times) - angles(times[:1]))[:, None]
+    assert np.median(np.abs(turned), 1).max() < 0.03
+
+
 def test_sizes_and_shapes(scaffold, world):
     P, M = scaffold.path.count, len(scaffold)
     assert int(np.ceil((36 + 8) / 4)) + 1 == P and 60 < M < 400
@@ -300,7 +321,7 @@ def test_videos_far_apart_in_time_are_bridged_with_a_warning(world, caplog):
     assert "show no track" in caplog.text
 
 
-@pytest.mark.parametrize("field", ["unit", "second_pick", "spacing", "margin", "neighbours"])
+@pytest.mark.parametrize("field", ["unit", "second_pick", "spacing", "margin", "neighbours", "spline", "blend"])
 def test_options_are_checked(field):
     with pytest.raises(ValueError, match=field):
         ScaffoldOptions(**{field: -1})

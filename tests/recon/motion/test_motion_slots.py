@@ -10,6 +10,7 @@ import torch
 
 from otsync.types import TrackSet
 from recon.motion import (
+    BSpline,
     HermiteSpline,
     PerGaussian,
     Sampled,
@@ -239,7 +240,8 @@ def test_nodes_grow_where_gaussians_pull(carried):
     assert ((q[1:] * q[:-1]).sum(-1) > 0).all()
 
 
-def test_a_rigid_motion_is_not_changed_by_growing():
+@pytest.mark.parametrize("kind", [HermiteSpline, BSpline])
+def test_a_rigid_motion_is_not_changed_by_growing(kind):
     from scipy.spatial.transform import Rotation
 
     from recon.rotations import continuous, quaternions
@@ -248,9 +250,10 @@ def test_a_rigid_motion_is_not_changed_by_growing():
     scaffold = random_scaffold(gaussians=0, rests=(), dtype=torch.float64)
     turns = Rotation.from_rotvec(0.3 * np.arange(8)[:, None] * np.array([0, 0.6, 0.8]))
     cloud = rng.normal(size=(40, 3))
-    knots = torch.from_numpy(np.stack([r.apply(cloud) for r in turns]))
-    quats = torch.from_numpy(continuous(quaternions(turns.as_matrix())))[:, None].repeat(1, 40, 1)
-    scaffold = replace(scaffold, knots=knots, knot_quats=quats)
+    path = kind(0.0, 4 * FRAME, 8)
+    knots = torch.from_numpy(path.through(np.stack([r.apply(cloud) for r in turns])))
+    quats = torch.from_numpy(path.through(continuous(quaternions(turns.as_matrix()))))[:, None].repeat(1, 40, 1)
+    scaffold = replace(scaffold, path=path, knots=knots, knot_quats=quats)
     means = rng.normal(size=(300, 3))
     bound = scaffold.bind(means[:150], 8 * FRAME).bind(means[150:], 20 * FRAME)
     pull, points = torch.from_numpy(rng.exponential(size=300) ** 3), torch.from_numpy(means)

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import torch
 
-from recon.motion import HermiteSpline, Sampled
+from recon.motion import BSpline, HermiteSpline, Sampled
 from recon.observe import Vignetting
 from recon.result import Page
 from recon.result.export import export_result
@@ -182,7 +182,8 @@ def test_pixels_are_those_of_the_rasterizer(browser, tmp_path, kind, options):
 
 def test_weights_of_splines_are_those_of_the_paths(opened, scene_page):
     opened.open(scene_page)
-    for path in (HermiteSpline(-0.3, 0.13, 4), HermiteSpline(2.0, 0.2, 7), Sampled(0.1, 1 / 30, 9)):
+    splines = [kind(*grid) for kind in (BSpline, HermiteSpline) for grid in ((-0.3, 0.13, 4), (2.0, 0.2, 7))]
+    for path in (*splines, Sampled(0.1, 1 / 30, 9)):
         about = {"kind": type(path).__name__, "start": path.start, "spacing": path.spacing, "count": path.count}
         times = np.linspace(path.start - 0.5, path.times[-1] + 0.5, 97)
         code = "([about, times]) => times.map(t => knotWeights(about, t))"

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from otsync.types import Offsets
-from recon.motion import PerGaussian
+from recon.motion import BSpline, PerGaussian
 from recon.scene.gaussians4d import Gaussians4D
 from recon.scene.hull import followed, hull_scene
 from recon.scene.seed import Seeding
@@ -26,7 +26,7 @@ def capture():
 def begun(footage, frames=None, **options) -> Gaussians4D:
     frames = np.zeros(len(footage)) if frames is None else np.array(frames, float)
     offsets = Offsets.known([f.name for f in footage], frames * STEP, 30.0)
-    about = {"frame_step": STEP, "span": (0.0, 12 * STEP), "spacing": 3 * STEP, "margin": STEP}
+    about = {"frame_step": STEP, "span": (0.0, 12 * STEP), "path": BSpline.of(0.0, 12 * STEP, 3 * STEP, STEP)}
     return hull_scene(footage, offsets, **{**about, **options})
 
 
