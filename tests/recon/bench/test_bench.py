@@ -225,7 +225,7 @@ def test_every_loss_and_every_plugin_is_a_row():
 
 def test_rows_that_are_compared_learn_offsets_alike():
     compared = (
-        ("ours", "w/o scaffold", "scaffold per video", "Sync-NeRF style"),
+        ("ours", "Hermite spline", "w/o scaffold", "scaffold per video", "Sync-NeRF style"),
         ("true time", "w/o scaffold, true time", "w/o spline, true time", "Dynamic3DGaussians"),
         ("fixed", "w/o spline"),
     )
