@@ -172,8 +172,10 @@ def fit_backdrop(
     finally:
         torch.set_num_threads(threads)
     gains, fitted, scores = fit.result()
+    if falloff is not None:  # as it was given, not as a float32
+        fitted = falloff
     stats = {"seconds": time.perf_counter() - started, "steps": fit.step, "seeds": len(start), "loss": loss}
-    return StaticFit(fit.gaussians().detach(), gains, near, scores, around.floor, falloff or fitted, stats)
+    return StaticFit(fit.gaussians().detach(), gains, near, scores, around.floor, fitted, stats)
 
 
 def colour_gain(

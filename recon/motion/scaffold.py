@@ -217,9 +217,8 @@ class Scaffold:
 
     def on(self, path: Path) -> Scaffold:
         """The same motion on another path, sampled at its knots; on :class:`Sampled`, the "w/o spline" ablation."""
-        with torch.no_grad():
-            knots, quats = (resampled(x, self.path, path) for x in (self.knots, self.knot_quats))
-            return replace(self, path=path, knots=knots, knot_quats=quats)
+        knots, quats = (resampled(x, self.path, path) for x in (self.knots, self.knot_quats))
+        return replace(self, path=path, knots=knots, knot_quats=quats)
 
     def to(self, device: torch.device | str) -> Scaffold:
         """The same scaffold on another device."""

@@ -40,15 +40,15 @@ SCENE = (
     Group("opacity_logits", 0.03, rows="gaussians"),
     Group("sh", 0.02, rows="gaussians"),
     Group("sh_rest", 1e-3, rows="gaussians"),
-    Group("knots", 0.11, "footprints", "nodes", axis=1),
-    Group("own_knots", 0.11, "footprints", "gaussians", axis=1),
-    Group("knot_quats", 3e-3, rows="nodes", axis=1),
-    Group("own_quats", 3e-3, rows="gaussians", axis=1),
+    Group("knots", 0.075, "footprints", "nodes", axis=1),
+    Group("own_knots", 0.075, "footprints", "gaussians", axis=1),
+    Group("knot_quats", 2e-3, rows="nodes", axis=1),
+    Group("own_quats", 2e-3, rows="gaussians", axis=1),
     Group("features", 5e-3, rows="gaussians"),
     Group("static.means", unit="footprints"),
 )
 """Of a scene. Rates are the study's metres and colours, expressed so; other static groups are in their own units. Those
-of curves are half as much again: a knot of a B-spline moves its curve by two thirds of its own way."""
+of knots say how far the curve goes, see :attr:`recon.motion.Path.share`."""
 
 CLOCKS = (Group("offsets", 0.02, "frames"), Group("clock_rates"))
 """Of the videos' clocks."""
