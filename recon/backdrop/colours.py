@@ -60,7 +60,7 @@ class Compared:
             seen, inside = lookup.look(points)
             colors.append(np.where(inside[:, None], seen, np.nan))
             u, v, _ = lookup.project(points)
-            radii.append(((u - circle.x) ** 2 + (v - circle.y) ** 2) / circle.radius**2)
+            radii.append(circle.squared(u, v))
         return cls(np.stack(colors), np.stack(radii), np.array([s.video for s in stills])).shared()
 
     def shared(self) -> Compared:

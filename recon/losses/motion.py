@@ -173,7 +173,7 @@ class Arap(MotionLoss):
     weight grows: the fit first finds where things are, and then what they have in common.
     """
 
-    weight: float = 0.075
+    weight: float = 0.1
     begin: float = 0.1
     every: int = 2
     shifts: tuple[float, ...] = SHIFTS
@@ -187,7 +187,7 @@ class Arap(MotionLoss):
 class Length(MotionLoss):
     """Distances to neighbours are kept (MoSca's L_len), between two moments as for :class:`Arap`."""
 
-    weight: float = 0.075
+    weight: float = 0.1
     begin: float = 0.1
     every: int = 2
     shifts: tuple[float, ...] = SHIFTS

@@ -56,9 +56,11 @@ class ImageCircle:
         """Squared distances [h,w] of the pixels in ``box`` (x0, y0, x1, y1) from the principal point, in half
         diagonals."""
         x0, y0, x1, y1 = box
-        x = (np.arange(x0, x1) + 0.5 - self.x) / self.radius
-        y = (np.arange(y0, y1) + 0.5 - self.y) / self.radius
-        return x * x + (y * y)[:, None]
+        return self.squared(np.arange(x0, x1) + 0.5, np.arange(y0, y1)[:, None] + 0.5)
+
+    def squared(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """The same of image coordinates."""
+        return ((u - self.x) / self.radius) ** 2 + ((v - self.y) / self.radius) ** 2
 
 
 @dataclass(frozen=True, eq=False)
