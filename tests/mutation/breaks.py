@@ -1734,8 +1734,8 @@ BREAKS = (
     Break(
         "vignetting-crop",
         "recon/observe/effects.py",
-        "(np.arange(x0, x1) + 0.5 - self.x)",
-        "(np.arange(x1 - x0) + 0.5 - self.x)",
+        "self.squared(np.arange(x0, x1) + 0.5,",
+        "self.squared(np.arange(x1 - x0) + 0.5,",
         OBSERVE,
         "a crop is darkened as if it began at the image's left edge",
     ),
