@@ -3,19 +3,21 @@
 ours                     motion-spline scaffold, offsets refined
 fixed                    the same, offsets held: what refinement is worth
 true time                the same from true offsets, held: the ceiling
+Hermite spline           the paper's splines, through their knots, in place of B-splines
 w/o spline               nodes sampled per frame: no derivative in time, so nothing to refine offsets by (MoSca)
 w/o spline, true time    the same from true offsets: what a spline costs or gains in quality (the paper's ablation)
 w/o scaffold             every Gaussian on a spline of its own, begun from the tracks near it; no scaffold anywhere
 w/o scaffold, true time  the same from true offsets, held
-scaffold per video       the paper's: every video's nodes on that video's clock
+scaffold per video       every video's nodes on that video's clock, as in the paper
 Sync-NeRF style          images and calibration alone: no tracks, no depth, no scaffold, no priors on motion
 Dynamic3DGaussians       true offsets; every Gaussian free to move and turn in every frame, held together by rigidity
 without LOSS             ours, without a loss of the default ones
 with LOSS                ours, with another loss that there is, a plugin's too
 with EFFECT              ours, with an effect that a plugin adds
 
-Rows of which one is to be compared with another learn offsets at one rate, or hold them both: "ours" beside "w/o
-scaffold" and "scaffold per video"; "true time" beside the other rows at true time; "fixed" beside "w/o spline".
+Rows of which one is to be compared with another learn offsets at one rate, or hold them both: "ours" beside "Hermite
+spline", "w/o scaffold" and "scaffold per video"; "true time" beside the other rows at true time; "fixed" beside "w/o
+spline".
 
 Sync-NeRF (Kim et al. 2024) has no geometric stage: its offsets begin at zero. With ``--amplitudes 30`` clocks begin
 wrong by up to 30 frames, as those of clips that begin up to 30 frames apart and are taken for simultaneous. Ours never
@@ -217,12 +219,12 @@ OWN: Mapping[str, Configuration] = {
     "ours": Configuration(),
     "fixed": Configuration(change=held),
     "true time": Configuration("true", held),
-    "Hermite spline": Configuration(change=hermite),
+    "Hermite spline": Configuration(change=hermite, own=("scaffold.spline",)),
     "w/o spline": Configuration(change=held, motion=sampled),
     "w/o spline, true time": Configuration("true", held, motion=sampled),
     "w/o scaffold": Configuration(**APART),
     "w/o scaffold, true time": Configuration("true", held, **APART),
-    "scaffold per video": Configuration(change=per_video),
+    "scaffold per video": Configuration(change=per_video, own=("scaffold.per_video",)),
     "Sync-NeRF style": Configuration(change=images_alone, start=FromImages(), groups=("own_knots",), own=("losses",)),
     "Dynamic3DGaussians": Configuration(
         "true", rigid, OnTracks(), free_in_every_frame, ("own_knots", "own_quats"), own=("losses",)

@@ -51,7 +51,8 @@ class FitOptions:
     effects: Annotated[tuple[Effect, ...], named("effects", EFFECTS, "--effects")] = ()
     """Effects of the cameras on the light, nearest to the scene first; a recording adds declared shutters and gains."""
     rates: Annotated[Mapping[str, float] | None, rates_on("--rates")] = None
-    """Learning rates at the start. Python: of all groups that are fitted. Command line: of those that shall differ."""
+    """Learning rates at the start. Python: of all groups that are fitted. Command line: of those that shall differ.
+    Those of a motion's knots are divided by the largest weight of a knot in its curve: 2/3 for B-splines."""
     freeze: tuple[str, ...] = ()
     """Parameter groups that stay as they are: offsets, gain, knots, ..."""
     steps: int | None = None

@@ -19,7 +19,6 @@ from recon.fit.problem import Problem, assemble, scene_groups
 from recon.fit.uncertainty import FRAMES, newton_sigma
 from recon.losses.image import Seen
 from recon.losses.motion import Draw
-from recon.motion import PerGaussian, Scaffold
 from recon.observe.cameras import Clip, compose_over, feature_image, observer, observer_at_once
 from recon.observe.effects import Rendered, Shot, compose, prior
 from recon.scene.gaussians4d import Gaussians4D, scene_arrays, scene_from_arrays
@@ -75,8 +74,7 @@ class Run:
 
     def _adam(self, moments: Mapping[str, Tensor]) -> Adam:
         motion, active = self.scene.motion, check_rates(self.rates, self.groups)
-        if isinstance(motion, Scaffold | PerGaussian):  # rates are steps of curves, not of their knots
-            active |= {name: active[name] / motion.path.share for name in motion.parameters() if name in active}
+        active |= {name: active[name] / motion.peak for name in motion.parameters() if name in active}
         adam = Adam(self.groups, active, self.scene.footprint, self.scene.frame_step, self.problem.declared)
         adam.restore(moments)
         return adam

@@ -130,7 +130,7 @@ def build_scaffold(
 
 @dataclass(frozen=True, eq=False)
 class _Nodes:
-    """Nodes of one clock: knots [P,M,3], rotations then [P,M,3,3], neighbours [M,K] with weights, spacing."""
+    """Nodes of one clock: knots [P,M,3], rotations [P,M,3,3] at their seconds, neighbours [M,K], weights, spacing."""
 
     curves: np.ndarray
     rotations: np.ndarray
@@ -172,7 +172,7 @@ def _nodes(grid: Grid, path: Path, footprint: float, options: ScaffoldOptions, s
     full = nodes.on_grid(curves)
     neighbours, distances = picking.neighbours(full, every[again], options.neighbours)
     weights = picking.edge_weights(distances, unit, options.reach)
-    turned = neighbourhood_rotations(path.at_knots(curves), neighbours, weights, unit)
+    turned = neighbourhood_rotations(path.at_knots(torch.from_numpy(curves)).numpy(), neighbours, weights, unit)
     logger.info("%d nodes of %d tracks, %.3g world units apart", len(again), len(grid), unit)
     return _Nodes(curves, turned, neighbours, weights, unit)
 

@@ -69,11 +69,8 @@ def grow(
 
         # the nodes of a Gaussian share a clock: at the seconds of the knots all have poses of one time
         path = scaffold.path
-        places_then, turned_then = (
-            path.at_knots(x.detach().cpu().numpy()) for x in (scaffold.knots, scaffold.knot_quats)
-        )
-        then = torch.as_tensor(places_then).to(means), unit(torch.as_tensor(turned_then).to(means))
-        moved, turns = zip(*map(carried, *then), strict=True)
+        places_then, turned_then = path.at_knots(scaffold.knots), unit(path.at_knots(scaffold.knot_quats))
+        moved, turns = zip(*map(carried, places_then, turned_then), strict=True)
         rests = [carried(p, q) for p, q in zip(scaffold.rest_positions, scaffold.rest_quats, strict=True)]
         signed = torch.from_numpy(path.through(continuous(torch.stack(turns).cpu().numpy()))).to(scaffold.knot_quats)
         knots = torch.from_numpy(path.through(torch.stack(moved).cpu().numpy())).to(scaffold.knots)

@@ -16,6 +16,12 @@ from recon.motion.scaffold import Scaffold
 class Motion(Protocol):
     """How Gaussians move. Immutable: changes return a new one."""
 
+    @property
+    def peak(self) -> float:
+        """By how much its curves move where one of their knots moves by 1, see :attr:`recon.motion.Path.peak`; 1 where
+        there are no curves."""
+        ...
+
     def parameters(self) -> dict[str, Tensor]:
         """The learnable tensors by name."""
         ...

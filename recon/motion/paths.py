@@ -33,8 +33,8 @@ MAX_KNOTS = 4096  # of one path: nine minutes at the default spacing; a longer s
 class Path(ABC):
     """A kind of curve on a uniform grid: `count` knots at start + i * spacing seconds (float64)."""
 
-    share: ClassVar[float] = 1.0
-    """Of its own way, by how much a knot moves the curve where it moves it most: steps of a fit are those of curves."""
+    peak: ClassVar[float] = 1.0
+    """The largest weight of a knot that is not at an end: how far the curve goes where that knot alone goes by 1."""
 
     start: float
     spacing: float
@@ -115,11 +115,16 @@ class Path(ABC):
 
     def through(self, values: np.ndarray) -> np.ndarray:
         """Knots [P,...] of the curve that has these values at the seconds of the knots."""
-        return values
+        first, w, _ = self.basis(self.times)
+        column = first[:, None] + np.arange(WINDOW)
+        bands = np.zeros((2 * WINDOW - 1, self.count))  # of the weights at the knots; row WINDOW - 1 is the diagonal
+        bands[WINDOW - 1 + np.arange(self.count)[:, None] - column, column] = w
+        flat = np.asarray(values, float).reshape(self.count, -1)
+        return solve_banded((WINDOW - 1, WINDOW - 1), bands, flat).reshape(np.shape(values))
 
-    def at_knots(self, knots: np.ndarray) -> np.ndarray:
+    def at_knots(self, knots: Tensor) -> Tensor:
         """Values [P,...] of the curve of ``knots`` at the seconds of the knots: what :meth:`through` undoes."""
-        return knots
+        return self.at(knots, torch.as_tensor(self.times, device=knots.device))
 
     def design(self, t: Float[np.ndarray, " S"]) -> Float[np.ndarray, "S P"]:
         """The weights of all knots at S times, dense."""
@@ -156,7 +161,7 @@ def _hermite_matrices() -> Float[np.ndarray, "5 4 4"]:
 
 def _bspline_matrices() -> Float[np.ndarray, "5 4 4"]:
     """As :func:`_hermite_matrices`, of the uniform cubic B-spline that goes on straight: the knot before the first lies
-    on the line through the first two, and so behind the last."""
+    on the line through the first two, and likewise beyond the last."""
     inner = np.array([[1, -3, 3, -1], [4, 0, -6, 3], [1, 3, 3, -3], [0, 0, 0, 1]]) / 6
     begin, end = np.zeros((4, 4)), np.zeros((4, 4))
     begin[:3], end[1:] = inner[1:], inner[:3]
@@ -173,62 +178,50 @@ _ONE_HOT[np.arange(4), np.arange(4), 0] = 1  # knot k of the window, whatever u
 
 
 @dataclass(frozen=True, repr=False)
-class HermiteSpline(Path):
-    """Cubic Hermite spline through its knots, C1, with tangents by finite differences (central; one-sided at the ends).
+class _Spline(Path):
+    """Cubics on the intervals between knots, and straight lines beyond the ends, with the ends' slopes: so the
+    derivative in time, by which offsets are refined, stays alive and bounded there."""
 
-    Equals scipy.interpolate.CubicHermiteSpline with those tangents. Beyond the ends it goes on in a straight line with
-    the end's tangent, so that the derivative in time, by which offsets are refined, stays alive and bounded there.
-
-    The paper's. Its error falls with the third power of the spacing only: between its knots a limb that swings is up to
-    1 % of its swing off at 1 Hz, and 9 % at 2 Hz, with knots every .133 s.
-    """
+    matrices: ClassVar[np.ndarray]
+    """[5,4,4], see :func:`_hermite_matrices`."""
 
     def _windows(self, t: np.ndarray | float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        return _intervals(self, t, _HERMITE)
+        s = (np.asarray(t, float) - self.start) / self.spacing
+        last = self.count - 1
+        # the knot where u = 0; an infinite or absurd time is continued like the end
+        i = np.clip(np.nan_to_num(np.floor(s)), -1, last).astype(np.int64)
+        kind = np.where(i < 0, 0, np.where(i == 0, 1, np.where(i < last - 1, 2, np.where(i < last, 3, 4))))
+        origin = np.maximum(i, 0)
+        return origin + _FIRST_OF_KIND[kind], self.matrices[kind], origin
 
     def step(self, seconds: float) -> float:
         return seconds
 
 
 @dataclass(frozen=True, repr=False)
-class BSpline(Path):
-    """Uniform cubic B-spline, C2, which passes near its knots; of natural ends, and beyond them a straight line.
+class HermiteSpline(_Spline):
+    """Cubic Hermite spline through its knots, C1, with tangents by finite differences (central; one-sided at the ends).
 
-    Equals scipy.interpolate.BSpline on the knots and one more at either end, on the straight line through the last two.
-    As smooth as four knots allow, its error falls with the fourth power of the spacing: of a swing of 1 Hz .2 %, of one
-    of 2 Hz 3 %, where :class:`HermiteSpline` has 1 and 9.
+    Equals scipy.interpolate.CubicHermiteSpline with those tangents.
+
+    The paper's. Its error falls with the third power of the spacing only: with knots every .133 s the nearest one (by
+    least squares) is up to 1 % of its swing off a limb that swings at 1 Hz, and 9 % at 2 Hz.
     """
 
-    share: ClassVar[float] = 2 / 3
-
-    def _windows(self, t: np.ndarray | float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        return _intervals(self, t, _BSPLINE)
-
-    def through(self, values: np.ndarray) -> np.ndarray:
-        """Solves the banded system of the knots' own weights."""
-        flat = np.asarray(values, float).reshape(self.count, -1)
-        bands = np.repeat([[1 / 6], [2 / 3], [1 / 6]], self.count, 1)
-        bands[0, 1] = bands[2, -2] = 0.0  # the ends of a natural spline are its first and last knot
-        bands[1, 0] = bands[1, -1] = 1.0
-        return solve_banded((1, 1), bands, flat).reshape(np.shape(values))
-
-    def at_knots(self, knots: np.ndarray) -> np.ndarray:
-        knots = np.asarray(knots, float)
-        return np.concatenate([knots[:1], (knots[:-2] + 4 * knots[1:-1] + knots[2:]) / 6, knots[-1:]])
-
-    def step(self, seconds: float) -> float:
-        return seconds
+    matrices: ClassVar[np.ndarray] = _HERMITE
 
 
-def _intervals(path: Path, t: np.ndarray | float, of_kind: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What :meth:`Path._windows` gives, of a spline with these matrices [5,4,4] for the five kinds of interval."""
-    s = (np.asarray(t, float) - path.start) / path.spacing
-    last = path.count - 1
-    # the knot where u = 0; an infinite or absurd time is continued like the end
-    i = np.clip(np.nan_to_num(np.floor(s)), -1, last).astype(np.int64)
-    kind = np.where(i < 0, 0, np.where(i == 0, 1, np.where(i < last - 1, 2, np.where(i < last, 3, 4))))
-    origin = np.maximum(i, 0)
-    return origin + _FIRST_OF_KIND[kind], of_kind[kind], origin
+@dataclass(frozen=True, repr=False)
+class BSpline(_Spline):
+    """Uniform cubic B-spline, C2, which passes near its knots, with natural ends.
+
+    Equals scipy.interpolate.BSpline on the knots and one more at either end, on the straight line through the last two.
+    As smooth as four knots allow, its error falls with the fourth power of the spacing: of a swing of 1 Hz .1 %, of one
+    of 2 Hz 2 %, where :class:`HermiteSpline` has 1 and 9.
+    """
+
+    peak: ClassVar[float] = 2 / 3
+    matrices: ClassVar[np.ndarray] = _BSPLINE
 
 
 @dataclass(frozen=True, repr=False)
@@ -263,7 +256,8 @@ def path_arrays(path: Path) -> dict[str, np.ndarray]:
 
 def path_from_arrays(arrays: Mapping[str, np.ndarray]) -> Path:
     """The path whose :func:`path_arrays` these are; KeyError where one is missing, ValueError where they make none."""
-    kinds = {kind.__name__: kind for kind in (BSpline, HermiteSpline, Sampled)}
+    every: tuple[type[Path], ...] = (*SPLINES.values(), Sampled)
+    kinds = {kind.__name__: kind for kind in every}
     name, (start, spacing, count) = str(arrays["path"]), numbers(arrays, "path_knots", (3,)).double().tolist()
     if name not in kinds:
         raise ValueError(f"path: expected one of {sorted(kinds)}; found {name!r}.")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -38,6 +39,10 @@ class PerGaussian:
     def __repr__(self) -> str:
         turning = "" if self.own_quats is None else ", turning"
         return f"PerGaussian({self.own_knots.shape[1]} Gaussians{turning}, {self.path}, {self.own_knots.device})"
+
+    @property
+    def peak(self) -> float:
+        return self.path.peak
 
     @classmethod
     def at_rest(cls, path: Path, count: int) -> PerGaussian:
@@ -155,6 +160,8 @@ class PerGaussian:
 @dataclass(frozen=True)
 class Static:
     """No motion: nothing is computed."""
+
+    peak: ClassVar[float] = 1.0
 
     def parameters(self) -> dict[str, Tensor]:
         return {}

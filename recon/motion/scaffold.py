@@ -26,7 +26,7 @@ class Scaffold:
     """M nodes, each a pose that moves along a path, and the Gaussians bound to them.
 
     Args:
-        path: the curve in time through the knots.
+        path: the curve in time that the knots make.
         knots [P,M,3] world units, knot_quats [P,M,4] wxyz of any length: learnable.
         edges int64 [M,K]: topological neighbours, the nearest (by D_track) first.
         edge_weights [M,K]: 0 where the neighbour is too far to be one.
@@ -89,6 +89,10 @@ class Scaffold:
     def rest_quats(self) -> Tensor:
         """Frozen orientations of the nodes at the R rests [R,M,4]."""
         return self.binding.quats
+
+    @property
+    def peak(self) -> float:
+        return self.path.peak
 
     def parameters(self) -> dict[str, Tensor]:
         return {"knots": self.knots, "knot_quats": self.knot_quats}

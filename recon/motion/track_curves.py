@@ -26,7 +26,7 @@ class TrackCurves:
     """Splines through M lifted tracks of several videos; none knows of another.
 
     Args:
-        path: the curve in world time through the knots. knots float64 [P,M,3]: world units.
+        path: the curve in world time that the knots make. knots float64 [P,M,3]: world units.
         first, last float64 [M]: world seconds between which each was seen. Beyond them it slows down to rest.
     """
 

@@ -48,7 +48,7 @@ SCENE = (
     Group("static.means", unit="footprints"),
 )
 """Of a scene. Rates are the study's metres and colours, expressed so; other static groups are in their own units. Those
-of knots say how far the curve goes, see :attr:`recon.motion.Path.share`."""
+of a motion's knots are divided by its :attr:`recon.motion.Path.peak`: a B-spline's knots go half as far again."""
 
 CLOCKS = (Group("offsets", 0.02, "frames"), Group("clock_rates"))
 """Of the videos' clocks."""

@@ -37,6 +37,7 @@ WARP = ("tests/recon/motion/test_motion_warp.py",)
 SOLVE = ("tests/recon/motion/test_motion_solve.py",)
 OBSERVE = ("tests/recon/observe",)
 PATHS = ("tests/recon/motion/test_motion_paths.py", "tests/recon/motion/test_motion_build.py")
+SLOTS = ("tests/recon/motion/test_motion_slots.py",)
 COLOURS = ("tests/recon/backdrop/test_colours.py",)
 DEPTH = ("tests/otsync/priors/test_depth_scale.py",)
 AUDIT = ("tests/otsync/recordings/test_audit.py",)
@@ -1982,23 +1983,39 @@ BREAKS = (
     Break(
         "bspline-through",
         "recon/motion/paths.py",
-        "bands[0, 1] = bands[2, -2] = 0.0",
-        "bands[0, 1] = bands[2, -2] = 0.1",
+        "bands[WINDOW - 1 + np.arange(self.count)[:, None] - column, column] = w",
+        "bands[WINDOW - 1 - np.arange(self.count)[:, None] + column, column] = w",
         PATHS,
-        "the ends of a curve through given values miss them",
+        "a curve through given values is solved by the transposed weights: its ends miss them",
     ),
     Break(
         "bspline-poses",
         "recon/motion/build.py",
-        "neighbourhood_rotations(path.at_knots(curves), neighbours",
+        "neighbourhood_rotations(path.at_knots(torch.from_numpy(curves)).numpy(), neighbours",
         "neighbourhood_rotations(curves, neighbours",
         PATHS,
         "a B-spline's knots are taken for places on its curve: what swings turns too far",
     ),
     Break(
+        "grown-poses",
+        "recon/motion/density.py",
+        "path.through(continuous(torch.stack(turns).cpu().numpy()))",
+        "continuous(torch.stack(turns).cpu().numpy())",
+        SLOTS,
+        "turns of new nodes are taken for knots: they lag behind those that they come from",
+    ),
+    Break(
+        "hull-through",
+        "recon/scene/hull.py",
+        "torch.as_tensor(path.through(followed(points, hulls, middle)), dtype",
+        "torch.as_tensor(followed(points, hulls, middle), dtype",
+        ("tests/recon/scene/test_hull.py",),
+        "ways along hulls are taken for knots: seeds do not begin where they were seen",
+    ),
+    Break(
         "steps-of-knots",
         "recon/fit/run.py",
-        "active[name] / motion.path.share",
+        "active[name] / motion.peak",
         "active[name]",
         ("tests/recon/fit/test_fit.py",),
         "a fit steps knots, not curves: B-splines lag behind what they are compared with",

@@ -26,7 +26,7 @@ from recon.fit.verb import Calibration, fit
 from recon.losses import ImageLoss
 from recon.losses.image import Mask, Photometric
 from recon.losses.motion import Velocity
-from recon.motion import BSpline, HermiteSpline, Scaffold, Static, build_scaffold
+from recon.motion import BSpline, HermiteSpline, PerGaussian, Scaffold, Static, build_scaffold
 from recon.observe.cameras import Clip, observer
 from recon.observe.effects import Gain, MotionBlur, RollingShutter, Shot
 from recon.observe.recorded import with_declared
@@ -312,18 +312,24 @@ def test_densification_splits_what_is_pulled_and_drops_what_is_faint(scene):
 
 
 @pytest.mark.parametrize("kind", [BSpline, HermiteSpline])
-def test_a_step_moves_the_curve_as_far_whatever_it_is_made_of(capture, scene, kind):
-    """A knot of a B-spline moves its curve by two thirds of its own way: it goes half as far again."""
+@pytest.mark.parametrize("apart", [False, True], ids=["scaffold", "per Gaussian"])
+def test_a_step_moves_a_curve_as_far_whatever_it_is_made_of(capture, scene, kind, apart):
+    """A lone knot of a B-spline moves its curve by two thirds of its own way: so it goes half as far again."""
     path = scene.motion.path
     path = kind(path.start, path.spacing, path.count)
-    carried = replace(scene, motion=scene.motion.on(path))
-    problem = Problem.of(carried, capture.footage, believed(capture), FitOptions())
-    run = Run(problem, {"knots": 0.01, "knot_quats": 0.001, "means": 0.01}, None, 10)
-    moved = path.design(path.times)[2, 2]
+    motion = PerGaussian.at_rest(path, len(scene)).turning() if apart else scene.motion.on(path)
+    places, turns = motion.parameters()
+    problem = Problem.of(replace(scene, motion=motion), capture.footage, believed(capture), FitOptions())
+    run = Run(problem, {places: 0.01, turns: 0.001, "means": 0.01}, None, 10)
+    before = run.groups[places].clone()
+    pushed = torch.zeros_like(before)
+    pushed[2] = 1.0  # a lone knot
+    run.adam.step({places: pushed}, 1.0)
+    moved = path.at(run.values()[places].detach() - before, float(path.times[2])).abs().amax()
     unit = scene.footprint
-    steps = {name: run.adam.rates[name] for name in ("knots", "knot_quats", "means")}
-    assert steps["knots"] * moved == pytest.approx(0.01 * unit)
-    assert steps["knot_quats"] * moved == pytest.approx(0.001) and steps["means"] == pytest.approx(0.01 * unit)
+    assert float(moved) == pytest.approx(0.01 * unit, rel=1e-3)
+    assert run.adam.rates[turns] * path.peak == pytest.approx(0.001)
+    assert run.adam.rates["means"] == pytest.approx(0.01 * unit)
 
 
 def test_a_step_follows_the_mean_of_its_images(capture, scene):

@@ -248,7 +248,8 @@ def test_a_rigid_motion_is_not_changed_by_growing(kind):
 
     rng = np.random.default_rng(0)
     scaffold = random_scaffold(gaussians=0, rests=(), dtype=torch.float64)
-    turns = Rotation.from_rotvec(0.3 * np.arange(8)[:, None] * np.array([0, 0.6, 0.8]))
+    swing = 0.8 * np.sin(1.3 * np.arange(8))  # unevenly: knots of an even turn are turned as its curve is
+    turns = Rotation.from_rotvec(swing[:, None] * np.array([0, 0.6, 0.8]))
     cloud = rng.normal(size=(40, 3))
     path = kind(0.0, 4 * FRAME, 8)
     knots = torch.from_numpy(path.through(np.stack([r.apply(cloud) for r in turns])))

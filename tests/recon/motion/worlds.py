@@ -9,7 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from otsync.types import TrackSet
-from recon.motion import Binding, HermiteSpline, Motion, Path, PerGaussian, Scaffold
+from recon.motion import Binding, BSpline, Motion, Path, PerGaussian, Scaffold
 from recon.scene.gaussians import Gaussians
 from recon.scene.gaussians4d import Gaussians4D
 
@@ -28,6 +28,7 @@ def random_scaffold(
     dtype: torch.dtype = torch.float32,
     turn: float = 0.3,
     seed: int = 0,
+    kind: type[Path] = BSpline,
 ) -> Scaffold:
     """Nodes that wander and turn at random, with Gaussians bound near them at each of `rests`; all but the first are
     bound after the nodes' knots changed, so that rests are not poses of the present curves."""
@@ -40,7 +41,7 @@ def random_scaffold(
     weights = np.exp(-(np.take_along_axis(apart, edges, 1) ** 2) / 0.5) + 1e-6
     weights[:, 3] = 0
     kn, kq = torch.from_numpy(curves).to(dtype), torch.from_numpy(quats).to(dtype)
-    path = HermiteSpline(0.0, 4 * FRAME, knots)
+    path = kind(0.0, 4 * FRAME, knots)
     scaffold = Scaffold(
         path,
         kn,

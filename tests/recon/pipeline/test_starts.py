@@ -80,6 +80,7 @@ OPTIONS = {
     "scaffold.neighbours": ScaffoldOptions(neighbours=3),
     "scaffold.spacing": ScaffoldOptions(spacing=0.05),
     "scaffold.margin": ScaffoldOptions(margin=0.5),
+    "scaffold.spline": ScaffoldOptions(spline="hermite"),
     "scaffold.robust": ScaffoldOptions(robust=0.2),
 }
 

@@ -10,7 +10,7 @@ import torch
 
 from otsync.types import Camera, Clock, Offsets
 from recon.footage.footage import Footage
-from recon.motion import HermiteSpline, Motion, PerGaussian, Sampled, Static
+from recon.motion import BSpline, HermiteSpline, Motion, PerGaussian, Sampled, Static
 from recon.result.folder import FilmedBy, SavedReconstruction
 from recon.rotations import look_at
 from recon.scene.gaussians import Gaussians
@@ -32,12 +32,18 @@ def motion_of(kind: str, points: torch.Tensor, seconds: float, nodes: int) -> Mo
         return Static()
     if kind == "own":
         g = torch.Generator().manual_seed(4)
-        path = HermiteSpline(-0.1, 4 / FPS, knots)
+        path = BSpline(-0.1, 4 / FPS, knots)
         turns = torch.tensor([1.0, 0, 0, 0]) + 0.4 * torch.randn(knots, len(points), 4, generator=g)
         return PerGaussian(path, 0.1 * torch.randn(knots, len(points), 3, generator=g), turns)
     blend = "dual-quaternion" if kind == "dual" else "linear"
     scaffold = random_scaffold(
-        nodes, knots=knots, rests=(), blend=blend, videos=2 if kind == "per video" else 0, turn=0.2
+        nodes,
+        knots=knots,
+        rests=(),
+        blend=blend,
+        videos=2 if kind == "per video" else 0,
+        turn=0.2,
+        kind=HermiteSpline if kind == "per video" else BSpline,  # the paper's, and ours
     )
     scaffold = replace(scaffold, knots=scaffold.knots + torch.as_tensor(FAR).float())
     half = len(points) // 2

@@ -42,6 +42,8 @@ def test_seeds_lie_on_what_moves_in_its_colours_and_go_with_it(capture):
     close = apart < voxel
     assert np.abs(colour[close] - capture.world.colors[nearest[close]]).mean() < 0.15
     assert isinstance(scene.motion, PerGaussian)
+    ways = scene.motion.path.at_knots(scene.motion.own_knots).norm(dim=2).amax(1)
+    assert ways.min() < 1e-6 * ways.max()  # at the moment of the seeds they are where they were seen
     for t in (0.0, 12 * STEP):
         there = cKDTree(capture.world.moving(t).means.numpy())
         gone, stood = (there.query(x)[0] for x in (scene.moving(t).means.numpy(), scene.dynamic.means.numpy()))

@@ -11,14 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from otsync.files.arrays import read_npz, write_npz
-from recon.motion import HermiteSpline, PerGaussian, Static
+from recon.motion import BSpline, HermiteSpline, PerGaussian, Static
 from recon.scene.gaussians4d import Gaussians4D, scene_arrays
 from tests.recon.motion.worlds import random_scaffold, random_scene
 
-PATH = HermiteSpline(0.0, 0.1, 8)
+PATH = BSpline(0.0, 0.1, 8)
 MOTIONS = {
     "world": random_scaffold(),
-    "videos": random_scaffold(videos=2, blend="dual-quaternion"),
+    "videos": random_scaffold(videos=2, blend="dual-quaternion", kind=HermiteSpline),
     "own": PerGaussian(PATH, torch.randn(8, 200, 3, generator=torch.Generator().manual_seed(0))),
     "turning": PerGaussian.at_rest(PATH, 200).turning().tied(torch.arange(600.0).reshape(200, 3), 0.0),
     "none": Static(),
