@@ -23,14 +23,13 @@ from .gauss_newton import GROUPS, Fit, fit_clock, neighbours, overlap_seconds, v
 from .seconds import Seconds
 from .slot import JUDGED_BY, Rate, Refiner
 
-LEAST_SIGMA = 0.013 / 30
-"""Seconds; no sigma is reported below this. With .008 frame, 63 and 92 % of the ends of 139 mid worlds (80600 to 80639
-and 80700 to 80799) lay within one and two sigmas; with this 69 and 95 %. It moves what is known best, little else."""
+LEAST_SIGMA = 0.008 / 30
+"""Seconds; no sigma is reported below this."""
 
 COMMON_ERRORS = 2.5
 """Seconds; blur²/COMMON_ERRORS joins sigma: errors that whole videos share (drifting depth, limbs, smoothing) grow with
-the square of the noise, and neither residuals nor other windows show them. It was chosen on mid, hard and brutal worlds
-of the seeds 72000 to 72039 and 75000 to 75039: 76, 68 and 71 % within one sigma."""
+the square of the noise, and neither residuals nor other windows show them. This and :data:`LEAST_SIGMA` were chosen on
+mid, hard and brutal worlds of the seeds 72000 to 72039 and 75000 to 75039: 76, 68 and 71 % within one sigma."""
 
 LONG = 180 / 30
 """Seconds of overlap from which a fitted rate may be kept: over less, one of 1 % moves the ends by less than a frame,
