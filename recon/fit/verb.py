@@ -30,7 +30,16 @@ from recon.fit.checkpoint import Checkpoint
 from recon.fit.options import FitOptions
 from recon.fit.problem import Problem, assemble, check_groups
 from recon.fit.run import Diverged, Run
-from recon.fit.uncertainty import averaged, reconciled, relative_sigma, repeated, unreached, unseen, unsettled
+from recon.fit.uncertainty import (
+    averaged,
+    reconciled,
+    relative_sigma,
+    repeated,
+    share_kept,
+    unreached,
+    unseen,
+    unsettled,
+)
 from recon.fit.undisturbed import one_thread_each
 from recon.footage.footage import Footage
 from recon.observe.effects import initial_parameters
@@ -292,13 +301,15 @@ def _witnessed(
     before = relative_sigma(start_sigma, p.reference)
     seen = run.step * p.batch
     per_video, per_frame = seen / len(p.clips), seen / len(p.keys)
-    own = unseen(before, refined - p.start, p.reference, images=per_video, epochs=per_frame)
-    # votes of frames tell less than all where the start still speaks in each of them
-    fitted = np.hypot(np.maximum(votes, own), unsettled(history, p.reference))
-    together = repeated if p.offsets.stats.get(PHOTOMETRIC) else reconciled
-    offsets, sigma, contradicted = together(p.start, before, refined, fitted, p.reference)
-    # what both have from the start is no better known for having been averaged
-    sigma = np.hypot(np.maximum(sigma, own), unreached(before, run.reach("offsets")))
+    kept = share_kept(images=per_video, epochs=per_frame)
+    own, alone = unseen(before, refined - p.start, p.reference, kept), np.hypot(votes, unsettled(history, p.reference))
+    if p.offsets.stats.get(PHOTOMETRIC):
+        offsets, sigma, contradicted = repeated(p.start, before, refined, np.hypot(alone, own), p.reference)
+    else:  # the other witness' share of a start is its own
+        witness = np.isfinite(before) & (before > 0)
+        alone = np.where(witness, alone, np.hypot(alone, own))
+        offsets, sigma, contradicted = reconciled(p.start, before, refined, alone, p.reference, kept)
+    sigma = np.hypot(sigma, unreached(before, run.reach("offsets")))
     # where nothing moves, in a video or in the reference, pictures tell nothing: the start stands
     blind = ~np.isfinite(votes)
     offsets, sigma = np.where(blind, p.start, offsets), np.where(blind, before, sigma)

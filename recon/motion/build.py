@@ -16,6 +16,7 @@ from recon.motion.nodes import Grid
 from recon.motion.paths import SPLINES, Path
 from recon.motion.scaffold import Scaffold
 from recon.motion.solve import FRAME, Coupling, Observations, Smoothness, neighbourhood_rotations, solve_curves
+from recon.motion.track_curves import WIDEST, knot_spacing
 from recon.motion.warp import BLENDS, LINEAR
 from recon.rotations import continuous, quaternions
 
@@ -33,8 +34,9 @@ class ScaffoldOptions:
         unit: spacing of the nodes; None: 7.5, or less (down to 2) where that gives fewer than `fewest` nodes, or more
             where it gives more than `most`. Give `unit` or `fewest`, not both.
         second_pick: spacing of the second pick, on full curves, as a share of `unit`.
-        spline: "b-spline", or "hermite", the paper's. spacing: of its knots in time. margin: seconds of knots beyond
-            both ends: the largest believable offset.
+        spline: "b-spline", or "hermite", the paper's. spacing: of its knots in time; None: 8/3 of a 30th of a second,
+            or less where tracks move too fast for that. margin: seconds of knots beyond both ends: the largest
+            believable offset.
         per_video: one scaffold per video, each on its own clock, as in the paper; else one in world time.
         neighbours: of a node. reach: D_track, in units, from which nodes are no neighbours.
         robust: distance at which a sample counts half, in footprints.
@@ -47,7 +49,7 @@ class ScaffoldOptions:
     fewest: int = FEWEST
     most: int = 1800
     spline: str = "b-spline"
-    spacing: float = 4 * FRAME
+    spacing: float | None = None
     margin: float = 4 * FRAME
     per_video: bool = False
     neighbours: int = 10
@@ -60,8 +62,10 @@ class ScaffoldOptions:
     def __post_init__(self) -> None:
         if self.unit is not None and not self.unit > 0:
             raise ValueError(f"unit: expected footprints > 0, or None to choose; found {self.unit}.")
-        if not (0 < self.second_pick <= 1 and self.reach > 0 and self.robust > 0 and self.spacing > 0):
-            raise ValueError("second_pick, reach, robust, spacing: expected numbers > 0, second_pick at most 1.")
+        if not (0 < self.second_pick <= 1 and self.reach > 0 and self.robust > 0):
+            raise ValueError("second_pick, reach, robust: expected numbers > 0, second_pick at most 1.")
+        if self.spacing is not None and not self.spacing > 0:
+            raise ValueError(f"spacing: expected seconds > 0, or None to choose; found {self.spacing}.")
         if self.unit is not None and self.fewest != FEWEST:
             raise ValueError("unit, fewest: expected one of them, since fewest chooses the unit; found both.")
         least = 1 if self.unit is not None else self.fewest
@@ -74,7 +78,17 @@ class ScaffoldOptions:
 
     def path(self, first: float, last: float) -> Path:
         """The curve in time for a motion from one second to another, with no values yet."""
-        return SPLINES[self.spline].of(first, last, self.spacing, self.margin)
+        return SPLINES[self.spline].of(first, last, WIDEST if self.spacing is None else self.spacing, self.margin)
+
+    def spaced(self, tracks: Sequence[TrackSet], footprint: float, rates: np.ndarray | None = None) -> ScaffoldOptions:
+        """These options with a spacing; where none is given, :func:`recon.motion.track_curves.knot_spacing` finds it.
+
+        rates: world seconds per second of each video's clock.
+        """
+        if self.spacing is not None:
+            return self
+        rates = None if self.per_video else rates  # there, knots are on each video's own clock
+        return replace(self, spacing=knot_spacing(tracks, spline=self.spline, footprint=footprint, rates=rates))
 
 
 UNIT, LEAST_UNIT, MOST_UNIT, GROWTH = 7.5, 2.0, 750.0, 1.25  # footprints; the last: the factor between two tries
@@ -104,9 +118,10 @@ def build_scaffold(
     offsets = np.asarray(offsets, float)
     if not options.per_video:
         grid = Grid.of(tracks, offsets, frame_step, rates)
+        options = options.spaced(tracks, footprint, rates)
         path = options.path(grid.times[0], grid.times[-1])
         return _assemble(path, [_nodes(grid, path, footprint, options, seed)], options)
-    clocks = picking.world_clocks(tracks, offsets, rates)
+    clocks, options = picking.world_clocks(tracks, offsets, rates), options.spaced(tracks, footprint)
     rates = np.ones(len(tracks)) if rates is None else np.asarray(rates, float)
     usable = [v for v, one in enumerate(tracks) if one.seen.any()]
     if not usable:

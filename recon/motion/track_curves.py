@@ -1,7 +1,9 @@
-"""Splines through lifted tracks, each fitted by itself: motion without a scaffold begins with them."""
+"""Splines through lifted tracks, each fitted by itself: motion without a scaffold begins with them, and how far apart
+knots may stand is read off them."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -11,13 +13,22 @@ from scipy.spatial import cKDTree
 
 from otsync.types import TrackSet
 from recon.motion.nodes import world_clocks
-from recon.motion.paths import Path
+from recon.motion.paths import SPLINES, Path
 from recon.motion.solve import FRAME, RIDGE
 
 ROUNDS = 3  # of reweighting
 STILL = (
     0.005  # weight of the knots' first differences: beyond its ends a track loses two thirds of its speed in two knots
 )
+WIDEST = 8 / 3 * FRAME  # seconds between knots, at most: docs/reconstruction.md
+FINER = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0)  # shares of it that are tried
+SAMPLES = 16  # of a piece of a track by which spacings are told apart, at least
+LONG = 6  # and at least so many of the widest spacing
+FULL = 0.8  # knots by samples of such a piece, at most: beyond, a curve follows anything
+NEEDED = 2.0  # times that what a wider spacing leaves must be more than what a finer one does
+SEEN = 0.5  # footprints, rms, below which nobody sees what a spacing leaves
+FAST = 0.1  # share of the pieces that must ask for a finer spacing
+MOST_PIECES = 4000
 NEAREST, LONGEST = 8, 3  # tracks that a point chooses among, and those of them, seen longest, that have a say
 
 
@@ -92,6 +103,67 @@ class TrackCurves:
         apart = np.linalg.norm(moved[:, :, :, None] - moved[:, :, None], axis=-1).mean(0).sum(2)
         middle = apart.argmin(1)
         return np.take_along_axis(moved, middle[None, :, None, None], 2)[:, :, 0]
+
+
+def knot_spacing(
+    tracks: Sequence[TrackSet], *, spline: str, footprint: float, rates: Float[np.ndarray, " V"] | None = None
+) -> float:
+    """Seconds between the knots of a motion: :data:`WIDEST`, or less where things move too fast for that.
+
+    Pieces of tracks are fitted by least squares with knots at several distances. What a spacing leaves unexplained is
+    judged by generalised cross-validation (Craven and Wahba 1979), which knows that more knots follow more noise. A
+    finer spacing is taken where a share of the pieces, :data:`FAST`, is left with half as much by it, and with a
+    part less that can be seen. A thing that swings in .3 s needs it; knots cannot follow what is faster than they are,
+    and the clocks of a fit then lie wherever the rest is least.
+
+    Args:
+        tracks: one set a video, on its own clock. footprint: world size of a working pixel. rates: world seconds per
+            second of each clock; default: 1.
+    """
+    rates = np.ones(len(tracks)) if rates is None else np.asarray(rates, float)
+    alike: dict[float, list[np.ndarray]] = {}
+    for one, rate in zip(tracks, rates, strict=True):
+        if len(one) and len(one.times) > 1:
+            step = float(np.median(np.diff(one.times)) * rate)
+            alike.setdefault(round(step, 6), []).append(_pieces(one.positions(), _length(step)))
+    spacings = (_spacing_of(np.concatenate(pieces), step, spline, footprint) for step, pieces in alike.items())
+    return min(spacings, default=WIDEST)
+
+
+def _length(step: float) -> int:
+    """Samples of a piece."""
+    return max(SAMPLES, math.ceil(LONG * WIDEST / step - 0.01))
+
+
+def _spacing_of(pieces: Float[np.ndarray, "m L 3"], step: float, spline: str, footprint: float) -> float:
+    found, least, length = WIDEST, None, pieces.shape[1]
+    if not len(pieces):
+        return found
+    for finer in FINER:
+        path = SPLINES[spline].of(0.0, (length - 1) * step, WIDEST / finer)
+        basis, size, _ = np.linalg.svd(path.design(step * np.arange(length)), full_matrices=False)
+        basis = basis[:, size > 1e-9 * size[0]]
+        knots = basis.shape[1]
+        if knots > FULL * length:
+            break
+        rest = pieces - basis @ (basis.T @ pieces)
+        left = np.square(rest).sum((1, 2)) / length / (1 - knots / length) ** 2
+        if least is None:
+            least = left
+        elif np.mean((least > NEEDED * left) & (least - left > (SEEN * footprint) ** 2)) >= FAST:
+            found, least = WIDEST / finer, left
+    return found
+
+
+def _pieces(xyz: Float[np.ndarray, "n T 3"], length: int) -> Float[np.ndarray, "m L 3"]:
+    """Pieces of so many samples of tracks, seen throughout, that have none in common; about their middles."""
+    seen, found = np.isfinite(xyz[..., 0]), []
+    for track, there in zip(xyz, seen, strict=True):
+        edges = np.flatnonzero(np.diff(np.r_[0, there, 0]))
+        for begin, end in zip(edges[::2], edges[1::2], strict=True):
+            found += [track[k : k + length] for k in range(begin, end - length + 1, length)]
+    pieces = np.array(found[:: max(1, math.ceil(len(found) / MOST_PIECES))], float).reshape(-1, length, 3)
+    return pieces - pieces.mean(1, keepdims=True)
 
 
 def _solved(

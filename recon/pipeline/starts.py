@@ -110,9 +110,11 @@ class OnTracks(Start):
     )
 
     def __call__(self, given: Given) -> Gaussians4D:
-        footprint, options, offsets = world_footprint(given.tracks, given.footage), given.plan.scaffold, given.offsets
+        footprint, offsets = world_footprint(given.tracks, given.footage), given.offsets
+        tracks = of_every_video(given.tracks, offsets.names)
+        options = given.plan.scaffold.spaced(tracks, footprint, offsets.rates)
         curves = TrackCurves.of(
-            of_every_video(given.tracks, offsets.names),
+            tracks,
             offsets.seconds,
             options.path(*given.span),
             robust=options.robust * footprint,

@@ -1613,6 +1613,14 @@ BREAKS = (
         "sigma forgets the step on which all frames agree",
     ),
     Break(
+        "fit-share-kept-forgotten",
+        "recon/fit/uncertainty.py",
+        "gap, undone = fitted - start, 1.0 - kept",
+        "gap, undone = fitted - start, 1.0",
+        SIGMA,
+        "tracks and pictures are averaged as if the fit had nothing of its start's error",
+    ),
+    Break(
         "fit-sigma-of-one-side",
         "recon/fit/uncertainty.py",
         "sigma = np.sqrt(variance + variance[reference])",

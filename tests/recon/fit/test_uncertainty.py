@@ -7,6 +7,8 @@ import pytest
 import torch
 
 from recon.fit.uncertainty import (
+    IMAGES,
+    MISFIT,
     averaged,
     newton_sigma,
     reconciled,
@@ -14,6 +16,7 @@ from recon.fit.uncertainty import (
     repeated,
     sandwich,
     scattered,
+    share_kept,
     unreached,
     unseen,
     unsettled,
@@ -114,7 +117,8 @@ def test_two_witnesses_that_disagree_are_covered_and_said():
         np.zeros(3), np.array([0, 0.1, 0.1]), np.array([0, 0.25, 0.8]), np.array([0, 0.02, 0.02]), 0
     )
     assert contradicted.tolist() == [False, False, True]
-    assert sigma[1] > 0.02 * 0.25 / 0.11  # wider than either of two that agree would make it
+    agreed = 0.1 * 0.02 / np.hypot(0.1, 0.02)
+    assert sigma[1] == pytest.approx(agreed * 0.25 / np.hypot(0.1, 0.02) / 2)  # of 2.45 sigmas, two are chance
     assert abs(offset[2] - 0.0) <= sigma[2] and abs(offset[2] - 0.8) <= sigma[2]
 
 
@@ -125,14 +129,27 @@ def test_a_start_without_a_sigma_is_no_witness(sigma):
     assert offset.tolist() == fitted.tolist() and found.tolist() == after.tolist() and not contradicted.any()
 
 
-def test_witnesses_cover_the_truth_as_often_as_they_say():
+@pytest.mark.parametrize("kept", [0.0, 0.3, 0.7])
+def test_witnesses_cover_the_truth_as_often_as_they_say(kept):
     rng = np.random.default_rng(0)
-    before, after = rng.uniform(0.02, 0.1, 4000), rng.uniform(0.02, 0.1, 4000)
-    start, fitted = before * rng.normal(size=4000), after * rng.normal(size=4000)
-    offset, sigma, contradicted = reconciled(start, before, fitted, after, 0)
-    inside = np.abs(offset[1:]) < sigma[1:]
-    assert 0.68 <= inside.mean() < 0.8  # discord can only widen it
+    before, after = rng.uniform(0.02, 0.1, 8000), rng.uniform(0.02, 0.1, 8000)
+    start = before * rng.normal(size=8000)
+    fitted = kept * start + after * rng.normal(size=8000)
+    offset, sigma, contradicted = reconciled(start, before, fitted, after, 0, kept)
+    inside = np.abs(offset[1:]) / sigma[1:]
+    assert 0.67 < (inside < 1).mean() < 0.73 and 0.945 < (inside < 2).mean() < 0.97  # discord can only widen it
     assert contradicted.mean() < 0.01
+    assert offset.std() < min(start.std(), fitted.std())
+
+
+def test_what_a_fit_kept_of_its_start_is_not_averaged_away():
+    """Two witnesses that share an error agree on it."""
+    start, fitted = np.array([0.0, 0.3]), np.array([0.0, 0.3])
+    before, after = np.array([0.0, 0.1]), np.array([0.0, 0.01])
+    _, sigma, contradicted = reconciled(start, before, fitted, after, 0, 0.5)
+    assert sigma[1] == pytest.approx(np.hypot(0.05, 0.01)) and not contradicted.any()
+    _, sigma, _ = reconciled(start, before, fitted, after, 0, 1.0)  # a fit that has seen nothing adds nothing
+    assert sigma[1] == pytest.approx(0.1)
 
 
 def test_what_still_moves_is_told():
@@ -173,15 +190,15 @@ def test_a_fit_that_has_seen_few_pictures_keeps_its_start_s_error():
     rms = np.sqrt((0.005**2 + 0.001**2) / 2)  # of those without a sigma: one of them has hardly moved by chance
 
     def left(images, epochs):
-        return unseen(start, moved, 0, images=images, epochs=epochs)
+        return unseen(start, moved, 0, share_kept(images=images, epochs=epochs))
 
     np.testing.assert_allclose(left(1e4, 1e3), 0.0, atol=1e-12)
     few = left(2.0, 0.1)
     assert few[0] == 0 and 0.009 / 1.2 < few[1] < 0.01
     assert few[2] == few[3] > rms  # they have gone a small part of their way: most is still to go
     assert left(200.0, 0.2)[1] > left(200.0, 3.0)[1]  # a long clip has hardly been seen
-    np.testing.assert_allclose(left(90 * np.log(2), 10.0), [0.0, 0.005, rms, rms])  # half is kept, half is done
-    assert unseen(start[:1], moved[:1], 0, images=1, epochs=1).tolist() == [0.0]
+    np.testing.assert_allclose(left(IMAGES * np.log(2), 10.0), [0.0, 0.005, rms, rms])  # half is kept, half is done
+    assert unseen(start[:1], moved[:1], 0, 0.4).tolist() == [0.0]
 
 
 def test_clocks_are_the_mean_of_the_last_steps_and_what_they_share_is_the_last_one_s():
@@ -216,7 +233,7 @@ def test_a_scene_that_shows_its_frames_badly_is_unsure_of_their_clocks():
         return newton_sigma(lambda v, k, later: pixels(later), lambda v, k: target(early), keys, 0, 2, 1 / 30)[1]
 
     assert sigma(0.02) == pytest.approx(
-        np.sqrt(2) * 2 * 0.02**2 / 0.08, rel=0.05
+        np.sqrt(2) * 2 * 0.02**2 / MISFIT, rel=0.05
     )  # two videos: a quarter is left of what they tell
     assert sigma(0.01) == pytest.approx(sigma(0.02) / 4, rel=0.05)
 

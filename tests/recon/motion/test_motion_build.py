@@ -79,7 +79,7 @@ def test_nodes_of_a_bar_that_swings_turn_with_it(spline):
 
 def test_sizes_and_shapes(scaffold, world):
     P, M = scaffold.path.count, len(scaffold)
-    assert int(np.ceil((36 + 8) / 4)) + 1 == P and 60 < M < 400
+    assert int(np.ceil((36 + 8) / (8 / 3))) + 1 == P and 60 < M < 400
     assert scaffold.knots.dtype == scaffold.knot_quats.dtype == torch.float32
     assert scaffold.edges.shape == scaffold.edge_weights.shape == (M, 10)
     assert 2 * FOOTPRINT <= scaffold.unit < 7.5 * FOOTPRINT  # small bodies: closer nodes, so that limbs have some
@@ -329,10 +329,10 @@ def test_options_are_checked(field):
 
 @pytest.mark.slow
 def test_many_long_tracks_take_seconds():
-    """6000 tracks over 150 frames: 41 knots."""
+    """6000 tracks over 150 frames: 61 knots."""
     sets, offsets = filmed(videos=10, tracks=600, frames=150, life=50)
     scaffold = build_scaffold(sets, offsets, **UNITS)
-    assert 40 <= scaffold.path.count <= 42 and 200 < len(scaffold) <= 900
+    assert 60 <= scaffold.path.count <= 62 and 200 < len(scaffold) <= 900
     truth = Bodies(500, seed=9).over(np.array([2.0, 2.7]))
     errors = followed(scaffold, Bodies(500, seed=9), np.array([2.0, 2.7]))
     assert np.median(errors[:, 1]) < 0.02 < np.median(np.linalg.norm(truth[:, 1] - truth[:, 0], axis=1))
