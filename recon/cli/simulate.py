@@ -45,6 +45,8 @@ class Simulate:
     """Seconds from the first to the last row: rolling shutter, which scene.json then declares."""
     sheen: float = 0.0
     """Strength of a lamp that what moves reflects, in 0..1: colours depend on the view."""
+    pace: float = 1.0
+    """How many times as fast as usual the bodies move; a limb swings about once a second."""
     seed: int = 0
 
     def run(self) -> int:
@@ -73,6 +75,8 @@ class Simulate:
             raise ValueError(f"--vignetting: expected a share of 0 or more, below 1; found {self.vignetting:g}.")
         if not all(0 <= size < math.inf for _, size in wanted):
             raise ValueError("--gain, --noise, --exposure, --readout, --sheen: expected numbers of 0 or more.")
+        if not 0 < self.pace < math.inf:
+            raise ValueError(f"--pace: expected a number > 0; found {self.pace:g}.")
         capture = synthetic(
             self.seed,
             cameras=self.cameras,
@@ -81,6 +85,7 @@ class Simulate:
             size=(self.width, self.height),
             offsets=self.max_offset,
             effects=tuple(effect(size) for effect, size in wanted if size),
+            pace=self.pace,
         )
         if self.layout == "sync-nerf":
             names = write_sync_nerf(capture, self.out)

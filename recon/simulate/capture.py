@@ -65,6 +65,7 @@ def synthetic(
     size: tuple[int, int] = (160, 96),
     offsets: float | Sequence[float] = 1.0,
     effects: tuple[Effect, ...] = (),
+    pace: float = 1.0,
 ) -> Capture:
     """Draw a world and film it; every seed has its own bodies, colours, cameras and offsets.
 
@@ -74,12 +75,13 @@ def synthetic(
         offsets: in frames: a bound within which they are drawn, or one for each training camera. The reference's is 0
             when drawn.
         effects: what cameras do to the images beyond noise of 1 %; one that is absent changes no bit of the rest.
+        pace: how many times as fast as usual all of it happens: a limb swings about once a second.
     """
     if cameras < 1 or held_out < 0 or frames < 1:
         raise ValueError(
             f"cameras, held_out, frames: expected at least 1, 0 and 1; found {cameras}, {held_out} and {frames}."
         )
-    world = draw_world(seed)
+    world = draw_world(seed, pace)
     shift = np.concatenate([_offsets(offsets, cameras, seed), np.zeros(held_out)]) / FPS
     times = np.arange(frames) / FPS
     lenses = [ring_camera(c, cameras, held_out, size, seed) for c in range(cameras + held_out)]

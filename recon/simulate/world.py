@@ -8,6 +8,7 @@ given everything but the offsets. Metres, seconds, z up.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -85,13 +86,15 @@ class World:
         return Gaussians.from_colors(means, upright, torch.full((n, 3), SPLAT), torch.full((n,), 0.9), colors)
 
 
-def draw_world(seed: int) -> World:
-    """Two bodies in a room; ``seed`` decides everything."""
+def draw_world(seed: int, pace: float = 1.0) -> World:
+    """Two bodies in a room; ``seed`` decides everything but the ``pace``: how many times as fast all of it happens."""
+    if not (math.isfinite(pace) and pace > 0):
+        raise ValueError(f"pace: expected a number > 0; found {pace:g}.")
     bodies = [_body(b, stream(seed, "body", b)) for b in range(2)]
     parts = Parts.join([parts for parts, _ in bodies])
 
     def pose(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        poses = [place(t) for _, place in bodies]
+        poses = [place(pace * t) for _, place in bodies]
         return np.concatenate([R for R, _ in poses]), np.concatenate([p for _, p in poses])
 
     rng = stream(seed, "surface")

@@ -1613,6 +1613,22 @@ BREAKS = (
         "sigma forgets the step on which all frames agree",
     ),
     Break(
+        "knots-of-noise",
+        "recon/motion/track_curves.py",
+        "/ length / (1 - knots / length) ** 2",
+        "/ length * (1 - knots / length) ** 2",
+        ("tests/recon/motion/test_knot_spacing.py",),
+        "knots are asked for by noise, which more of them follow",
+    ),
+    Break(
+        "knots-by-the-video-s-clock",
+        "recon/motion/track_curves.py",
+        "step = float(np.median(np.diff(one.times)) * rate)",
+        "step = float(np.median(np.diff(one.times)))",
+        ("tests/recon/motion/test_knot_spacing.py",),
+        "slow motion is taken for slow things",
+    ),
+    Break(
         "fit-share-kept-forgotten",
         "recon/fit/uncertainty.py",
         "gap, undone = fitted - start, 1.0 - kept",

@@ -577,6 +577,7 @@ def test_declared_readouts_and_given_exposures_reach_the_fit(tmp_path, monkeypat
     assert otsync(["sync", str(world), "--out", str(tmp_path / "s")]) == 2
     assert "camera.readout of 'cam0': expected seconds" in capsys.readouterr().err
     assert main(["simulate", str(tmp_path / "x"), "--noise", "nan"]) == 2
+    assert main(["simulate", str(tmp_path / "x"), "--pace", "0"]) == 2
     assert "--noise" in capsys.readouterr().err
 
 

@@ -154,6 +154,19 @@ def test_exposure_changes_colours_only(capture):
         assert ratio == pytest.approx(bright.gains[v], rel=0.01)
 
 
+def test_a_faster_world_is_the_same_one(capture):
+    """At a pace of three all of it happens in a third of the time; rooms, colours, cameras and clocks are the same."""
+    fast = synthetic(3, **SMALL, pace=3.0)
+    t = np.array([0.0, 0.1, 0.25])
+    np.testing.assert_allclose(fast.world.positions(t), capture.world.positions(3 * t), atol=1e-12)
+    np.testing.assert_allclose(fast.world.facing(0.1), capture.world.facing(0.3), atol=1e-12)
+    assert fast.offsets.tolist() == capture.offsets.tolist() and fast.gains.tolist() == capture.gains.tolist()
+    assert np.array_equal(fast.footage[1].w2c, capture.footage[1].w2c)
+    for pace in (0.0, -1.0, np.nan, np.inf):
+        with pytest.raises(ValueError, match="pace"):
+            synthetic(3, **SMALL, pace=pace)
+
+
 def test_effects_do_not_disturb_each_other(capture):
     alone = synthetic(3, **SMALL, effects=(Exposure(0.1),))
     both = synthetic(3, **SMALL, effects=(MoreNoise(0.0), Exposure(0.1)))
