@@ -877,6 +877,7 @@ def test_options_of_simulate(home):
         ["--exposure", "0.02"],
         ["--readout", "0.02"],
         ["--sheen", "0.5"],
+        ["--pace", "2"],
         ["--seed", "2"],
     ):
         assert world(*more) != base, more
@@ -963,7 +964,7 @@ def rows() -> set[str]:
         "demo": "out seed steps",
         "view": "what port stages allow_outside",
         "simulate": "out layout cameras held_out frames width height max_offset gain vignetting noise exposure readout "
-        "sheen seed",
+        "sheen pace seed",
     }
     slots = {f"run {o}" for o in options_of(SYNC["sync"]) if slotted(o)}
     shared = (
