@@ -21,7 +21,7 @@ STILL = (
     0.005  # weight of the knots' first differences: beyond its ends a track loses two thirds of its speed in two knots
 )
 WIDEST = 8 / 3 * FRAME  # seconds between knots, at most: docs/reconstruction.md
-FINER = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0)  # shares of it that are tried
+FINER = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0)  # by which it is divided, in turn
 SAMPLES = 16  # of a piece of a track by which spacings are told apart, at least
 LONG = 6  # and at least so many of the widest spacing
 FULL = 0.8  # knots by samples of such a piece, at most: beyond, a curve follows anything

@@ -90,7 +90,10 @@ class OnScaffold(Start):
             seed=given.plan.fit.seed,
         )
         count = sum(len(t) for t in tracks)
-        given.progress.tell(f"scaffold: {len(motion)} nodes of {count} tracks, footprint {footprint:.4g}")
+        given.progress.tell(
+            f"scaffold: {len(motion)} nodes of {count} tracks, a knot every {motion.path.spacing:.3f} s, "
+            f"footprint {footprint:.4g}"
+        )
         return _seeded(given, motion, footprint, to_scaffold)
 
 
