@@ -41,6 +41,11 @@ def test_what_swings_faster_does():
     assert spacing(swinging([*[0.5] * 19, 3.5])) == WIDEST  # a track that went astray is a small one
 
 
+def test_what_nobody_sees_asks_for_nothing():
+    assert spacing(swinging(3.5, amplitude=0.4, noise=0.01)) == WIDEST
+    assert spacing(swinging(3.5, amplitude=30, noise=0.01)) < WIDEST
+
+
 def test_cameras_that_see_faster_follow_faster_things():
     slow, fast = (swinging(12.0, fps=240.0, frames=480, tracks=20, amplitude=a) for a in (0.2, 30.0))
     assert spacing(slow) == WIDEST  # a fifth of a pixel
