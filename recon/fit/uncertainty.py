@@ -33,13 +33,13 @@ FRAMES = 48
 CONTRADICTION = 3.0  # sigmas between two answers, from which one of them is wrong
 STEP = 0.1  # frames between the instants of the central difference, half
 GOLDEN = (5**0.5 - 1) / 2
-MISFIT = 0.12  # s; of filmed rigs and rooms whose fits were short or poor: docs/trust.md
+MISFIT = 0.08  # s; of filmed rigs and rooms whose fits were short or poor: docs/trust.md
 STRETCHES = 4  # of a clip that a variance is taken from, at least
 AVERAGED = 0.8  # share of the steps from which on clocks are averaged: Adam's last steps still shake each of them
 BEFORE = 0.6  # and from which on those are that they are held against
 LEFT = 1.5  # of the last move that is still to go: .6 / (1 - .6)
-IMAGES = 80  # of a video, after which a fit keeps 1/e of the error that its start had: filmed rigs, docs/trust.md
-EPOCHS = 0.9  # times that it has then seen every frame; the motion, which carries the start's clocks, is local in time
+IMAGES = 90  # of a video, after which a fit keeps 1/e of the error that its start had: filmed rigs, docs/trust.md
+EPOCHS = 1.0  # times that it has then seen every frame; the motion, which carries the start's clocks, is local in time
 CHANCE = 2.0  # sigmas between two answers, up to which chance explains it
 
 
