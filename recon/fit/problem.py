@@ -14,6 +14,7 @@ from otsync.files.digest import content_key
 from otsync.types import Offsets
 from recon.fit.optimize import check_there, chosen_rates
 from recon.fit.options import FitOptions
+from recon.footage.bends import bend_curve
 from recon.footage.footage import Footage
 from recon.losses import ImageLoss, MotionLoss
 from recon.observe.cameras import Clip
@@ -27,7 +28,8 @@ class Problem:
     """All that a fit is given and does not change while it runs.
 
     Args:
-        times: [V] of (F,) seconds of every video's frames. index: [V] place of every video in ``offsets``.
+        times: [V] of (F,) seconds of every video's frames. curves: of a bend of one second there
+            (:func:`recon.footage.bends.bend_curve`). index: [V] place of every video in ``offsets``.
         losses, motion_losses, effects, batch, seed: of the options.
         keys: [K,2] (video, frame) of the images that take part. declared: what is declared of every parameter group.
     """
@@ -35,6 +37,7 @@ class Problem:
     scene: Gaussians4D
     clips: tuple[Clip, ...]
     times: tuple[Tensor, ...]
+    curves: tuple[Tensor, ...]
     offsets: Offsets
     index: np.ndarray
     losses: tuple[ImageLoss, ...]
@@ -96,6 +99,7 @@ class Problem:
             scene,
             tuple(Clip.of(f, device) for f in footage),
             tuple(torch.as_tensor(f.times, dtype=torch.float64, device=device) for f in footage),
+            tuple(torch.as_tensor(bend_curve(f.times), dtype=torch.float64, device=device) for f in footage),
             offsets,
             index,
             on_images,
@@ -160,6 +164,8 @@ class Problem:
         """Every parameter group at its start, frozen or not."""
         out = initial_parameters(self.effects, len(self.clips))
         out["offsets"] = torch.as_tensor(self.start.copy())
+        bends = np.array([clip.footage.bend for clip in self.clips])
+        out["bends"] = torch.as_tensor(bends if bends.any() else bends[:0])
         out["clock_rates"] = torch.as_tensor(self.offsets.rates[self.index].copy())
         return scene_groups(self.scene) | {name: t.to(self.device) for name, t in out.items()}
 

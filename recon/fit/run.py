@@ -17,6 +17,7 @@ from recon.fit.densify import Densify
 from recon.fit.optimize import Adam, Decay, check_rates
 from recon.fit.problem import Problem, assemble, scene_groups
 from recon.fit.uncertainty import FRAMES, newton_sigma
+from recon.fit.witnesses import Told, told_by_bends
 from recon.losses.image import Seen
 from recon.losses.motion import Draw
 from recon.observe.cameras import Clip, compose_over, feature_image, observer, observer_at_once
@@ -93,7 +94,8 @@ class Run:
 
     def world_time(self, values: Mapping[str, Tensor], video: int, frame: int) -> Tensor:
         """World seconds at which a frame was taken, differentiable in its video's clock."""
-        return values["clock_rates"][video] * self.problem.times[video][frame] + values["offsets"][video]
+        t = values["clock_rates"][video] * self.problem.times[video][frame] + values["offsets"][video]
+        return t + values["bends"][video] * self.problem.curves[video][frame] if len(values["bends"]) else t
 
     def shot(self, values: Mapping[str, Tensor], video: int, frame: int) -> Shot:
         """What is asked for of a frame: the box where something may move, at the world time that its clock gives."""
@@ -162,17 +164,21 @@ class Run:
             return compose_over(compose(observe, p.effects, values)(shot), clip.behind(box))
 
     def sigma(self, values: dict[str, Tensor], map: MapLike = map) -> np.ndarray:
-        """See :func:`recon.fit.uncertainty.newton_sigma`."""
+        """[V] seconds of each video's own clock: see :func:`recon.fit.uncertainty.newton_sigma`."""
         p = self.problem
         return newton_sigma(
             lambda v, k, later: self.look(values, v, k, later),
             lambda v, k: p.clips[v].image(k, p.clips[v].box(k)),
             p.keys,
-            p.reference,
             len(p.clips),
             self.scene.frame_step,
             map=map,
         )
+
+    def told(self, sigma: np.ndarray) -> Told | None:
+        """What the bends of the clocks tell, None where none were bent; ``sigma`` as of :meth:`sigma`."""
+        left = self.values()["bends"].detach().cpu().numpy()
+        return told_by_bends(np.array([c.footage.bend for c in self.problem.clips]), left, sigma) if len(left) else None
 
     def image_gradient(
         self, values: dict[str, Tensor], names: list[str], keys: list[tuple[int, int]], probe: bool

@@ -9,14 +9,12 @@ they show moves one way; those further apart much less: so stretches of frames, 
 sandwich estimate, White 1980). What the frames agree on beyond the answer is a bias that the fit did not follow, and is
 added. Where videos are few, the motion itself could take up much of a clock's error. All this is a lower bound, and
 another one stands beside it: a scene that shows its frames badly may do so by its clocks (:func:`by_misfit`). What a
-short fit has not settled yet is added (:func:`unsettled`), and what it could not have reached (:func:`unreached`). The
-clock that the fit began with, where it has a sigma of its own, is the other witness (:func:`reconciled`); but a short
-fit still has a share of its start's error (:func:`share_kept`), which no averaging of the two can remove.
+short fit has not settled yet is added (:func:`unsettled`), and what it could not have reached (:func:`unreached`). What
+the fit and the clocks that it began with say together is told in :mod:`recon.fit.witnesses`.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from functools import partial
 
@@ -30,7 +28,6 @@ Look = Callable[[int, int, float], Tensor]
 Target = Callable[[int, int], Tensor]
 
 FRAMES = 48
-CONTRADICTION = 3.0  # sigmas between two answers, from which one of them is wrong
 STEP = 0.1  # frames between the instants of the central difference, half
 GOLDEN = (5**0.5 - 1) / 2
 MISFIT = 0.08  # s; of filmed rigs and rooms whose fits were short or poor: docs/trust.md
@@ -38,22 +35,18 @@ STRETCHES = 4  # of a clip that a variance is taken from, at least
 AVERAGED = 0.8  # share of the steps from which on clocks are averaged: Adam's last steps still shake each of them
 BEFORE = 0.6  # and from which on those are that they are held against
 LEFT = 1.5  # of the last move that is still to go: .6 / (1 - .6)
-IMAGES = 90  # of a video, after which a fit keeps 1/e of the error that its start had: filmed rigs, docs/trust.md
-EPOCHS = 1.0  # times that it has then seen every frame; the motion, which carries the start's clocks, is local in time
-CHANCE = 2.0  # sigmas between two answers, up to which chance explains it
 
 
 def newton_sigma(
     look: Look,
     target: Target,
     keys: np.ndarray,
-    reference: int,
     n_videos: int,
     frame_step: float,
     frames: int = FRAMES,
     map: MapLike = map,
 ) -> np.ndarray:
-    """[V] standard deviations in seconds, of each offset relative to the reference's; 0 there, nan where nothing moves.
+    """[V] standard deviations in seconds of each video's clock; nan where nothing moves.
 
     Args:
         look: (video, frame, seconds) -> the image [h,w,3] that the scene gives, that much later than the frame.
@@ -72,9 +65,7 @@ def newton_sigma(
     shown = int(np.isfinite(variance).sum())
     if shown > 1:  # V videos have 2 V numbers of a point, three of which tell where it is, and none of time
         variance *= 2 * shown / (2 * shown - 3)
-    sigma = np.sqrt(variance + variance[reference])
-    sigma[reference] = 0.0
-    return sigma
+    return np.sqrt(variance)
 
 
 def scattered(count: int, most: int) -> np.ndarray:
@@ -139,96 +130,6 @@ def unreached(start_sigma: np.ndarray, reach: float) -> np.ndarray:
         reach: seconds that all steps together can move an offset.
     """
     return np.where(np.isfinite(start_sigma), np.fmax(start_sigma - reach, 0.0), 0.0)
-
-
-def share_kept(*, images: float, epochs: float) -> float:
-    """Share of its start's error that a fit still has, because it has seen too few pictures.
-
-    The scene that a fit begins with was made with the start's clocks, of each video's own tracks and depth: so each
-    video agrees with itself, however wrong its clock. Pictures undo that in time.
-
-    Args:
-        images: of a video that the fit has seen. epochs: times that it has seen every frame.
-    """
-    return math.exp(-min(images / IMAGES, epochs / EPOCHS))
-
-
-def unseen(start_sigma: np.ndarray, moved: np.ndarray, reference: int, kept: float) -> np.ndarray:
-    """[V] seconds of the start's error that a fit may still have.
-
-    Of starts without a sigma it tells by how far the fit has gone from all of them, rms: what is kept is to that as the
-    shares are.
-
-    Args:
-        start_sigma: one standard deviation of the clocks that it began with, seconds; nan or 0: no witness.
-        moved: seconds from the start to the fit's answer. kept: see :func:`share_kept`.
-    """
-    known = np.isfinite(start_sigma) & (start_sigma > 0)
-    others = ~known
-    others[reference] = False
-    gone = math.sqrt(float(np.square(moved[others]).mean())) if others.any() else 0.0
-    left = kept * np.where(known, start_sigma, gone / max(1.0 - kept, 1e-9))
-    left[reference] = 0.0
-    return left
-
-
-def relative_sigma(sigma: np.ndarray, reference: int) -> np.ndarray:
-    """[V] sigma of offsets against the reference of a fit, which need not be the one that they were measured against.
-
-    Where it is not, the reference's own error counts; errors are taken as independent.
-    """
-    relative = np.hypot(sigma, sigma[reference])
-    relative[reference] = 0.0
-    return relative
-
-
-def reconciled(
-    start: np.ndarray,
-    start_sigma: np.ndarray,
-    fitted: np.ndarray,
-    fitted_sigma: np.ndarray,
-    reference: int,
-    kept: float = 0.0,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Two witnesses of each offset, tracks and pictures: (offset, sigma, whether they contradict each other), [V] each.
-
-    The start errs by s, the fit by ``kept`` s + e. The answer is that between the two of least variance (Gauss-Markov),
-    so its sigma is ``kept`` times the start's at the least. Sigma grows by their discord (Birge's ratio) where it is
-    more than chance explains. Beyond CONTRADICTION sigmas one of them is wrong, nobody can say which, and sigma covers
-    both. A start without a sigma, or with none (0: it was declared, not measured), is no witness: the fit's answer
-    stands.
-
-    Args:
-        start, fitted: seconds relative to the reference's, whose entries are returned as they are.
-        start_sigma: one standard deviation of s, seconds. fitted_sigma: of e. kept: see :func:`share_kept`.
-    """
-    known = np.isfinite(start_sigma) & (start_sigma > 0) & np.isfinite(fitted_sigma)
-    known[reference] = False
-    before = np.where(known, start_sigma, 1.0) ** 2
-    after = np.where(known, fitted_sigma, 1.0) ** 2
-    gap, undone = fitted - start, 1.0 - kept
-    expected = undone**2 * before + after
-    discord = np.square(gap) / expected
-    contradicted = known & (discord > CONTRADICTION**2)
-    weight = np.minimum(undone * before / expected, 1.0)  # never past the fit's answer: the share is known too roughly
-    variance = (1.0 - weight * undone) ** 2 * before + weight**2 * after
-    variance *= np.maximum(1.0, discord / CHANCE**2)
-    variance = np.where(contradicted, variance + np.square(gap), variance)
-    offset = np.where(known, start + gap * weight, fitted)
-    return offset, np.where(known, np.sqrt(variance), fitted_sigma), contradicted
-
-
-def repeated(
-    start: np.ndarray, start_sigma: np.ndarray, fitted: np.ndarray, fitted_sigma: np.ndarray, reference: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """:func:`reconciled` where the start is an earlier fit's: the same pictures are no second witness.
-
-    The fit's answer stands, with the larger one of both sigmas.
-    """
-    _, _, contradicted = reconciled(start, start_sigma, fitted, fitted_sigma, reference)
-    sigma = np.fmax(start_sigma, fitted_sigma)
-    sigma[reference] = fitted_sigma[reference]
-    return fitted, np.where(contradicted, np.hypot(sigma, fitted - start), sigma), contradicted
 
 
 def sandwich(g: np.ndarray, h: np.ndarray) -> float:

@@ -30,17 +30,9 @@ from recon.fit.checkpoint import Checkpoint
 from recon.fit.options import FitOptions
 from recon.fit.problem import Problem, assemble, check_groups
 from recon.fit.run import Diverged, Run
-from recon.fit.uncertainty import (
-    averaged,
-    reconciled,
-    relative_sigma,
-    repeated,
-    share_kept,
-    unreached,
-    unseen,
-    unsettled,
-)
+from recon.fit.uncertainty import averaged, unreached, unsettled
 from recon.fit.undisturbed import one_thread_each
+from recon.fit.witnesses import Told, reconciled, relative_sigma, repeated, scaled_start, share_kept, unseen
 from recon.footage.footage import Footage
 from recon.observe.effects import initial_parameters
 from recon.scene.gaussians4d import Gaussians4D
@@ -96,7 +88,8 @@ class Reconstruction:
         offsets: the videos' clocks, refined where "offsets" had a rate; sigma from the frames' own votes, from what was
             not settled yet, and from the sigma of the clocks that the fit began with.
         parameters: of the effects, by group.
-        history: convergence. stats: steps, seconds, images, loss, psnr, gaussians.
+        history: convergence. stats: steps, seconds, images, loss, psnr, gaussians; where clocks were bent, the share of
+            the start's error that the fit still has, by what it left of the bends, and its sigma.
     """
 
     scene: Gaussians4D
@@ -259,9 +252,10 @@ def _finish(run: Run, seconds: float, map: MapLike) -> Reconstruction:
     refined = values["offsets"].cpu().numpy()
     drift = float(refined[p.reference] - p.start[p.reference])
     refined, sigma = refined - drift, p.offsets.sigma[p.index]
+    told: Told | None = None
     flags = list(p.offsets.flags)
     if "offsets" in run.adam.groups:
-        refined, sigma, raised = _witnessed(run, refined, sigma, run.sigma(values, map), history)
+        refined, sigma, raised, told = _witnessed(run, refined, sigma, run.sigma(values, map), history)
         for v, flag in raised:
             flags[p.index[v]] = in_order((*flags[p.index[v]], flag))
     clocks = torch.as_tensor(refined).to(values["offsets"])
@@ -274,36 +268,45 @@ def _finish(run: Run, seconds: float, map: MapLike) -> Reconstruction:
         rates=_put(p.offsets.rates, p.index, values["clock_rates"].cpu().numpy()),
         stats=dict(p.offsets.stats) | ({PHOTOMETRIC: 1.0} if "offsets" in run.adam.groups else {}),
     ).judged_by_sigma()
-    told = History.of(run.rows)
+    course = History.of(run.rows)
     stats = {
         "steps": float(run.step),
         "seconds": seconds,
         "images": float(run.step * p.batch),
         "gaussians": float(len(scene)),
-        "loss": float(told.loss[-1]) if len(told.loss) else math.nan,
-        "psnr": float(told.psnr[-1]) if len(told.psnr) else math.nan,
+        "loss": float(course.loss[-1]) if len(course.loss) else math.nan,
+        "psnr": float(course.psnr[-1]) if len(course.psnr) else math.nan,
         "drift_frames": drift / scene.frame_step,
     }
+    if told is not None:
+        stats |= {"start_kept": told.share, "start_kept_sigma": told.share_sigma}
     learned = {n: values[n].cpu() for n in initial_parameters(p.effects, len(p.clips))}
-    return Reconstruction(scene, offsets, learned, told, stats)
+    return Reconstruction(scene, offsets, learned, course, stats)
 
 
 def _witnessed(
     run: Run, refined: np.ndarray, start_sigma: np.ndarray, votes: np.ndarray, history: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, list[tuple[int, Status]]]:
-    """What start and pictures together say of the clocks: offsets and sigma [V], seconds, and flags by video.
+) -> tuple[np.ndarray, np.ndarray, list[tuple[int, Status]], Told | None]:
+    """What start and pictures together say of the clocks: offsets and sigma [V], seconds, flags by video, and what
+    bends told.
 
     Args:
-        refined: offsets of the fit. start_sigma: of the clocks that it began with. votes: sigma of the frames' votes.
-        history: as of :func:`recon.fit.uncertainty.averaged`.
+        refined: offsets of the fit. start_sigma: of the clocks that it began with. votes: sigma of the frames' votes,
+            of each clock by itself. history: as of :func:`recon.fit.uncertainty.averaged`.
     """
     p = run.problem
-    before = relative_sigma(start_sigma, p.reference)
+    before, gap = relative_sigma(start_sigma, p.reference), refined - p.start
+    told = run.told(votes)
     seen = run.step * p.batch
-    per_video, per_frame = seen / len(p.clips), seen / len(p.keys)
-    kept = share_kept(images=per_video, epochs=per_frame)
-    own, alone = unseen(before, refined - p.start, p.reference, kept), np.hypot(votes, unsettled(history, p.reference))
-    if p.offsets.stats.get(PHOTOMETRIC):
+    usual = share_kept(images=seen / len(p.clips), epochs=seen / len(p.keys))
+    kept, scale = (usual, 1.0) if told is None else (told.kept, told.scale)
+    votes = relative_sigma(scale * votes, p.reference)
+    alone = np.hypot(votes, unsettled(history, p.reference))
+    again = bool(p.offsets.stats.get(PHOTOMETRIC))
+    if told is not None and not again:
+        before = scaled_start(before, gap, alone, p.reference, kept)
+    own = unseen(before, gap, p.reference, kept)
+    if again:
         offsets, sigma, contradicted = repeated(p.start, before, refined, np.hypot(alone, own), p.reference)
     else:  # the other witness' share of a start is its own
         witness = np.isfinite(before) & (before > 0)
@@ -315,7 +318,7 @@ def _witnessed(
     offsets, sigma = np.where(blind, p.start, offsets), np.where(blind, before, sigma)
     raised = [(int(v), Status.CONTRADICTED) for v in np.flatnonzero(contradicted & ~blind)]
     raised += [(int(v), Status.STATIC) for v in np.flatnonzero(blind & ~np.isfinite(before))]
-    return offsets, sigma, raised
+    return offsets, sigma, raised, told
 
 
 def _offsets_by_step(run: Run, reached: np.ndarray) -> np.ndarray:

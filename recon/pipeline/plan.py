@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from otsync.types.checks import check_whole
+from otsync.types.checks import check_whole, positive
 from recon.fit.options import FitOptions
 from recon.motion import ScaffoldOptions
 from recon.observe import Effect, MotionBlur
@@ -31,6 +31,10 @@ class Plan:
     """Seconds that the shutters were open, where moving things are blurred: short for --effects
     motion-blur:exposure=S.
     """
+    bend: float = 0.2
+    """Frames, at the most, by which clocks are bent before the fit: what it leaves of that tells how much of the
+    clocks' own error it leaves. 0: none are bent, and sigma counts on what fits of such a length usually leave.
+    """
     scaffold: ScaffoldOptions = field(default_factory=ScaffoldOptions)
     """How the motion is built."""
     seeding: Seeding = field(default_factory=Seeding)
@@ -49,10 +53,13 @@ class Plan:
     def __post_init__(self) -> None:
         for name, least in (("width", 1), ("views", 1), ("backdrop_steps", 0)):
             check_whole(name, getattr(self, name), least)
+        positive("bend", self.bend, zero=True)
         if self.frames is not None and not 0 <= self.frames[0] < self.frames[1]:
             raise ValueError(f"frames: expected first < stop, from 0; found {self.frames[0]} {self.frames[1]}.")
         if self.exposure and any(isinstance(effect, MotionBlur) for effect in self.fit.effects):
             raise ValueError("exposure, effects: expected motion blur from one of them; found it in both.")
+        if "bends" in self.fit.freeze:
+            raise ValueError("freeze: expected groups without bends, which only a fit unbends; found it. Give bend 0.")
         read_by(self.fit.losses, self.features)
         if self.features is not None:
             maps_from(self.features)

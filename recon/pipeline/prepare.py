@@ -17,6 +17,7 @@ from otsync.recordings.stages import Stages
 from otsync.sync.breaks import mended
 from otsync.types import Clock, Offsets, TrackSet
 from recon.backdrop.fit import StaticFit, with_backdrop
+from recon.footage.bends import bent, bent_tracks, chosen_bends
 from recon.footage.footage import Footage
 from recon.observe.effects import Effect
 from recon.observe.recorded import check_effects
@@ -46,7 +47,7 @@ class Prepared:
     Args:
         footage: of the training videos, in the order of ``offsets``. held_out: of the others.
         clocks: of the held-out videos, where the given offsets tell.
-        offsets: of the training videos alone.
+        offsets: of the training videos alone. tracks: that the scene was made of, with the bends of its footage.
         initial: scene before any refinement. gains: (V,3) factors from its colours to each video's. falloff: of the
             vignetting that the static part shows; None without one.
         frame: name of the world frame. left_out: videos that have no offset.
@@ -86,6 +87,15 @@ def check_vignetting(effects: Sequence[Effect], static: StaticFit | None, progre
             f"backdrop: expected one fitted with the vignetting of the plan, {tuple(given)}; found "
             f"{tuple(static.falloff)}. Fit it with falloff={tuple(given)}, or leave vignetting out of the effects."
         )
+
+
+def bends_of(plan: Plan, offsets: Offsets, progress: Progress) -> np.ndarray:
+    """[V] seconds by which each video's clock is bent: see :mod:`recon.footage.bends`. None where clocks stay."""
+    sigma = offsets.sigma if "offsets" in plan.fit.active_rates() else np.zeros(len(offsets.names))
+    bends = chosen_bends(sigma, 1.0 / float(offsets.fps[offsets.reference]), plan.bend, plan.fit.seed)
+    if plan.bend not in (0.0, Plan.bend) and not bends.any():
+        progress.note(f"bend: of {plan.bend:g} frames is unused: clocks are frozen, or have no sigma to begin with")
+    return bends
 
 
 def prepare(
@@ -141,6 +151,8 @@ def prepare(
             f"backdrop: expected gains of shape ({len(train.videos)},3), of the videos to fit in their order "
             f"({', '.join(train.names)}); found {backdrop.gains.shape}. Keep the gains of those videos alone."
         )
+    upright, bends = train, bends_of(plan, offsets, progress)
+    train = replace(train, videos=tuple(bent(v, float(b)) for v, b in zip(train.videos, bends, strict=True)))
     if not start.reads_geometry:
         train, tracks = replace(train, videos=tuple(replace(v, depth=None) for v in train.videos)), ()
     elif tracks is None:
@@ -156,7 +168,11 @@ def prepare(
                 train = replace(train, videos=tuple(replace(v, depth=None) for v in train.videos))
     else:
         own = [at_frame_times(t) for t in tracks_of(train, tracks, held_out, progress.note)]
-        tracks = tuple(mended(t, offsets.breaks[offsets.names.index(t.name)]) for t in own)
+        of = [offsets.names.index(t.name) for t in own]
+        tracks = tuple(
+            bent_tracks(mended(t, offsets.breaks[v]), upright.videos[v], float(bends[v]))
+            for v, t in zip(of, own, strict=True)
+        )
     with progress.stage("footage"):
         footage = read_footage(train, plan.width, cache, map, progress, stages)
         held = () if others is None else read_footage(others, plan.width, cache, map, progress, stages)
@@ -185,5 +201,8 @@ def prepare(
     if wanted:
         footage = with_readings(wanted, train, footage, tracks, initial, offsets, plan.width, maps)
     falloff = None if static is None else static.falloff
+    footage = tuple(
+        replace(f, times=video.times, bend=float(b)) for f, video, b in zip(footage, upright.videos, bends, strict=True)
+    )
     left_out = tuple(n for n in scene.names if n not in train.names and n not in held_out)
     return Prepared(footage, held, clocks, offsets, tuple(tracks), initial, gains, scene.frame, left_out, falloff)

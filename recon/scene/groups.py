@@ -50,8 +50,8 @@ SCENE = (
 """Of a scene. Rates are the study's metres and colours, expressed so; other static groups are in their own units. Those
 of a motion's knots are divided by its :attr:`recon.motion.Path.peak`: a B-spline's knots go half as far again."""
 
-CLOCKS = (Group("offsets", 0.02, "frames"), Group("clock_rates"))
-"""Of the videos' clocks."""
+CLOCKS = (Group("offsets", 0.02, "frames"), Group("bends", 0.02, "frames"), Group("clock_rates"))
+"""Of the videos' clocks; ``bends`` are there where the scene was made with bent ones (:mod:`recon.footage.bends`)."""
 
 
 def by_name(groups: Iterable[Group]) -> dict[str, Group]:

@@ -1630,7 +1630,7 @@ BREAKS = (
     ),
     Break(
         "fit-share-kept-forgotten",
-        "recon/fit/uncertainty.py",
+        "recon/fit/witnesses.py",
         "gap, undone = fitted - start, 1.0 - kept",
         "gap, undone = fitted - start, 1.0",
         SIGMA,
@@ -1638,9 +1638,9 @@ BREAKS = (
     ),
     Break(
         "fit-sigma-of-one-side",
-        "recon/fit/uncertainty.py",
-        "sigma = np.sqrt(variance + variance[reference])",
-        "sigma = np.sqrt(variance)",
+        "recon/fit/witnesses.py",
+        "relative = np.hypot(sigma, sigma[reference])",
+        "relative = np.array(sigma)",
         SIGMA,
         "sigma relative to the reference forgets the reference's own",
     ),
