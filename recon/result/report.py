@@ -84,7 +84,8 @@ def write_reconstruction_report(
         _offset_rows(reconstruction, coarse, truth),
         "<p class=s>Frames are those of the reference. A positive offset means that the video's clock started later: "
         "t<sub>world</sub> = rate · t<sub>video</sub> + offset. ± is one standard deviation; after the fit, of what "
-        f"tracks and pictures say together: it grows where the two disagree. {TRUSTED}{told_truth(truth)}</p>",
+        f"tracks and pictures say together: it grows where the two disagree. {_left(reconstruction)} {TRUSTED}"
+        f"{told_truth(truth)}</p>",
         late_starts(offsets, own) if filmed else "",
         remedies(offsets),
         "<h2>What accuracy cost</h2>",
@@ -123,6 +124,18 @@ def _size(reconstruction: Reconstruction) -> str:
     moving, static = len(reconstruction.scene), reconstruction.scene.static
     still = "" if static is None else f" and {len(static):,} that stand still"
     return f"The scene has {moving:,} moving Gaussians{still}."
+
+
+def _left(reconstruction: Reconstruction) -> str:
+    """What the fit left of a known error of its clocks, in words; nothing where none was put in."""
+    share = reconstruction.stats.get("start_kept")
+    if share is None:
+        return ""
+    sigma = reconstruction.stats["start_kept_sigma"]
+    return (
+        f"Before the fit, clocks were bent on purpose: it left {share:.0%} (± {sigma:.0%}) of that. So much of the "
+        "error that the clocks began with is left as well, and sigma counts it."
+    )
 
 
 def _worth(views: Sequence[ViewScore]) -> str:

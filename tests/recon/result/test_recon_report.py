@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -146,3 +147,12 @@ def test_a_fit_of_no_steps_and_without_views_has_a_page_too(coarse, tmp_path):
     write_reconstruction_report(tmp_path / "r.html", found, coarse, ["a", "b", "<c>"], [])
     page = (tmp_path / "r.html").read_text()
     assert "No camera was held out" in page and "No view was scored" in page
+
+
+def test_the_page_says_what_a_fit_left_of_bends(coarse, tmp_path):
+    found = reconstruction(coarse)
+    write_reconstruction_report(tmp_path / "r.html", found, coarse, ["a", "b", "<c>"], [])
+    assert "bent on purpose" not in (tmp_path / "r.html").read_text()
+    found = replace(found, stats=found.stats | {"start_kept": 0.12, "start_kept_sigma": 0.09})
+    write_reconstruction_report(tmp_path / "r.html", found, coarse, ["a", "b", "<c>"], [])
+    assert "it left 12% (± 9%) of that" in (tmp_path / "r.html").read_text()
