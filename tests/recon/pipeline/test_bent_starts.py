@@ -13,6 +13,7 @@ from otsync.progress import Progress
 from otsync.types import Offsets
 from recon.fit.options import FitOptions
 from recon.fit.verb import fit
+from recon.fit.witnesses import Told
 from recon.footage.bends import bend_curve, bent, bent_tracks
 from recon.pipeline.plan import Plan
 from recon.pipeline.prepare import bends_of, prepare
@@ -68,6 +69,18 @@ def test_a_fit_unbends_clocks_and_tells_what_it_left(world, unsure):
     assert moved.stats["start_kept"] < 0.8 and moved.stats["start_kept_sigma"] > 0
     straight = [replace(f, bend=0.0) for f in ready.footage]
     assert "start_kept" not in fit(ready.initial, straight, ready.offsets, steps=0).stats
+
+
+def test_a_fit_that_left_all_of_its_bends_says_nothing(world, unsure, monkeypatch):
+    """However far it moved the clocks, and however well its frames agree: the start stands."""
+    ready = prepare(open_scene(world), unsure, capture().tracks, plan=PLAN, held_out=("held0",), cache=Cache())
+    steps, started = 60, ready.offsets
+    said = fit(ready.initial, ready.footage, started, steps=steps).offsets
+    monkeypatch.setattr("recon.fit.run.Run.told", lambda self, sigma: Told(1.0, 0.0, 1.0))
+    deaf = fit(ready.initial, ready.footage, started, steps=steps).offsets
+    assert np.abs(said.seconds - started.seconds).max() > 1e-4
+    np.testing.assert_allclose(deaf.seconds, started.seconds, atol=1e-9)
+    assert (deaf.sigma >= 0.999 * started.sigma).all()
 
 
 def test_clocks_that_a_fit_does_not_move_are_not_bent(unsure):
