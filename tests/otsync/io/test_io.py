@@ -250,6 +250,8 @@ def test_a_phones_video_is_read_as_it_is_stored(tmp_path, turned):
     with av.open(str(tmp_path / "v.mp4"), "w") as out:
         stream = out.add_stream("libx264", rate=30, options={"crf": "1", "bf": "2", "g": "12"})
         stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        if not hasattr(stream, "set_display_rotation"):
+            pytest.skip("this PyAV reads a rotation, but writes none")
         stream.set_display_rotation(-turned)
         sound = out.add_stream("aac", rate=48000, layout="mono")
         for k in range(20):

@@ -109,7 +109,10 @@ def files(tmp_path):
 
 def R(order, *degrees):
     """Intrinsic rotations in the order of the letters."""
-    return Rotation.from_euler(order.upper(), degrees, degrees=True).as_matrix()
+    angles = (
+        degrees if len(degrees) > 1 else degrees[0]
+    )  # of a single letter, scipy 1.16 takes a list for many rotations
+    return Rotation.from_euler(order.upper(), angles, degrees=True).as_matrix()
 
 
 def test_bvh_by_hand(files):
