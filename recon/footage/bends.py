@@ -4,7 +4,7 @@ The scene that a fit begins with was made with the start's clocks, of each video
 agrees with itself, however wrong its clock, and a short fit keeps a share of that error; nothing in its answer tells
 which. So the scene is made with every clock bent as well, by a curve that no offset and no rate can take up, and the
 fit unbends it: what it leaves of the known error it leaves of the unknown one, too
-(:func:`recon.fit.uncertainty.told_by_bends`). Other fields call that signal injection.
+(:func:`recon.fit.witnesses.told_by_bends`). Other fields call that signal injection.
 """
 
 from __future__ import annotations

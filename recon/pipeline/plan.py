@@ -59,7 +59,9 @@ class Plan:
         if self.exposure and any(isinstance(effect, MotionBlur) for effect in self.fit.effects):
             raise ValueError("exposure, effects: expected motion blur from one of them; found it in both.")
         if "bends" in self.fit.freeze:
-            raise ValueError("freeze: expected groups without bends, which only a fit unbends; found it. Give bend 0.")
+            raise ValueError(
+                "freeze: expected no bends, which only a fit takes out again; found bends. Give bend 0 to go without."
+            )
         read_by(self.fit.losses, self.features)
         if self.features is not None:
             maps_from(self.features)

@@ -94,7 +94,7 @@ def test_clocks_that_a_fit_does_not_move_are_not_bent(unsure):
 
 
 def test_bends_that_nothing_unbends_are_refused():
-    with pytest.raises(ValueError, match=r"freeze: .* Give bend 0"):
+    with pytest.raises(ValueError, match=r"freeze: .* Give bend 0 to go without"):
         replace(PLAN, fit=FitOptions(freeze=("bends",)))
     with pytest.raises(ValueError, match="bend: expected a number >= 0"):
         replace(PLAN, bend=-0.1)
