@@ -14,7 +14,6 @@ from otsync.files.digest import content_key
 from otsync.types import Offsets
 from recon.fit.optimize import check_there, chosen_rates
 from recon.fit.options import FitOptions
-from recon.footage.bends import bend_curve
 from recon.footage.footage import Footage
 from recon.losses import ImageLoss, MotionLoss
 from recon.observe.cameras import Clip
@@ -28,8 +27,8 @@ class Problem:
     """All that a fit is given and does not change while it runs.
 
     Args:
-        times: [V] of (F,) seconds of every video's frames. curves: of a bend of one second there
-            (:func:`recon.footage.bends.bend_curve`). index: [V] place of every video in ``offsets``.
+        times: [V] of (F,) seconds of every video's frames. waves: of a bend of one second there
+            (:mod:`recon.footage.bends`). index: [V] place of every video in ``offsets``.
         losses, motion_losses, effects, batch, seed: of the options.
         keys: [K,2] (video, frame) of the images that take part. declared: what is declared of every parameter group.
     """
@@ -37,7 +36,7 @@ class Problem:
     scene: Gaussians4D
     clips: tuple[Clip, ...]
     times: tuple[Tensor, ...]
-    curves: tuple[Tensor, ...]
+    waves: tuple[Tensor, ...]
     offsets: Offsets
     index: np.ndarray
     losses: tuple[ImageLoss, ...]
@@ -99,7 +98,10 @@ class Problem:
             scene,
             tuple(Clip.of(f, device) for f in footage),
             tuple(torch.as_tensor(f.times, dtype=torch.float64, device=device) for f in footage),
-            tuple(torch.as_tensor(bend_curve(f.times), dtype=torch.float64, device=device) for f in footage),
+            tuple(
+                torch.as_tensor(np.zeros(len(f)) if f.wave is None else f.wave, dtype=torch.float64, device=device)
+                for f in footage
+            ),
             offsets,
             index,
             on_images,

@@ -95,7 +95,7 @@ class Run:
     def world_time(self, values: Mapping[str, Tensor], video: int, frame: int) -> Tensor:
         """World seconds at which a frame was taken, differentiable in its video's clock."""
         t = values["clock_rates"][video] * self.problem.times[video][frame] + values["offsets"][video]
-        return t + values["bends"][video] * self.problem.curves[video][frame] if len(values["bends"]) else t
+        return t + values["bends"][video] * self.problem.waves[video][frame] if len(values["bends"]) else t
 
     def shot(self, values: Mapping[str, Tensor], video: int, frame: int) -> Shot:
         """What is asked for of a frame: the box where something may move, at the world time that its clock gives."""

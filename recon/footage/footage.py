@@ -52,7 +52,8 @@ class Footage:
         depth: z in world units [h,w] by frame, 0 where unknown; for a depth loss.
         tracks: :class:`recon.losses.Sightings` by frame; for a track loss.
         features: extracted features [h,w,C] by frame; for a feature loss.
-        bend: seconds by which the scene that a fit begins with had this clock bent (:mod:`recon.footage.bends`).
+        bend: seconds by which the scene that a fit begins with had this clock bent, along the wave: of one second, at
+            every frame (:mod:`recon.footage.bends`).
     """
 
     name: str
@@ -70,6 +71,7 @@ class Footage:
     tracks: Mapping[int, Any] | None = None
     features: Mapping[int, np.ndarray] | None = None
     bend: float = 0.0
+    wave: Float[np.ndarray, " T"] | None = None
 
     def __len__(self) -> int:
         """Number of frames."""

@@ -17,7 +17,7 @@ from otsync.recordings.stages import Stages
 from otsync.sync.breaks import mended
 from otsync.types import Clock, Offsets, TrackSet
 from recon.backdrop.fit import StaticFit, with_backdrop
-from recon.footage.bends import bent, bent_tracks, chosen_bends
+from recon.footage.bends import bent, bent_tracks, chosen_bends, motion_of, wave
 from recon.footage.footage import Footage
 from recon.observe.effects import Effect
 from recon.observe.recorded import check_effects
@@ -151,8 +151,14 @@ def prepare(
             f"backdrop: expected gains of shape ({len(train.videos)},3), of the videos to fit in their order "
             f"({', '.join(train.names)}); found {backdrop.gains.shape}. Keep the gains of those videos alone."
         )
-    upright, bends = train, bends_of(plan, offsets, progress)
-    train = replace(train, videos=tuple(bent(v, float(b)) for v, b in zip(train.videos, bends, strict=True)))
+    with progress.stage("footage"):
+        upright = read_footage(train, plan.width, cache, map, progress, stages)
+        held = () if others is None else read_footage(others, plan.width, cache, map, progress, stages)
+    filmed, bends = train, bends_of(plan, offsets, progress)
+    waves = [wave(motion_of(f)) if bends.any() else np.zeros(len(f)) for f in upright]
+    crooked = [bent(v, float(b), w) for v, b, w in zip(filmed.videos, bends, waves, strict=True)]
+    train, bends = replace(train, videos=tuple(v for v, _ in crooked)), np.array([b for _, b in crooked])
+    footage = tuple(replace(f, times=v.times) for f, (v, _) in zip(upright, crooked, strict=True))
     if not start.reads_geometry:
         train, tracks = replace(train, videos=tuple(replace(v, depth=None) for v in train.videos)), ()
     elif tracks is None:
@@ -170,12 +176,9 @@ def prepare(
         own = [at_frame_times(t) for t in tracks_of(train, tracks, held_out, progress.note)]
         of = [offsets.names.index(t.name) for t in own]
         tracks = tuple(
-            bent_tracks(mended(t, offsets.breaks[v]), upright.videos[v], float(bends[v]))
+            bent_tracks(mended(t, offsets.breaks[v]), filmed.videos[v], float(bends[v]), waves[v])
             for v, t in zip(of, own, strict=True)
         )
-    with progress.stage("footage"):
-        footage = read_footage(train, plan.width, cache, map, progress, stages)
-        held = () if others is None else read_footage(others, plan.width, cache, map, progress, stages)
     if not any((f.boxes[:, 2] > f.boxes[:, 0]).any() for f in footage):
         raise ValueError("scene: expected something that moves; the masks are empty in every frame of every video.")
     with progress.stage("backdrop"):
@@ -202,7 +205,8 @@ def prepare(
         footage = with_readings(wanted, train, footage, tracks, initial, offsets, plan.width, maps)
     falloff = None if static is None else static.falloff
     footage = tuple(
-        replace(f, times=video.times, bend=float(b)) for f, video, b in zip(footage, upright.videos, bends, strict=True)
+        replace(f, times=u.times, bend=float(b), wave=w) if b else replace(f, times=u.times)
+        for f, u, b, w in zip(footage, upright, bends, waves, strict=True)
     )
     left_out = tuple(n for n in scene.names if n not in train.names and n not in held_out)
     return Prepared(footage, held, clocks, offsets, tuple(tracks), initial, gains, scene.frame, left_out, falloff)

@@ -1631,7 +1631,7 @@ BREAKS = (
     Break(
         "fit-leaves-bends",
         "recon/fit/run.py",
-        'return t + values["bends"][video] * self.problem.curves[video][frame] if len(values["bends"]) else t',
+        'return t + values["bends"][video] * self.problem.waves[video][frame] if len(values["bends"]) else t',
         "return t",
         ("tests/recon/pipeline/test_bent_starts.py",),
         "what a scene was bent by is no part of its clocks, so that no fit unbends it",

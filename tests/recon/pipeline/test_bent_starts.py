@@ -14,10 +14,13 @@ from otsync.types import Offsets
 from recon.fit.options import FitOptions
 from recon.fit.verb import fit
 from recon.fit.witnesses import Told
-from recon.footage.bends import bend_curve, bent, bent_tracks
+from recon.footage.bends import bent, bent_tracks
 from recon.pipeline.plan import Plan
 from recon.pipeline.prepare import bends_of, prepare
 from recon.scene.gaussians4d import scene_arrays
+from recon.simulate.capture import synthetic
+from recon.simulate.recording import write_capture
+from recon.simulate.world import World
 from tests.recon.worlds import SIZE, capture, write_world
 
 PLAN = Plan(SIZE[0], backdrop_steps=3)
@@ -42,11 +45,11 @@ def test_a_scene_with_bends_is_that_of_bent_videos(world, unsure, given: bool):
     ready = prepare(scene, unsure, tracks, plan=PLAN, held_out=("held0",), cache=cache)
     bends = [f.bend for f in ready.footage]
     assert np.allclose(np.abs(bends), 0.2 / 30) and min(bends) < 0 < max(bends)
-    by_name = {f.name: f.bend for f in ready.footage}
-    videos = tuple(bent(v, by_name.get(v.name, 0.0)) for v in scene.videos)
+    by_name = {f.name: (f.bend, f.wave) for f in ready.footage}
+    videos = tuple(bent(v, *by_name[v.name])[0] if v.name in by_name else v for v in scene.videos)
     if tracks is not None:
         known = {v.name: v for v in scene.videos}
-        tracks = tuple(bent_tracks(t, known[t.name], by_name.get(t.name, 0.0)) for t in tracks)
+        tracks = tuple(bent_tracks(t, known[t.name], *by_name[t.name]) if t.name in by_name else t for t in tracks)
     plan = replace(PLAN, bend=0.0)
     crooked = prepare(replace(scene, videos=videos), unsure, tracks, plan=plan, held_out=("held0",), cache=cache)
     one, other = scene_arrays(ready.initial), scene_arrays(crooked.initial)
@@ -55,7 +58,7 @@ def test_a_scene_with_bends_is_that_of_bent_videos(world, unsure, given: bool):
         np.testing.assert_array_equal(one[name], other[name], err_msg=name)
     for f, g in zip(ready.footage, crooked.footage, strict=True):
         np.testing.assert_array_equal(f.times, scene.videos[scene.names.index(f.name)].times)
-        np.testing.assert_allclose(g.times, f.times + f.bend * bend_curve(f.times))
+        np.testing.assert_allclose(g.times, f.times + f.bend * f.wave)
         assert g.bend == 0
 
 
@@ -98,3 +101,26 @@ def test_bends_that_nothing_unbends_are_refused():
         replace(PLAN, fit=FitOptions(freeze=("bends",)))
     with pytest.raises(ValueError, match="bend: expected a number >= 0"):
         replace(PLAN, bend=-0.1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [331, 333])
+def test_a_bend_is_no_offset_where_things_move_for_a_while_alone(seed, tmp_path, monkeypatch):
+    """Half a second of motion amid standstill: a wave by the video's clock moved offsets by .35 frame there."""
+    with monkeypatch.context() as patch:
+        for name in ("positions", "facing"):
+            usual = getattr(World, name)
+            patch.setattr(World, name, lambda self, t, usual=usual: usual(self, 2 * np.clip(t, 0.56, 1.04)))
+        filmed = synthetic(seed, frames=48, held_out=0)
+        write_capture(filmed, tmp_path / "world")
+    truth = Offsets.load(tmp_path / "world" / "truth.json")
+    error = np.random.default_rng(seed).normal(size=len(truth.names)) * 0.2 / 30
+    others = np.arange(len(truth.names)) != truth.reference
+    sigma = np.where(others, 0.2 * np.sqrt(2) / 30, 0.0)
+    start = replace(truth, seconds=truth.seconds + error - error[truth.reference], sigma=sigma)
+    plan = Plan(160, backdrop_steps=200)
+    ready = prepare(open_scene(tmp_path / "world"), start, filmed.tracks, plan=plan, cache=Cache())
+    found = fit(ready.initial, ready.footage, ready.offsets, steps=400).offsets
+    off = np.abs(found.seconds - truth.seconds)[others] * 30
+    print(f"seed {seed}: off {np.round(off, 3)}, sigma {np.round(found.sigma[others] * 30, 3)} frames")
+    assert (off < 0.12).all() and (off < 3 * found.sigma[others] * 30).all()
