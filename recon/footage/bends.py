@@ -41,6 +41,7 @@ def motion_of(footage: Footage) -> Float[np.ndarray, " T"]:
         if footage.masks is not None:
             change = change * ((footage.masks[k] > FOREGROUND) | (footage.masks[k + 1] > FOREGROUND))
         between[k] = change.sum()
+    footage.release()
     around = np.convolve(between, [0.5, 0.5])  # of a frame, those on either side
     return np.clip(around / max(float(around.mean()), 1e-9), LEAST, MOST) if around.any() else np.ones(len(footage))
 
