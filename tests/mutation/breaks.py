@@ -158,8 +158,8 @@ BREAKS = (
     Break(
         "lags-noise-counts",
         "otsync/sync/lags.py",
-        "between = weight * (late.sum(1) ** 2 - (late**2).sum(1))",
-        "between = weight * late.sum(1) ** 2",
+        "square = late.sum(1) ** 2 - (late**2).sum(1)",
+        "square = late.sum(1) ** 2",
         LAGS,
         "what a pair of tracks says in one second vouches for itself: noise passes for delays",
     ),
@@ -1270,10 +1270,18 @@ BREAKS = (
     Break(
         "refine-common-pieces",
         "otsync/refine/common_error.py",
-        "return sums.variance() * parts.share",
-        "return sums.variance()",
+        "sums.variance_of_motion()) * parts.share",
+        "sums.variance_of_motion())",
         REFINE,
         "a part of a long clip is taken for all of it",
+    ),
+    Break(
+        "refine-common-size-alone",
+        "otsync/refine/common_error.py",
+        "self.speeds * (self.speeds / largest)",
+        "self.speeds",
+        REFINE,
+        "errors that change as the motion does are taken for noise that changes at once",
     ),
     Break(
         "refine-common-dropped",

@@ -36,12 +36,17 @@ def draw(rng, *, of_all=0.0, of_group=0.0, own=0.0):
 def test_common_errors_are_as_large_as_said(kind):
     """Errors of the offset over many worlds against the claim, before anything has been fitted."""
     rng = np.random.default_rng(1)
-    wrong, said = [], []
+    wrong, said, alike = [], [], []
     for _ in range(150):
         r, v, group = draw(rng, **{kind: 0.3}, own=0.1)
         wrong.append((r * v).sum() / (v * v).sum())
-        said.append(Sums.of(r, v, np.ones(r.shape[:2]), group, 40).variance())
+        sums = Sums.of(r, v, np.ones(r.shape[:2]), group, 40)
+        said.append(sums.variance())
+        alike.append(sums.variance_of_motion())
     assert np.sqrt(np.mean(np.square(wrong)) / np.mean(said)) == pytest.approx(1, abs=0.25)
+    # here errors change as the motion does; of one short clip their size is the surer part
+    assert np.sqrt(np.mean(np.square(wrong)) / np.mean(alike)) == pytest.approx(1, abs=0.25)
+    assert np.std(alike) / np.mean(alike) < np.std(said) / np.mean(said)
 
 
 def test_errors_of_single_tracks_are_left_to_the_jackknife():
@@ -50,8 +55,9 @@ def test_errors_of_single_tracks_are_left_to_the_jackknife():
     for _ in range(60):
         for found, errors in ((alone, {"own": 0.3}), (common, {"of_all": 0.3})):
             r, v, group = draw(rng, **errors)
-            found.append(Sums.of(r, v, np.ones(r.shape[:2]), group, 40).variance())
-    assert np.sqrt(np.mean(alone) / np.mean(common)) < 0.2
+            sums = Sums.of(r, v, np.ones(r.shape[:2]), group, 40)
+            found.append((sums.variance(), sums.variance_of_motion()))
+    assert np.all(np.sqrt(np.mean(alone, 0) / np.mean(common, 0)) < 0.2)
 
 
 def curves(rng, frames=FRAMES, error=0.05, shift=0.0):

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from otsync import synchronize
 from otsync.bench.trust.worlds import plain
 from otsync.simulate import simulate
-from otsync.simulate.effects import Gaps, In, Lag, PositionNoise
+from otsync.simulate.effects import Gaps, In, Lag, PositionNoise, Repeats
 from otsync.sync.lags import lag_of
 from otsync.types import Status, TrackSet
 from tests.otsync.epipolar.test_epipolar import moving_poses
@@ -51,7 +51,7 @@ def test_no_lag_changes_nothing():
 @pytest.mark.parametrize("noise", [(), (PositionNoise(0.01), Gaps(0.2))], ids=["clean", "noisy"])
 @pytest.mark.parametrize("seed", range(3))
 def test_delays_are_told_from_none(noise, seed):
-    assert lag_of(film(*noise, seed=seed)).told < 0.5 / FPS
+    assert lag_of(film(*noise, seed=seed)).told < 0.3 / FPS
     found = lag_of(film(LATE, *noise, seed=seed))
     assert found.told > 0.6 / FPS and found.sigma > 0.5 / FPS
 
@@ -61,7 +61,7 @@ def flat(tracks: TrackSet) -> TrackSet:
 
 
 def test_pixels_tell_as_well_as_positions():
-    assert lag_of(flat(film())).told < 0.5 / FPS
+    assert lag_of(flat(film())).told < 0.3 / FPS
     # the pixels of a simulated track follow its positions
     assert lag_of(flat(film(LATE))).told > 0.6 / FPS
 
@@ -72,7 +72,7 @@ def test_a_hand_that_sways_neither_looks_late_nor_hides_what_is(seed):
         camera = replace(tracks.camera, w2c=moving_poses(tracks.camera, tracks.times))
         return replace(flat(tracks), uv=camera.project(tracks.positions()), camera=camera)
 
-    assert lag_of(held(film(seed=seed))).told < 0.5 / FPS
+    assert lag_of(held(film(seed=seed))).told < 0.3 / FPS
     assert lag_of(held(film(LATE, seed=seed))).told > 0.6 / FPS
 
 
@@ -130,6 +130,14 @@ def test_under_noise_in_which_neighbours_hardly_move_together_lag_is_told(seed):
     late = plain(seed, preset="hard", first=(In(1, LATE),))
     assert Status.LAGGING in synchronize(late.tracks).flags[1]
     assert Status.LAGGING not in synchronize(plain(seed, preset="hard").tracks).flags[1]
+
+
+@pytest.mark.parametrize("seed", [233, *range(83000, 83012)])
+def test_two_seconds_of_juggled_balls_whose_tracks_lag_are_never_trusted_and_wrong(seed):
+    """A search found 233: trusted at sigma .24 and 1.8 frames off. Few long delays hid all others in a mean square."""
+    late = In(1, Repeats(24.0)), In(0, Lag(0.1049887342890155))
+    world = plain(seed, motion="juggle", frames=69, tracks=78, within=13.734062262134477, first=late)
+    assert not synchronize(world.tracks).status[1].ok
 
 
 def test_videos_beside_one_that_lags_stay_trusted():
