@@ -26,7 +26,7 @@ they agree best, so that residuals show less of a common error than there is. Of
 sigmas; with 2.5, 81 and 100 %. Real people need 1.0."""
 
 
-OF_MOTION = 1.5
+OF_MOTION = 2.0
 """Factor on the error of residuals that are as large as those found, and change as the motion does. What a short clip
 tells of how a common error changes is little: of 300 pairs of films (`recon simulate`, seeds 80100 to 80147, whose
 single offsets were judged by then) 69 and 88 % lay within one and two sigmas without this, 73 and 94 % with it (77 and

@@ -95,7 +95,7 @@ def test_units_places_and_order_do_not_matter(seed, unit, begins):
     again = TrackSet(moved, tracks.seen, timestamps=tracks.times + begins).take(rng.permutation(len(tracks)))
     one, other = lag_of(tracks), lag_of(again)
     assert one.spread == pytest.approx(other.spread, rel=1e-3)
-    assert one.sure == pytest.approx(other.sure, rel=1e-2)
+    assert one.error == pytest.approx(other.error, rel=1e-2)
 
 
 @pytest.mark.parametrize(
@@ -138,6 +138,16 @@ def test_two_seconds_of_juggled_balls_whose_tracks_lag_are_never_trusted_and_wro
     late = In(1, Repeats(24.0)), In(0, Lag(0.1049887342890155))
     world = plain(seed, motion="juggle", frames=69, tracks=78, within=13.734062262134477, first=late)
     assert not synchronize(world.tracks).status[1].ok
+
+
+def test_where_delays_cannot_be_excluded_sigma_holds_them():
+    """Trusted before, at sigma .17 and 2.6 frames off: of 43 noisy tracks neighbours hardly tell of any delay."""
+    late = (In(0, Lag(1.5 / FPS)),)
+    world = plain(84003, motion="juggle", preset="hard", frames=64, tracks=43, within=20.0, first=late)
+    found, lags = synchronize(world.tracks), [lag_of(tracks) for tracks in world.tracks]
+    assert max(lag.told for lag in lags) < 0.1 / FPS
+    assert max(lag.sigma for lag in lags) > 0.7 / FPS
+    assert found.sigma[1] >= max(lag.sigma for lag in lags) and not found.status[1].ok
 
 
 def test_videos_beside_one_that_lags_stay_trusted():
