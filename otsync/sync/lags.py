@@ -60,7 +60,7 @@ brutal ones twelve. Of 56 whose delays are exponential with a mean of .6 frame (
 
 USUAL = 0.4 / 30
 """Seconds that the delays of tracks without any may seem to be: sigma has only what is more. Of the same videos without
-delays 4 (clean), 5 (mid) and 9 % (hard) have more, mostly those of few tracks."""
+delays 3 (clean), 5 (mid) and 8 % (hard) have more, mostly those of few tracks."""
 
 
 @dataclass(frozen=True)
