@@ -170,6 +170,13 @@ AT_REST = 0.01
 """A picture that stands still is at rest where its mean square steps are less than this share of the median."""
 
 
+LONGEST, ENOUGH_PICTURES = 4, 8
+"""Frames for which a picture may last in a file that repeats some, and pictures that tell it."""
+
+UNMOVED, FAST = 0.01, 0.9
+"""A picture is the last one again where its mean square step is less than this share of a fast one, this quantile."""
+
+
 def pauses(x: Float[np.ndarray, "M T D"]) -> list[tuple[int, int]]:
     """The first and the last frame of each time that all tracks are at rest, though they mostly are not; nobody guesses
     when that is.
@@ -184,6 +191,21 @@ def pauses(x: Float[np.ndarray, "M T D"]) -> list[tuple[int, int]]:
     rest = np.concatenate([[False], steps < AT_REST * float(np.median(known)), [False]])
     turns = np.flatnonzero(rest[1:] != rest[:-1])
     return [(int(i), int(j)) for i, j in turns.reshape(-1, 2) if j - i >= FEWEST]
+
+
+def picture_frames(x: Float[np.ndarray, "M T D"]) -> float:
+    """Frames for which a video shows a picture, in the mean: 1 where each is new, 2 where every one is shown twice.
+
+    Where it rests for longer than :data:`LONGEST` frames is left out.
+    """
+    steps = mean_steps(x)
+    steps = steps[np.isfinite(steps)]
+    if not len(steps):
+        return 1.0
+    moves = np.flatnonzero(steps > UNMOVED * np.quantile(steps, FAST))
+    lasts = np.diff(moves)
+    lasts = lasts[lasts <= LONGEST]
+    return float(lasts.mean()) if len(lasts) >= ENOUGH_PICTURES else 1.0
 
 
 def mean_steps(x: Float[np.ndarray, "M T D"]) -> Float[np.ndarray, " T-1"]:

@@ -16,7 +16,7 @@ from ..clocks.common import readable, strongest
 from ..clocks.cuts import Steps
 from ..clocks.lengths import jumping, lasting
 from ..clocks.splines import TrackSplines
-from ..clocks.stillness import AROUND, pause, stood_still
+from ..clocks.stillness import AROUND, pause, picture_frames, stood_still
 from ..refine.gauss_newton import Fit, fit_clock
 from ..refine.splines import SplineRefine
 from ..types import Break, Clock, TrackSet, mended_frames
@@ -50,6 +50,9 @@ BESIDE, OFF, OTHERS = 0.45, 1.5 / 30, 10 / 30
 :data:`OTHERS`, may suit the positions better than the answer. Beside freezes, lost frames and cuts one within a frame
 of the answer is the best (46 worlds of mid noise); beside a slow motion that is taken for lost frames one that is 2 to
 7 frames off (10 of 10)."""
+
+STAIRS = 5.0
+"""Seconds on either side of a break in which a video shows how often its file repeats a picture."""
 
 SHORT = 1.5
 """Seconds below which what its matches differ by does not cover the error of a part: 48 and 79 % of .65 s of mid worlds
@@ -123,9 +126,10 @@ def _readings(
     first, second = float(before), later
     gap = 0.0
     sigmas = [math.nan, math.nan]
+    stairs = _stairs(*raw, when)
     for margin in (2 * AROUND / 3, MARGIN):
         sides = Part(low, when - margin, first), Part(when + gap + margin, high, second)
-        (first, second), sigmas = _offsets(a, b, sides, within)
+        (first, second), sigmas = _offsets(a, b, sides, stairs, within)
         when, gap = _moment(*raw, first, second, when, limits)
     jump, sigma = second - first, math.hypot(*sigmas)
     if jump > 0 and gap == 0:  # a's frames run on, b's go back: its parts are in the other order
@@ -166,12 +170,28 @@ def _counted(shown: Raw, start: float, length: float, sigma: float, frame: float
     return Break(found[1], -lasts, lasts, 0.0) if abs(lasts - length) <= near else None
 
 
+def _stairs(a: Raw, b: Raw, when: float) -> float:
+    """Variance, s², of the offset of a second of two videos whose files repeat pictures, by that alone: a picture that
+    lasts p frames is late by any of 0 to p - 1, and only so many pictures tell the time.
+    """
+    total = 0.0
+    for raw in (a, b):
+        near = slice(*np.searchsorted(raw.times, [when - STAIRS, when + STAIRS]))
+        if len(raw.times[near]) > 1:
+            frame, lasts = float(np.median(np.diff(raw.times))), picture_frames(raw.x[:, near])
+            total += (lasts**2 - 1) / 12 * frame**2 * lasts * frame
+    return total
+
+
 def _offsets(
-    a: TrackSplines, b: TrackSplines, sides: tuple[Part, Part], within: float = AROUND
+    a: TrackSplines, b: TrackSplines, sides: tuple[Part, Part], stairs: float, within: float = AROUND
 ) -> tuple[list[float], list[float]]:
     """Offsets of two parts beside a break, and their sigmas, s; nan where a part cannot tell: its offset stays.
 
     Each by the motion within it; where that is too little, by the places of the matches in the other part.
+
+    Args:
+        stairs: see :func:`_stairs`.
     """
     fits = [fit_clock(a.within(p.begin, p.end), b, Clock(p.offset), WINDOW) for p in sides]
     near = [f is not None and abs(f.clock.offset - p.offset) < within for f, p in zip(fits, sides, strict=True)]
@@ -180,7 +200,8 @@ def _offsets(
     for k in (0, 1):
         if fits[k] is None and near[1 - k]:
             found[k], sigma[k] = measured(a, b, replace(sides[1 - k], offset=found[1 - k]), sides[k])
-    return found, sigma
+    lengths = [max(_length(a, b, p), a.frame) for p in sides]
+    return found, [math.sqrt(s**2 + stairs / length) for s, length in zip(sigma, lengths, strict=True)]
 
 
 def sigma_of_part(fit: Fit | None, other: Fit | None, length: float) -> float:
@@ -317,9 +338,11 @@ def remeasured(answer: Answer, a: TrackSet, b: TrackSet, moment: float) -> tuple
     """What is left of a jump after it was mended, s, and one sigma of it; ``moment``: of the break, on a's clock."""
     curves = SplineRefine().splines(a, b, strongest(answer.matches, readable(LIMIT, a, b)))
     offset = answer.refined.offset
+    pairs = strongest(answer.matches, readable(LIMIT, a, b)).pairs
+    stairs = _stairs(Raw.of(a, pairs[:, 0]), Raw.of(b, pairs[:, 1]), moment)
     for margin in (MARGIN, curves[0].frame):  # right up to the break where too little is left of a part
         sides = Part(-math.inf, moment - margin, offset), Part(moment + margin, math.inf, offset)
-        (first, second), sigmas = _offsets(*curves, sides)
+        (first, second), sigmas = _offsets(*curves, sides, stairs)
         sigma = math.hypot(*sigmas)
         if math.isfinite(sigma):
             break
