@@ -12,10 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.special import stdtrit
 
 from ..clocks.common import readable, strongest
 from ..clocks.splines import TrackSplines
-from ..refine.gauss_newton import GROUPS, ROBUST, jackknife, neighbours
+from ..refine.gauss_newton import GROUPS, ONE_SIGMA, ROBUST, jackknife, neighbours
 from ..types import Clock, TrackSet
 from .alike import LEAST_BESIDE, LIMIT, MARGIN, Raw, Usual
 from .verdict import Answer
@@ -149,7 +150,8 @@ def measured(a: TrackSplines, b: TrackSplines, known: Part, short: Part) -> tupl
     whose offset is known; (its own offset, nan) where nothing tells.
 
     Places drift, those of all matches alike, which their scatter does not show. So the same is asked of parts of the
-    known one, too, as long and as far from what they are measured by: what these are off by joins sigma.
+    known one, too, as long and as far from what they are measured by: what these are off by joins sigma. They are few,
+    and overlap by half: sigma is that of Student's distribution with as many degrees of freedom as would not overlap.
     """
     offset, sigma = _by_place(a, b, known, short)
     length, gap = min(short.end, float(a.times[-1])) - max(short.begin, float(a.times[0])), _gap(known, short)
@@ -169,7 +171,8 @@ def measured(a: TrackSplines, b: TrackSplines, known: Part, short: Part) -> tupl
             off.append(found - known.offset)
     if len(off) < FEWEST:
         return offset, math.nan
-    return offset, math.hypot(sigma, float(np.sqrt(np.mean(np.square(off)))))
+    student = float(stdtrit((len(off) + 1) / 2, ONE_SIGMA))
+    return offset, math.hypot(sigma, student * float(np.sqrt(np.mean(np.square(off)))))
 
 
 def _by_place(a: TrackSplines, b: TrackSplines, known: Part, short: Part) -> tuple[float, float]:
