@@ -414,7 +414,7 @@ BREAKS = (
     Break(
         "places-own-scatter",
         "otsync/sync/places.py",
-        "return offset, math.hypot(sigma, float(np.sqrt(np.mean(np.square(off)))))",
+        "return offset, math.hypot(sigma, student * float(np.sqrt(np.mean(np.square(off)))))",
         "return offset, sigma",
         PARTS,
         "sigma of a short part does not know that places drift",
