@@ -416,7 +416,7 @@ BREAKS = (
         "otsync/sync/places.py",
         "return offset, math.hypot(sigma, student * float(np.sqrt(np.mean(np.square(off)))))",
         "return offset, sigma",
-        PARTS,
+        PLACES,
         "sigma of a short part does not know that places drift",
     ),
     Break(

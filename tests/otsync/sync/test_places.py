@@ -82,6 +82,22 @@ def test_a_short_part_is_measured_by_the_places_beside_it(truth):
     assert nowhere[0] == 0.0 and np.isnan(nowhere[1])
 
 
+def test_what_drifts_for_all_matches_alike_counts_in_the_sigma_of_a_short_part():
+    """Their scatter does not show it; known parts that are measured in the same way do."""
+    move, k, off = motion(7), np.arange(150) / 30, []
+    short = Part(3.1, 3.1 + 11.5 / 30, 0.0)
+    for seed in range(12):
+        rng = np.random.default_rng([seed, 2])
+        phase = rng.uniform(0, 6.3, (3, 3))
+        drift = 0.05 * np.sin(2 * np.pi * np.outer(k, [0.4, 0.9, 1.4])[..., None] + phase).sum(1)
+        a, b = (move(k) + 0.003 * rng.normal(size=(N, 150, 3)) + d for d in (0.0, drift))
+        matches = Matches(np.stack([np.arange(N)] * 2, 1))
+        curves = SplineRefine().splines(TrackSet(a, fps=30), TrackSet(b, fps=30), matches)
+        offset, sigma = measured(*curves, Part(0.0, 2.9, 0.0), short)
+        off.append(abs(offset) / sigma)
+    assert max(off) < 1.5
+
+
 @pytest.mark.parametrize("seed", [41010, 41012])
 def test_lost_frames_near_an_end_are_named_and_mended(seed):
     """Twenty frames behind ten lost ones: motion alone measured the jump to a frame, and the mend was thrown away."""
