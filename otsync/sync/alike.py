@@ -41,6 +41,11 @@ class Raw:
     def of(cls, tracks: TrackSet, index: np.ndarray) -> Raw:
         return cls(tracks.times, tracks.take(index).positions())
 
+    def around(self, when: float, seconds: float) -> Raw:
+        """The frames within so many seconds of a moment of the video's own clock."""
+        near = slice(*np.searchsorted(self.times, [when - seconds, when + seconds]))
+        return Raw(self.times[near], self.x[:, near])
+
     def at(self, t: np.ndarray) -> np.ndarray:
         """(M,S,3) between two samples on a line; nan outside."""
         right = np.clip(np.searchsorted(self.times, t), 1, len(self.times) - 1)

@@ -126,7 +126,7 @@ def _readings(
     first, second = float(before), later
     gap = 0.0
     sigmas = [math.nan, math.nan]
-    stairs = _stairs(*raw, when)
+    stairs = _stairs(raw[0].around(when, STAIRS), raw[1].around(when - first, STAIRS))
     for margin in (2 * AROUND / 3, MARGIN):
         sides = Part(low, when - margin, first), Part(when + gap + margin, high, second)
         (first, second), sigmas = _offsets(a, b, sides, stairs, within)
@@ -170,15 +170,14 @@ def _counted(shown: Raw, start: float, length: float, sigma: float, frame: float
     return Break(found[1], -lasts, lasts, 0.0) if abs(lasts - length) <= near else None
 
 
-def _stairs(a: Raw, b: Raw, when: float) -> float:
+def _stairs(a: Raw, b: Raw) -> float:
     """Variance, s², of the offset of a second of two videos whose files repeat pictures, by that alone: a picture that
     lasts p frames is late by any of 0 to p - 1, and only so many pictures tell the time.
     """
     total = 0.0
     for raw in (a, b):
-        near = slice(*np.searchsorted(raw.times, [when - STAIRS, when + STAIRS]))
-        if len(raw.times[near]) > 1:
-            frame, lasts = float(np.median(np.diff(raw.times))), picture_frames(raw.x[:, near])
+        if len(raw.times) > 1:
+            frame, lasts = float(np.median(np.diff(raw.times))), picture_frames(raw.x)
             total += (lasts**2 - 1) / 12 * frame**2 * lasts * frame
     return total
 
@@ -336,10 +335,11 @@ def culprit(found: Sequence[Suspect], sound: Sequence[Seen]) -> Suspect | None:
 
 def remeasured(answer: Answer, a: TrackSet, b: TrackSet, moment: float) -> tuple[float, float]:
     """What is left of a jump after it was mended, s, and one sigma of it; ``moment``: of the break, on a's clock."""
-    curves = SplineRefine().splines(a, b, strongest(answer.matches, readable(LIMIT, a, b)))
+    matches = strongest(answer.matches, readable(LIMIT, a, b))
+    curves = SplineRefine().splines(a, b, matches)
     offset = answer.refined.offset
-    pairs = strongest(answer.matches, readable(LIMIT, a, b)).pairs
-    stairs = _stairs(Raw.of(a, pairs[:, 0]), Raw.of(b, pairs[:, 1]), moment)
+    raw = Raw.of(a, matches.pairs[:, 0]), Raw.of(b, matches.pairs[:, 1])
+    stairs = _stairs(raw[0].around(moment, STAIRS), raw[1].around(moment - offset, STAIRS))
     for margin in (MARGIN, curves[0].frame):  # right up to the break where too little is left of a part
         sides = Part(-math.inf, moment - margin, offset), Part(moment + margin, math.inf, offset)
         (first, second), sigmas = _offsets(*curves, sides, stairs)

@@ -164,6 +164,14 @@ BREAKS = (
         "what a pair of tracks says in one second vouches for itself: noise passes for delays",
     ),
     Break(
+        "stairs-clock-of-the-other",
+        "otsync/sync/breaks.py",
+        "raw[1].around(moment - offset, STAIRS)",
+        "raw[1].around(moment, STAIRS)",
+        ("tests/otsync/sync/test_breaks.py",),
+        "whether a file repeats pictures is read at the time of the other video",
+    ),
+    Break(
         "stairs-pauses-count",
         "otsync/clocks/stillness.py",
         "lasts = lasts[lasts <= LONGEST]",

@@ -15,13 +15,13 @@ from otsync.align.likelihood import LikelihoodScan
 from otsync.align.peaks import likely
 from otsync.align.returns import beside_returns, like_itself, return_is_liked
 from otsync.align.windows import local_curves
-from otsync.bench.trust.worlds import CLASSES
+from otsync.bench.trust.worlds import CLASSES, plain
 from otsync.clocks.common import CommonClock
 from otsync.clocks.stillness import pause, stood_still
 from otsync.refine.gauss_newton import Fit
 from otsync.refine.splines import SplineRefine
 from otsync.simulate import simulate
-from otsync.simulate.effects import Drop, Freeze, In, SlowMotion
+from otsync.simulate.effects import Drop, Freeze, In, Repeats, SlowMotion
 from otsync.sync.breaks import Suspect, culprit, mended, sigma_of_part
 from otsync.sync.mending import _by, confirmed
 from otsync.sync.pairs import Job, run
@@ -456,3 +456,14 @@ def test_windows_that_are_steady_lift_no_doubt_whether_motion_comes_back(returns
     (said,) = _by(even, answer, job, {"returns": 0.0}, {"returns": returns})
     assert (Status.BROKEN_CLOCK in said.refined.flags) == bool(returns)
     assert said.scanned.stats["returns"] == returns
+
+
+def test_a_break_of_a_file_that_repeats_pictures_is_as_sure_whenever_its_clock_begins():
+    """Of the video that froze, frames were read at the other one's time: its pictures were not seen to repeat."""
+    faults = In(1, Repeats(15.0)), In(1, Freeze(41))
+    world = plain(1126, motion="tennis", preset="clean", frames=154, tracks=32, within=11.0, first=faults)
+    one, other = world.tracks
+    later = replace(other, timestamps=other.times + 60.0, fps=None)
+    (here,), (there,) = (synchronize([one, video]).breaks[1] for video in (other, later))
+    assert there.at - 60.0 == pytest.approx(here.at, abs=1e-6)
+    assert there.jump == pytest.approx(here.jump, abs=1e-6) and there.sigma == pytest.approx(here.sigma, abs=1e-6)
