@@ -166,8 +166,8 @@ BREAKS = (
     Break(
         "stairs-clock-of-the-other",
         "otsync/sync/breaks.py",
-        "raw[1].around(moment - offset, STAIRS)",
-        "raw[1].around(moment, STAIRS)",
+        "raw[1].around(when - first, STAIRS)",
+        "raw[1].around(when, STAIRS)",
         ("tests/otsync/sync/test_breaks.py",),
         "whether a file repeats pictures is read at the time of the other video",
     ),
