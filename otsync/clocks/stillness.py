@@ -6,6 +6,9 @@ each frame of the pause is one moment, so that steps from frame to frame are noi
 
 from __future__ import annotations
 
+import math
+from fractions import Fraction
+
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -166,6 +169,13 @@ def pause(
     return (float(times[i]), float(times[j])) if clear and not rhythm and beside > 0 else None
 
 
+PICTURES, ENOUGH_BESIDE, APART = 60, 5, 3.0
+"""Frames on either side of a pause whose pictures are counted, the fewest pictures on one side, and the factor by which
+mean square steps to a new picture are larger than all others."""
+
+PERIODS = sorted({Fraction(a, b) for b in range(1, 7) for a in range(b + 1, 3 * b + 1)})
+"""Frames for which a picture may last, in the mean: 24, 25, 20, 15, 12 and 10 a second in a file of 30, 50 or 60."""
+
 AT_REST = 0.01
 """A picture that stands still is at rest where its mean square steps are less than this share of the median."""
 
@@ -206,6 +216,66 @@ def picture_frames(x: Float[np.ndarray, "M T D"]) -> float:
     lasts = np.diff(moves)
     lasts = lasts[lasts <= LONGEST]
     return float(lasts.mean()) if len(lasts) >= ENOUGH_PICTURES else 1.0
+
+
+def pause_of_pictures(
+    times: Float[np.ndarray, " T"], x: Float[np.ndarray, "M T 3"], start: float, length: float
+) -> tuple[float, int] | None:
+    """A pause in a file that repeats pictures: when it ends, s, and for how many frames it lasts; None where its
+    pictures do not tell that.
+
+    A file of more frames than pictures shows a new one whenever it is due, so that picture m begins at the frame
+    floor(m p + q): a digital straight line. A pause that was made in the file moves all that follow by as many frames
+    as it lasts, and one number alone makes a line of both sides again. One that was in the footage before leaves the
+    line as it is, and then the file does not tell it to a frame.
+
+    Args:
+        times: (T,) s. x: (M,T,3) where its tracks are seen, as they are; nan where not seen. start, length: as a pair
+            has measured them, s.
+    """
+    low, high = (int(k) for k in np.searchsorted(times, [start, start + length]))
+    begin, end = max(0, low - OFF - PICTURES), min(len(times), high + OFF + PICTURES + 1)
+    times, low, high = times[begin:end], low - begin, high - begin
+    new = _new_pictures(mean_steps(x[:, begin:end]))
+    if len(new) < 2 * ENOUGH_BESIDE:
+        return None
+    first = int(np.argmax(np.diff(new)))  # of the pause, which is the longest that a picture lasts
+    before, behind = new[: first + 1], new[first + 1 :]
+    still = int(behind[0] - before[-1])
+    if min(len(before), len(behind)) < ENOUGH_BESIDE or still <= LONGEST:
+        return None
+    if not 1 < max(np.diff(before).max(), np.diff(behind).max()) <= LONGEST:
+        return None  # each picture is new, or something rests there, too
+    if max(abs(before[-1] - low), abs(behind[0] - 1 - high)) > OFF + LONGEST:
+        return None
+    k, later = np.arange(len(new)), np.arange(len(new)) > first
+    lasts = set()
+    for period in PERIODS:
+        if any(_in_step(k + n * later, new, period) for n in range(still)):
+            return None
+        lasts |= {n for n in range(max(1, still - LONGEST), still) if _in_step(k, new - n * later, period)}
+    return (float(times[behind[0]]), lasts.pop()) if len(lasts) == 1 else None
+
+
+def _new_pictures(steps: Float[np.ndarray, " S"]) -> Int[np.ndarray, " N"]:
+    """The frames that show another picture than the one before; none where no gap sets moving steps apart from still
+    ones.
+    """
+    if not np.isfinite(steps).all():
+        return np.zeros(0, int)
+    size = np.log(np.maximum(steps, ROUNDED * max(float(steps.max()), 1e-300)))
+    order = np.sort(size)
+    gaps = np.diff(order)
+    widest = int(np.argmax(gaps))
+    if gaps[widest] < math.log(APART):
+        return np.zeros(0, int)
+    return 1 + np.flatnonzero(size > order[widest] + gaps[widest] / 2)
+
+
+def _in_step(k: Int[np.ndarray, " N"], frames: Int[np.ndarray, " N"], period: Fraction) -> bool:
+    """Whether the pictures ``k`` begin at floor(k period + q), of any q."""
+    late = frames * period.denominator - k * period.numerator
+    return int(late.max() - late.min()) < period.denominator
 
 
 def mean_steps(x: Float[np.ndarray, "M T D"]) -> Float[np.ndarray, " T-1"]:

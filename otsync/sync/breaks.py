@@ -16,7 +16,7 @@ from ..clocks.common import readable, strongest
 from ..clocks.cuts import Steps
 from ..clocks.lengths import jumping, lasting
 from ..clocks.splines import TrackSplines
-from ..clocks.stillness import AROUND, pause, picture_frames, stood_still
+from ..clocks.stillness import AROUND, pause, pause_of_pictures, picture_frames, stood_still
 from ..refine.gauss_newton import Fit, fit_clock
 from ..refine.splines import SplineRefine
 from ..types import Break, Clock, TrackSet, mended_frames
@@ -163,11 +163,16 @@ def _readings(
 def _counted(shown: Raw, start: float, length: float, sigma: float, frame: float) -> Break | None:
     """A pause that the video itself shows, of about the length that the pair measured: its frames are counted."""
     found = pause(shown.times, shown.x, start, length)
-    if found is None:
-        return None
-    lasts = round((found[1] - found[0]) / frame) * frame
+    if found is not None:
+        end, frames = found[1], round((found[1] - found[0]) / frame)
+    else:
+        pictures = pause_of_pictures(shown.times, shown.x, start, length)
+        if pictures is None:
+            return None
+        end, frames = pictures
+    lasts = frames * frame
     near = max(1.5 * frame, SIGMAS * sigma if math.isfinite(sigma) else 0.0)
-    return Break(found[1], -lasts, lasts, 0.0) if abs(lasts - length) <= near else None
+    return Break(end, -lasts, lasts, 0.0) if abs(lasts - length) <= near else None
 
 
 def _stairs(a: Raw, b: Raw) -> float:

@@ -1123,6 +1123,22 @@ BREAKS = (
         "a frame that the file shows twice is counted with the pause beside it",
     ),
     Break(
+        "pictures-of-the-footage",
+        "otsync/clocks/stillness.py",
+        "if any(_in_step(k + n * later, new, period) for n in range(still)):",
+        "if False:",
+        ("tests/otsync/clocks/test_stillness.py",),
+        "a pause that the footage had is counted in whole frames of its file",
+    ),
+    Break(
+        "pictures-any-line",
+        "otsync/clocks/stillness.py",
+        "return int(late.max() - late.min()) < period.denominator",
+        "return int(late.max() - late.min()) <= period.denominator",
+        ("tests/otsync/clocks/test_stillness.py",),
+        "pictures may begin a frame before they are due",
+    ),
+    Break(
         "breaks-rest-of-all",
         "otsync/clocks/stillness.py",
         "wander = wander[moves][most >= np.quantile(most, FASTEST)]",

@@ -460,10 +460,21 @@ def test_windows_that_are_steady_lift_no_doubt_whether_motion_comes_back(returns
 
 def test_a_break_of_a_file_that_repeats_pictures_is_as_sure_whenever_its_clock_begins():
     """Of the video that froze, frames were read at the other one's time: its pictures were not seen to repeat."""
-    faults = In(1, Repeats(15.0)), In(1, Freeze(41))
+    faults = In(1, Repeats(15.0)), In(1, Freeze(40))  # an even number: its pictures do not tell it
     world = plain(1126, motion="tennis", preset="clean", frames=154, tracks=32, within=11.0, first=faults)
     one, other = world.tracks
     later = replace(other, timestamps=other.times + 60.0, fps=None)
     (here,), (there,) = (synchronize([one, video]).breaks[1] for video in (other, later))
     assert there.at - 60.0 == pytest.approx(here.at, abs=1e-6)
     assert there.jump == pytest.approx(here.jump, abs=1e-6) and there.sigma == pytest.approx(here.sigma, abs=1e-6)
+
+
+@pytest.mark.parametrize("frames, rate", [(154, 15.0), (156, 20.0)])
+def test_half_a_second_behind_a_pause_of_a_file_that_repeats_pictures_is_counted(frames, rate):
+    """What was measured of it, 41.8 +- .2 frames, was rounded to 42."""
+    faults = In(1, Repeats(rate)), In(1, Freeze(41))
+    world = plain(1124, motion="tennis", preset="clean", frames=frames, tracks=32, within=11.0, first=faults)
+    offsets = synchronize(world.tracks)
+    (found,) = offsets.breaks[1]
+    assert found.jump * 30 == pytest.approx(-41) and found.sigma == 0
+    assert offsets.status[1].ok and world.errors(offsets)[0][0] < 0.2
