@@ -22,6 +22,7 @@ from ...simulate.effects import (
     Gaps,
     In,
     Lag,
+    LatePoses,
     LimbDrift,
     Loop,
     PartLate,
@@ -293,6 +294,7 @@ CLASSES: dict[str, Callable[[int], World]] = {
     "clock sways": partial(plain, first=(In(1, ClockSway()),)),
     "tracks that lag": partial(plain, first=(In(1, Lag(3 / 30)),)),
     "tracks that lag, hard": partial(plain, preset="hard", first=(In(1, Lag(3 / 30)),)),
+    "camera follows, poses late": partial(plain, last=(In(1, LatePoses(3 / 30)),)),
     "one of two late": partial(plain, classes=("basketball", "football"), first=(In(1, PartLate()),)),
     "one of two late, hard": partial(
         plain, preset="hard", classes=("basketball", "football"), first=(In(1, PartLate()),)

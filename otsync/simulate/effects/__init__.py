@@ -13,7 +13,17 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from ..observation import Observation
-from .camera import CameraFrame, ClockDrift, ClockRamp, ClockSway, DroppedFrames, OwnFrame, RigidFrame, RollingShutter
+from .camera import (
+    CameraFrame,
+    ClockDrift,
+    ClockRamp,
+    ClockSway,
+    DroppedFrames,
+    LatePoses,
+    OwnFrame,
+    RigidFrame,
+    RollingShutter,
+)
 from .noise import (
     CameraDepthDrift,
     DepthBias,
@@ -48,6 +58,7 @@ __all__ = [
     "IdentitySwitch",
     "In",
     "Lag",
+    "LatePoses",
     "LateralJitter",
     "LimbDrift",
     "Loop",

@@ -98,6 +98,45 @@ class RollingShutter:
 
 
 @dataclass(frozen=True)
+class LatePoses:
+    """A camera that turns after what it films, by the middle of its tracks, and whose poses come late: a gimbal's or a
+    phone's, stamped when they were read.
+
+    What a frame shows is then put where the camera pointed ``late`` s before, so that all of it turns about the camera
+    as the middle turned in that time. One performer who is followed seems to be ``late`` s behind across the ray.
+
+    Args:
+        late: s. settles: s over which the camera smooths what it follows.
+    """
+
+    late: float = 0.1
+    settles: float = 0.3
+
+    def __post_init__(self) -> None:
+        check_number("LatePoses.late", self.late, -10.0, 10.0)
+        check_number("LatePoses.settles", self.settles, 1e-3, 10.0)
+
+    def __call__(self, obs: Observation, rng: np.random.Generator) -> Observation:
+        centre = obs.camera.center if obs.camera.center.ndim == 2 else obs.camera.center[None]
+        aim = np.median(obs.xyz, 0).astype(float) - centre
+        near = np.exp(-(((obs.times[:, None] - obs.times) / self.settles) ** 2) / 2)
+        aim = near / near.sum(1, keepdims=True) @ aim
+        said = np.stack([np.interp(obs.times - self.late, obs.times, x) for x in aim.T], axis=1)
+        turn = _turning(aim, said)
+        at = obs.xyz - centre
+        return replace(obs, xyz=obs.xyz + (np.einsum("tij,ntj->nti", turn, at) - at).astype(obs.xyz.dtype))
+
+
+def _turning(a: Float[np.ndarray, "T 3"], b: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "T 3 3"]:
+    """The smallest rotations that turn the directions a towards b (Rodrigues); no two may be opposite."""
+    a, b = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (a, b))
+    x, y, z = np.cross(a, b).T
+    zero = np.zeros_like(x)
+    K = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
+    return np.eye(3) + K + K @ K / (1 + (a * b).sum(1))[:, None, None]
+
+
+@dataclass(frozen=True)
 class ClockDrift:
     """The video's clock wanders: frames are exposed up to ``size`` s (one sigma) off the times the file tells.
 

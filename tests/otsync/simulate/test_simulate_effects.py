@@ -255,6 +255,23 @@ def test_clocks_that_run_backwards_are_refused(effect, values):
         effect(**values)
 
 
+def test_what_a_camera_follows_is_put_where_it_pointed_before():
+    exact, worse, _, _ = with_and_without(effects.LatePoses(0.1, settles=0.002), tracks=1)
+    before, now = exact.xyz[0] - exact.camera.center, worse.xyz[0] - exact.camera.center
+    np.testing.assert_allclose(np.linalg.norm(now, axis=1), np.linalg.norm(before, axis=1), rtol=1e-5)
+    pointed = before / np.linalg.norm(before, axis=1, keepdims=True)
+    np.testing.assert_allclose(now[3:] / np.linalg.norm(now[3:], axis=1, keepdims=True), pointed[:-3], atol=1e-4)
+
+
+def test_poses_that_come_late_turn_all_tracks_alike_about_the_camera():
+    exact, worse, _, _ = with_and_without(effects.LatePoses(0.2), tracks=30)
+    before, now = exact.xyz - exact.camera.center, worse.xyz - exact.camera.center
+    assert np.abs(now - before).max() > 0.01
+    np.testing.assert_allclose(
+        np.einsum("itk,jtk->tij", now, now), np.einsum("itk,jtk->tij", before, before), atol=1e-3
+    )
+
+
 def test_dropped_frames_keep_their_times():
     exact, worse, truth, _ = with_and_without(effects.DroppedFrames(0.2), tracks=30)
     assert 100 < worse.n_frames < 140
