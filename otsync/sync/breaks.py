@@ -36,11 +36,16 @@ MOVING, RESTING = 0.6, 0.4
 SEARCH = 2.0
 """Seconds around a break's coarse place in which it is looked for, at most, beside :data:`AROUND`."""
 
+USUAL = 3.0
+"""Seconds beyond these in which is read how far apart matched tracks usually are."""
+
 ENOUGH = 15
 """Frames that tell where a match's own constant difference lies."""
 
-BACK = 1.5
-"""Seconds that a video must go back by to be taken for cut; less is lost frames."""
+BACK, HALF, LONG = 0.5, 0.5, 1.5
+"""Seconds by which a video must go back to be told from one that lost frames; share of the way from how well frames
+suit their own offset to how well they suit the wrong one, from which on they have no partner; and seconds of frames
+beside a break that are left out of its measurement in any case: a freeze seldom lasts longer."""
 
 SIGMAS = 3.0
 """By which a pause that is counted may differ from what a pair measures, or by a frame and a half."""
@@ -132,10 +137,6 @@ def _readings(
         (first, second), sigmas = _offsets(a, b, sides, stairs, within)
         when, gap = _moment(*raw, first, second, when, limits)
     jump, sigma = second - first, math.hypot(*sigmas)
-    if jump > 0 and gap == 0:  # a's frames run on, b's go back: its parts are in the other order
-        j, turn = answer.pair[1], _turn(*raw, second, first)
-        cut = steps[1].cut_near(turn, AROUND)
-        return [Suspect(j, jumping(turn if cut is None else cut, -jump, sigma, 1 / fps[j]), 1.0)]
     at_b = when - first
     if jump > 0:  # a's frames from `when` on for `jump` s have no partner: a stood still, or b lost them
         (froze, start), (lost, gone) = (0, when), (1, at_b)
@@ -144,20 +145,48 @@ def _readings(
     length, frame = abs(jump), 1 / fps[answer.pair[froze]]
     shown = raw[froze]
     stands = stood_still(shown.times, shown.x, start, length)
-    cut, back = steps[lost].cut_near(gone, AROUND), steps[froze].cut_near(start, AROUND)
+    back = _goes_back(raw, first, second, when, limits) if stands is None and length >= BACK else None
+    if back is not None:
+        k, moment = back
+        cut, v = steps[k].cut_near(moment, AROUND), answer.pair[k]
+        return [Suspect(v, jumping(moment if cut is None else cut, -length, sigma, 1 / fps[v]), 1.0)]
+    cut, back_at = steps[lost].cut_near(gone, AROUND), steps[froze].cut_near(start, AROUND)
     if stands is not None:
         repeats = _counted(shown, stands, length, sigma, frame) or lasting(stands, length, sigma, frame)
     else:
-        repeats = jumping(start if back is None else back, -length, sigma, frame)
+        repeats = jumping(start if back_at is None else back_at, -length, sigma, frame)
     misses = jumping(gone if cut is None else cut, length, sigma, 1 / fps[answer.pair[lost]])
     # what one video shows by itself decides
     votes = RESTING, MOVING
-    if (cut is None) != (stands is None and back is None):
+    if (cut is None) != (stands is None and back_at is None):
         votes = (1.0, 0.0) if cut is None else (0.0, 1.0)
     return [
         Suspect(answer.pair[froze], repeats, votes[0]),
         Suspect(answer.pair[lost], misses, votes[1]),
     ]
+
+
+def _goes_back(
+    raw: tuple[Raw, Raw], first: float, second: float, when: float, limits: tuple[float, float]
+) -> tuple[int, float] | None:
+    """Which of the two videos, 0 or 1, goes back to what it has shown or not yet shown, and when, on its own clock:
+    every frame of it has a partner, on either side of a break at the one or the other offset. None: neither does.
+
+    Args:
+        when, limits: as of :func:`_moment`, on the first one's clock.
+    """
+    a, b = raw
+    low, high = limits
+    if second < first:
+        near = _turn(a, b, first, second)[1]
+        moments = _moments(b, a, -first, -second, near, (low - first, high - second))
+        return None if moments.whole is None else (1, moments.whole)
+    moments = _moments(a, b, first, second, when, limits)
+    if moments.whole is None:
+        return None
+    # a shows anew what b shows once; or b's parts are in the other order
+    (turned, turn), (ordered, _) = _turn(a, b, second, first), _turn(a, b, first, second)
+    return (1, turn) if turned > ordered else (0, moments.whole)
 
 
 def _counted(shown: Raw, start: float, length: float, sigma: float, frame: float) -> Break | None:
@@ -228,39 +257,71 @@ def _length(a: TrackSplines, b: TrackSplines, part: Part) -> float:
     return min(part.end, float(a.times[-1]), last) - max(part.begin, float(a.times[0]), first)
 
 
+@dataclass(frozen=True)
+class _Moments:
+    """Where a break lies on one clock, s: the first offset suits up to ``when``, the second one from ``gap`` later on.
+    whole: the moment without a gap, where frames beside it suit the offsets as others do; None where they do not.
+    """
+
+    when: float
+    gap: float
+    whole: float | None
+
+
+def _moments(a: Raw, b: Raw, first: float, second: float, near: float, limits: tuple[float, float]) -> _Moments:
+    """The time of a's clock up to which the first offset suits the positions better."""
+    reach = AROUND + min(abs(second - first), SEARCH)
+    wide = reach + USUAL
+    t = a.times[(a.times > max(limits[0], near - wide)) & (a.times < min(limits[1], near + wide))]
+    asked = np.abs(t - near) < reach
+    gap = max(second - first, 0.0)
+    if asked.sum() < 3:
+        return _Moments(near, gap, None)
+    frame = float(np.median(np.diff(a.times)))
+    # the coarse place may lie at either end of a gap
+    sides = [t < near - gap - MARGIN, t > near + gap + MARGIN]
+    for k, beside in enumerate((t < near - MARGIN, t > near + MARGIN)):
+        if sides[k].sum() < ENOUGH:
+            sides[k] = beside
+    one, two = (_suits(a, b, o, t, inside)[asked] for o, inside in zip((first, second), sides, strict=True))
+    t = t[asked]
+    before = np.concatenate([[0.0], np.cumsum(one)])
+    behind = np.concatenate([np.cumsum(two[::-1])[::-1], [0.0]])
+
+    def best(missing: int) -> tuple[float, int]:
+        """The largest sum where so many frames belong to neither part, and which is the first of them."""
+        total = before + behind[np.minimum(np.arange(len(t) + 1) + missing, len(t))]
+        k = int(np.argmax(total))
+        return float(total[k]), k
+
+    def moment(k: int) -> float:
+        return float(t[k] if k < len(t) else t[-1] + frame)
+
+    missing = round(gap / frame)
+    (without, when), (whole, at) = best(missing), best(0)
+    missing = min(missing, len(t) - when)
+    wrong = np.concatenate([one[at:], two[:at]])
+    if not missing or not len(wrong):
+        return _Moments(moment(when), gap, None)
+    right = without / max(len(t) - missing, 1)
+    # frames that have no partner suit no better than others do at the wrong offset
+    share = (right - (whole - without) / missing) / max(right - float(wrong.mean()), 1e-9)
+    return _Moments(moment(when), gap, moment(at) if share < HALF else None)
+
+
 def _moment(
     a: Raw, b: Raw, first: float, second: float, near: float, limits: tuple[float, float]
 ) -> tuple[float, float]:
     """The time of a's clock up to which the first offset suits the positions better, and how many seconds later the
-    second one begins to.
+    second one begins to: at once where a gap of :data:`LONG` would leave out frames that suit.
     """
-    reach = AROUND + min(abs(second - first), SEARCH)
-    t = a.times[(a.times > max(limits[0], near - reach)) & (a.times < min(limits[1], near + reach))]
-    gap = max(second - first, 0.0)
-    if len(t) < 3:
-        return near, gap
-    frame = float(np.median(np.diff(a.times)))
-    # the coarse place may lie at either end of a gap
-    sides = [t < near - gap - MARGIN, t > near + gap + MARGIN]
-    for k, wide in enumerate((t < near - MARGIN, t > near + MARGIN)):
-        if sides[k].sum() < ENOUGH:
-            sides[k] = wide
-    scores = [_suits(a, b, o, t, inside) for o, inside in zip((first, second), sides, strict=True)]
-    one = np.concatenate([[0.0], np.cumsum(scores[0])])
-    two = np.concatenate([np.cumsum(scores[1][::-1])[::-1], [0.0]])
-    found = {}
-    for g in {0.0, gap}:
-        total = one + two[np.minimum(np.arange(len(t) + 1) + round(g / frame), len(t))]
-        best = int(np.argmax(total))
-        found[g] = float(total[best]), float(t[best] if best < len(t) else t[-1] + frame)
-    # frames within the gap that suit the second offset all the same add up to 1 each
-    if gap >= BACK and found[0.0][0] > found[gap][0] + 0.5 * min(gap / frame, 15):
-        gap = 0.0
-    return found[gap][1], gap
+    found = _moments(a, b, first, second, near, limits)
+    return (found.whole, 0.0) if found.whole is not None and found.gap >= LONG else (found.when, found.gap)
 
 
-def _turn(a: Raw, b: Raw, first: float, second: float) -> float:
-    """The time of b's own clock from which on it has the second offset, where its parts are not in a's order.
+def _turn(a: Raw, b: Raw, first: float, second: float) -> tuple[float, float]:
+    """How well frames of b suit two offsets one after the other, and the time of its own clock from which on the second
+    one holds.
 
     Frames that neither offset brings into a's clip count for neither.
     """
@@ -268,8 +329,9 @@ def _turn(a: Raw, b: Raw, first: float, second: float) -> float:
     scores = [_suits(b, a, -offset, t, np.ones(len(t), bool)) for offset in (first, second)]
     one = np.concatenate([[0.0], np.cumsum(scores[0])])
     two = np.concatenate([np.cumsum(scores[1][::-1])[::-1], [0.0]])
-    best = int(np.argmax(one + two))
-    return float(t[best] if best < len(t) else t[-1] + np.median(np.diff(t)))
+    total = one + two
+    best = int(np.argmax(total))
+    return float(total[best]), float(t[best] if best < len(t) else t[-1] + np.median(np.diff(t)))
 
 
 def _suits(a: Raw, b: Raw, offset: float, t: np.ndarray, inside: np.ndarray) -> np.ndarray:

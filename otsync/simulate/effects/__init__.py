@@ -36,7 +36,7 @@ from .noise import (
     SlowDrift,
     Transient,
 )
-from .timing import Cut, Drop, Freeze, In, Loop, Repeats, Reverse, SlowMotion
+from .timing import Cut, Drop, Freeze, In, Loop, Repeats, Replay, Reverse, SlowMotion
 from .tracker import Gaps, Hallucination, IdentitySwitch, Lag, Occlusion, Outliers, PartLate, RayCompression, Smoothing
 
 __all__ = [
@@ -69,6 +69,7 @@ __all__ = [
     "PositionNoise",
     "RayCompression",
     "Repeats",
+    "Replay",
     "Reverse",
     "RigidFrame",
     "RollingShutter",

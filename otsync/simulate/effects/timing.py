@@ -142,6 +142,26 @@ class Cut:
 
 
 @dataclass(frozen=True)
+class Replay:
+    """From ``at`` on, a share of the clip, the video shows again what it has shown in the last ``seconds``, and goes on
+    from there; ``at`` None: drawn. What a broadcast replays, or a buffer that is played out twice.
+    """
+
+    seconds: float = 1.0
+    at: float | None = None
+
+    def __post_init__(self) -> None:
+        check_number("Replay.seconds", self.seconds)
+        check_moment("Replay.at", self.at)
+
+    def __call__(self, obs: Observation, rng: np.random.Generator) -> Observation:
+        own = obs.times - obs.times[0]
+        k = moment(self.at, own, rng)
+        back = min(self.seconds, float(own[k]))  # not to before the file begins
+        return showing(obs, own - back * (np.arange(len(own)) >= k))
+
+
+@dataclass(frozen=True)
 class Repeats:
     """Footage of ``fps`` frames a second within a file of more: frames repeat until the next one is due."""
 

@@ -22,6 +22,7 @@ from otsync.simulate.effects import (
     Lag,
     LimbDrift,
     Repeats,
+    Replay,
     SharedDrift,
     SlowMotion,
 )
@@ -34,6 +35,7 @@ FAULTS = st.one_of(
     st.tuples(st.floats(0.1, 1.5), st.floats(0.1, 0.9)).map(lambda x: Drop(x[0], at=x[1])),
     st.builds(Cut),
     st.sampled_from([15.0, 20.0, 24.0, 25.0]).map(Repeats),
+    st.tuples(st.floats(0.2, 2.0), st.floats(0.1, 0.9)).map(lambda x: Replay(*x)),
     st.floats(1.3, 4.0).map(SlowMotion),
     st.floats(0.02, 0.3).map(ClockDrift),
     st.floats(-0.1, 0.1).map(ClockRamp),

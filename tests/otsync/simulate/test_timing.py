@@ -16,6 +16,7 @@ from otsync.simulate.effects import (
     In,
     Loop,
     Repeats,
+    Replay,
     Reverse,
     SlowMotion,
 )
@@ -34,6 +35,7 @@ def filmed(*effects, seed: int = 2):
         (Drop(0.4),),
         (Cut(),),
         (Repeats(24),),
+        (Replay(0.7),),
         (Loop(1.0),),
         (Reverse(),),
         (SlowMotion(),),
@@ -79,6 +81,14 @@ def test_effects_on_one_file_add_up_in_their_order():
     assert np.ptp(during) < 1e-9
 
 
+def test_a_replay_shows_once_more_what_it_has_shown_and_goes_on():
+    _, truth = filmed(Replay(0.5, at=0.6))
+    shown = truth.shown[1]
+    k = int(np.argmin(np.diff(shown))) + 1
+    np.testing.assert_allclose(shown[k : k + 15], shown[k - 15 : k])
+    np.testing.assert_allclose(np.delete(np.diff(shown), k - 1), 1 / 30)
+
+
 def test_lost_frames_are_jumped_over():
     _, truth = filmed(Drop(1.0, at=0.4))
     steps = np.diff(truth.shown[1])
@@ -104,6 +114,8 @@ def test_motions_that_mislead_are_smooth_and_drawn_by_the_seed(motion):
         (lambda: Drop(at=float("nan")), "Drop.at"),
         (lambda: Cut(at=-0.1), "Cut.at"),
         (lambda: Repeats(0), "Repeats.fps"),
+        (lambda: Replay(0.0), "Replay.seconds"),
+        (lambda: Replay(at=1.5), "Replay.at"),
         (lambda: Loop(0.0), "Loop.seconds"),
         (lambda: SlowMotion(factor=0), "SlowMotion.factor"),
         (lambda: SlowMotion(begin=True), "SlowMotion.begin"),

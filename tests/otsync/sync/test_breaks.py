@@ -21,7 +21,7 @@ from otsync.clocks.stillness import pause, stood_still
 from otsync.refine.gauss_newton import Fit
 from otsync.refine.splines import SplineRefine
 from otsync.simulate import simulate
-from otsync.simulate.effects import Drop, Freeze, In, Repeats, SlowMotion
+from otsync.simulate.effects import Drop, Freeze, In, Repeats, Replay, SlowMotion
 from otsync.sync.breaks import Suspect, culprit, mended, sigma_of_part
 from otsync.sync.mending import _by, confirmed
 from otsync.sync.pairs import Job, run
@@ -74,6 +74,19 @@ def test_frames_without_a_partner_are_no_part_and_speak_against_none(name, seed,
     assert offsets.ok and world.errors(offsets)[0][0] < 0.2
     (found,) = offsets.breaks[0] + offsets.breaks[1]
     assert found.jump == pytest.approx(jump, abs=1 / 30 if jump < -2 else 0.2 / 30)
+
+
+@pytest.mark.parametrize(
+    ("video", "seconds", "seed"), [(1, 1.5, 87203), (1, 1.0, 87205), (1, 0.6, 87206), (0, 1.5, 87204), (0, 1.0, 87205)]
+)
+def test_the_video_that_shows_something_again_is_the_one_that_goes_back(video, seconds, seed):
+    """It was said that the other one had lost frames: right at both ends, and up to 45 frames off in the middle."""
+    world = plain(seed, frames=180, within=20, first=(In(video, Replay(seconds, at=0.6)),))
+    offsets = synchronize(list(world.tracks))
+    (found,) = offsets.breaks[video]
+    assert not offsets.breaks[1 - video]
+    assert found.jump == pytest.approx(-seconds, abs=0.2 / 30) and found.at == pytest.approx(107.4 / 30, abs=1.5 / 30)
+    assert offsets.ok and world.errors(offsets)[1][0] < 0.2
 
 
 def test_motion_that_comes_back_breaks_no_clock():
