@@ -114,7 +114,7 @@ def test_a_clock_that_is_mended_elsewhere_than_its_video_is_cut_is_not_trusted()
     assert Status.BROKEN_CLOCK in synchronize(list(world.tracks)).flags[1]
 
 
-@pytest.mark.parametrize("name", ["ten frames dropped", "a second missing"])
+@pytest.mark.parametrize("name", ["ten frames dropped", pytest.param("a second missing", marks=pytest.mark.slow)])
 def test_a_clock_that_is_mended_where_its_video_is_cut_is_trusted(name):
     world = CLASSES[name](80103)
     found = synchronize(list(world.tracks))
@@ -185,7 +185,8 @@ def test_things_that_jump_by_themselves_are_no_cut():
     ("name", "seed", "video", "still"),
     [
         ("freeze of 15", 80101, 1, True),  # the other one was said to lack frames
-        ("ten frames dropped, hard", 80104, 1, False),  # by a length that nobody knew
+        # by a length that nobody knew
+        pytest.param("ten frames dropped, hard", 80104, 1, False, marks=pytest.mark.slow),
         ("ten frames dropped, hard", 80117, 1, False),  # told by its pieces alone
     ],
 )

@@ -76,9 +76,7 @@ def test_frames_without_a_partner_are_no_part_and_speak_against_none(name, seed,
     assert found.jump == pytest.approx(jump, abs=1 / 30 if jump < -2 else 0.2 / 30)
 
 
-@pytest.mark.parametrize(
-    ("video", "seconds", "seed"), [(1, 1.5, 87203), (1, 1.0, 87205), (1, 0.6, 87206), (0, 1.5, 87204), (0, 1.0, 87205)]
-)
+@pytest.mark.parametrize(("video", "seconds", "seed"), [(1, 1.5, 87203), (1, 0.6, 87206), (0, 1.0, 87205)])
 def test_the_video_that_shows_something_again_is_the_one_that_goes_back(video, seconds, seed):
     """It was said that the other one had lost frames: right at both ends, and up to 45 frames off in the middle."""
     world = plain(seed, frames=180, within=20, first=(In(video, Replay(seconds, at=0.6)),))

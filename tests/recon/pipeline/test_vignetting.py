@@ -82,7 +82,7 @@ def test_it_is_kept(done, world, monkeypatch):
     assert again.falloff == Falloff(effect.second, effect.fourth)
 
 
-@pytest.mark.parametrize("own", [Vignetting(-0.2, 0.05), Vignetting(0.0)])
+@pytest.mark.parametrize("own", [Vignetting(-0.2, 0.05), pytest.param(Vignetting(0.0), marks=pytest.mark.slow)])
 def test_coefficients_of_ones_own_hold_for_the_static_part_too(own, world, tmp_path):
     plan = replace(PLAN, backdrop_steps=40, fit=FitOptions(steps=2, effects=(own,)))
     start = Offsets.load(world / "start.json")
