@@ -65,6 +65,7 @@ def test_a_break_is_found_named_and_mended(effect, jump, still):
         ("freeze of the first", 505, -20 / 30),
         ("freeze of 30", 504, -1.0),  # a juggler, whose motion comes again
         ("halves exchanged", 511, -151 / 30),
+        ("halves exchanged", 87300, -5.0),
     ],
 )
 def test_frames_without_a_partner_are_no_part_and_speak_against_none(name, seed, jump):
