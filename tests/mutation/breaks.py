@@ -1163,6 +1163,14 @@ BREAKS = (
         "halves that are exchanged are a gap as long as the clip",
     ),
     Break(
+        "ends-however-sure",
+        "otsync/sync/parts.py",
+        "if surest > SURE and surest > SURER + _surest_within(matched, length):",
+        "if False:",
+        PARTS,
+        "three frames that were lost .6 s from an end are trusted",
+    ),
+    Break(
         "breaks-rest-of-all",
         "otsync/clocks/stillness.py",
         "wander = wander[moves][most >= np.quantile(most, FASTEST)]",

@@ -12,7 +12,7 @@ from otsync.bench.trust.worlds import CLASSES, plain
 from otsync.simulate import simulate
 from otsync.simulate.effects import Drop, In
 from otsync.sync.alike import Raw
-from otsync.sync.parts import _Matched, broken_part, does_not_agree, unvouched
+from otsync.sync.parts import Other, _Matched, broken_part, does_not_agree, unvouched
 from otsync.sync.verdict import Answer
 from otsync.types import Alignment, Clock, Matches, Status, TrackSet
 
@@ -26,6 +26,13 @@ def test_a_break_near_an_end_is_never_trusted_and_wrong(name):
     found = synchronize(world.tracks)
     ends, _ = world.errors(found)
     assert Status.BROKEN_CLOCK in found.flags[1] or ends.max() < 1
+
+
+def test_a_few_frames_lost_near_an_end_are_a_doubt():
+    """Another offset suits half a second little better, but as surely as none suits any other half."""
+    faults = (In(0, Drop(3 / FPS, at=0.1)),)
+    world = plain(499, motion="juggle", frames=183, tracks=122, within=0.0, first=faults)
+    assert Status.BROKEN_CLOCK in synchronize(world.tracks).flags[1]
 
 
 @pytest.mark.parametrize("motion", ["softball", "boxes"])
@@ -94,7 +101,7 @@ def test_a_part_within_is_named_where_few_agree_or_fewer_do_and_another_offset_s
         return share if 2 <= len(begins) - 1 <= 3 else 0.9
 
     monkeypatch.setattr("otsync.sync.parts._share", shares)
-    monkeypatch.setattr("otsync.sync.parts._others", lambda matched, begin, length: iter([(better, better)]))
+    monkeypatch.setattr("otsync.sync.parts._others", lambda matched, begin, length: iter([Other(better, better, 0.0)]))
     raw = Raw.of(a, answer.matches.pairs[:, 0]), Raw.of(b, answer.matches.pairs[:, 1])
     away = a.times - a.times[0]
     assert does_not_agree(_Matched(*raw, Clock(0.3), a.times, away)) == (begins[2] if named else None)
@@ -162,11 +169,11 @@ def test_a_gap_in_a_mended_clock_is_not_asked_about(seed):
 @pytest.mark.parametrize(("late", "named"), [(2.3, True), (1.7, False)])
 def test_the_end_of_a_short_overlap_must_know(monkeypatch, late, named):
     """Below two seconds another offset that suits the end as well is a doubt; above, it must suit it clearly better."""
-    monkeypatch.setattr("otsync.sync.parts._others", lambda *job: iter([(0.05, 0.5)]))
+    monkeypatch.setattr("otsync.sync.parts._others", lambda *job: iter([Other(0.05, 0.5, 0.0)]))
     assert (broken_part(*pair(late=late)) is not None) == named
     monkeypatch.setattr("otsync.sync.parts._others", lambda *job: iter([]))
     assert (broken_part(*pair(late=late)) is not None) == named  # nothing can be asked for
-    monkeypatch.setattr("otsync.sync.parts._others", lambda *job: iter([(-0.05, 0.5)]))
+    monkeypatch.setattr("otsync.sync.parts._others", lambda *job: iter([Other(-0.05, 0.5, 0.0)]))
     assert broken_part(*pair(late=late)) is None
 
 
@@ -190,3 +197,12 @@ def test_who_is_doubted_where_others_see_the_end():
     assert unvouched({(0, 1): (3.4, 3.9)}, answers, clips) == {(0, 1), (0, 2)}
     answers[2] = answer((1, 2), -1.0)
     assert unvouched({(0, 1): (3.4, 3.9)}, answers, clips) == {(0, 1), (0, 2), (1, 2)}
+
+
+@pytest.mark.parametrize(("end", "within", "doubted"), [(2.5, 0.5, True), (2.5, 2.0, False), (1.5, -1.0, False)])
+def test_a_small_gain_at_an_end_must_be_surer_than_any_within(monkeypatch, end, within, doubted):
+    def others(matched, begin, length):
+        return iter([Other(0.1, 0.5, end if begin == 0 else within)])
+
+    monkeypatch.setattr("otsync.sync.parts._others", others)
+    assert (broken_part(*pair()) is not None) == doubted
