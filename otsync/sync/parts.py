@@ -34,7 +34,7 @@ a break (mid to brutal, few tracks, like people, flocks, clean ones; seeds 500-5
 of real pairs, basketball, nine have .2 to .76: people turn, so that matched points move apart; there nothing suits, .10
 at most. Behind lost frames the true offset suits as usual, .3 to .5."""
 
-LITTLE, SURE, SURER, WITHIN = 0.05, 1.8, 1.0, 12
+LITTLE, SURE, SURER, WITHIN = 0.05, 1.5, 1.5, 12
 """The least gain of another offset that is a doubt where more than so many standard errors of the matches tell of it,
 and so many more than of any offset in the windows within, of which so many are asked. Where two to five frames were
 lost .3 to .9 s from an end, little is left that tells: of 70 worlds (clean to hard, seeds 88400 to 88469) seven were

@@ -226,6 +226,14 @@ def paused(seed: int) -> World:
     return plain(seed, first=(In(1, Drop(float(np.random.default_rng([seed, 903]).uniform(0.25, 0.5)))),))
 
 
+def beside_an_end(seed: int, preset: str = "mid") -> World:
+    """Three to five frames are lost .5 to .8 s from an end of one video."""
+    rng = np.random.default_rng([seed, 906])
+    away = float(rng.uniform(0.5, 0.8)) * FPS / 150
+    lost = In(1, Drop(int(rng.integers(3, 6)) / FPS, at=float(rng.choice([away, 1 - away]))))
+    return plain(seed, preset=preset, frames=150, first=(lost,), within=10)
+
+
 def performers(seed: int, *, motion: str, sees: Sequence[Sequence[int]]) -> World:
     """Like performers: video v sees those of ``sees[v]`` alone."""
     tracks, truth = drawn(seed, motion=motion, videos=len(sees), alike=True, within=15)
@@ -276,6 +284,8 @@ CLASSES: dict[str, Callable[[int], World]] = {
     "freeze of the first": partial(plain, first=(In(0, Freeze(20)),)),
     "ten frames dropped": partial(plain, first=(In(1, Drop(10 / 30)),)),
     "ten frames dropped, hard": partial(plain, preset="hard", first=(In(1, Drop(10 / 30)),)),
+    "few frames lost near an end": beside_an_end,
+    "few frames lost near an end, hard": partial(beside_an_end, preset="hard"),
     "freeze of 15, hard": partial(plain, preset="hard", first=(In(1, Freeze(15)),)),
     "freeze of 15, brutal": partial(plain, preset="brutal", first=(In(1, Freeze(15)),)),
     "a second missing": partial(plain, first=(In(1, Drop(1.0)),), within=15),
