@@ -261,7 +261,7 @@ def _new_pictures(steps: Float[np.ndarray, " S"]) -> Int[np.ndarray, " N"]:
     """The frames that show another picture than the one before; none where no gap sets moving steps apart from still
     ones.
     """
-    if not np.isfinite(steps).all():
+    if len(steps) < 2 or not np.isfinite(steps).all():
         return np.zeros(0, int)
     size = np.log(np.maximum(steps, ROUNDED * max(float(steps.max()), 1e-300)))
     order = np.sort(size)

@@ -42,10 +42,16 @@ USUAL = 3.0
 ENOUGH = 15
 """Frames that tell where a match's own constant difference lies."""
 
-BACK, HALF, LONG = 0.5, 0.5, 1.5
-"""Seconds by which a video must go back to be told from one that lost frames; share of the way from how well frames
-suit their own offset to how well they suit the wrong one, from which on they have no partner; and seconds of frames
-beside a break that are left out of its measurement in any case: a freeze seldom lasts longer."""
+BACK = 0.5
+"""Seconds by which a video must go back to be told from one whose partner lost frames."""
+
+HALF = 0.5
+"""Share of the way from how well frames suit their own offset to how well others suit the wrong one, from which on they
+have no partner. In replays of .6 to 1.5 s it is .1 to .4, beside 15 frames to a second that are missing .7 to 1.1."""
+
+LONG = 1.5
+"""Seconds that may be missing from which on the frames beside a break that suit are used to measure it; of less they
+are left out, since a video that stands still for so long half suits both offsets."""
 
 SIGMAS = 3.0
 """By which a pause that is counted may differ from what a pair measures, or by a frame and a half."""
@@ -170,7 +176,7 @@ def _goes_back(
     raw: tuple[Raw, Raw], first: float, second: float, when: float, limits: tuple[float, float]
 ) -> tuple[int, float] | None:
     """Which of the two videos, 0 or 1, goes back to what it has shown or not yet shown, and when, on its own clock:
-    every frame of it has a partner, on either side of a break at the one or the other offset. None: neither does.
+    every frame of it has a partner at one of the two offsets. None: neither does.
 
     Args:
         when, limits: as of :func:`_moment`, on the first one's clock.
@@ -259,8 +265,11 @@ def _length(a: TrackSplines, b: TrackSplines, part: Part) -> float:
 
 @dataclass(frozen=True)
 class _Moments:
-    """Where a break lies on one clock, s: the first offset suits up to ``when``, the second one from ``gap`` later on.
-    whole: the moment without a gap, where frames beside it suit the offsets as others do; None where they do not.
+    """Where a break lies on one clock, s.
+
+    Args:
+        when, gap: the first offset suits up to ``when``, the second one from ``gap`` later on.
+        whole: where the first offset ends and the second one begins at once; None where frames beside it suit neither.
     """
 
     when: float
@@ -269,7 +278,7 @@ class _Moments:
 
 
 def _moments(a: Raw, b: Raw, first: float, second: float, near: float, limits: tuple[float, float]) -> _Moments:
-    """The time of a's clock up to which the first offset suits the positions better."""
+    """Where the break near ``near`` lies on a's clock, within ``limits``."""
     reach = AROUND + min(abs(second - first), SEARCH)
     wide = reach + USUAL
     t = a.times[(a.times > max(limits[0], near - wide)) & (a.times < min(limits[1], near + wide))]

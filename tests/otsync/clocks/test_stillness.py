@@ -38,6 +38,16 @@ def filmed(shown: np.ndarray, noise: float = 0.0, seed: int = 0) -> np.ndarray:
 RATES = [10.0, 12.0, 15.0, 20.0, 24.0, 25.0]
 
 
+PAUSES = given(
+    rate=st.sampled_from(RATES),
+    lasts=st.integers(6, 45),
+    at=st.integers(40, 60),
+    behind=st.integers(22, 60),
+    guess=st.floats(-1.5, 1.5),
+    seed=st.integers(0, 99),
+)
+
+
 def pictures(frames: np.ndarray, rate: float) -> np.ndarray:
     """The moments, in frames, that a file of 30 a second shows of footage with ``rate`` pictures a second."""
     return np.floor(frames * rate / 30 + 1e-9) * 30 / rate
@@ -48,14 +58,7 @@ def paused(frames: np.ndarray, at: int, lasts: int) -> np.ndarray:
     return np.where(frames < at, frames, np.maximum(frames - lasts, at - 1))
 
 
-@given(
-    rate=st.sampled_from(RATES),
-    lasts=st.integers(6, 45),
-    at=st.integers(40, 60),
-    behind=st.integers(22, 60),
-    guess=st.floats(-1.5, 1.5),
-    seed=st.integers(0, 99),
-)
+@PAUSES
 def test_a_pause_of_a_file_that_repeats_pictures_is_counted(rate, lasts, at, behind, guess, seed):
     k = np.arange(at + lasts + behind)
     x = filmed(pictures(paused(k, at, lasts), rate) * FRAME, 0.002, seed)
@@ -68,17 +71,17 @@ def test_a_pause_of_a_file_that_repeats_pictures_is_counted(rate, lasts, at, beh
         assert abs(found[0] / FRAME - at - lasts) < 3
 
 
-@given(
-    rate=st.sampled_from(RATES),
-    lasts=st.integers(6, 45),
-    at=st.integers(40, 60),
-    behind=st.integers(22, 60),
-    guess=st.floats(-1.5, 1.5),
-    seed=st.integers(0, 99),
-)
+@PAUSES
 def test_a_pause_of_the_footage_is_not_counted_in_frames_of_a_file_that_repeats_pictures(
     rate, lasts, at, behind, guess, seed
 ):
     k = np.arange(at + lasts + behind)
     x = filmed(paused(pictures(k, rate), at, lasts) * FRAME, 0.002, seed)
     assert pause_of_pictures(k * FRAME, x, at * FRAME, (lasts + guess) * FRAME) is None
+
+
+@pytest.mark.parametrize("frames", [1, 2, 3, 12])
+def test_clips_too_short_to_count_pictures_tell_no_pause(frames):
+    x = filmed(np.arange(frames) * FRAME)
+    assert pause_of_pictures(np.arange(frames) * FRAME, x, 0.0, 0.3) is None
+    assert pause_of_pictures(np.arange(frames) * FRAME, np.full_like(x, np.nan), 0.0, 0.3) is None
