@@ -248,9 +248,11 @@ def test_a_clock_that_sways_is_ahead_and_behind_in_turn():
         (effects.ClockSway, {"period": 0.0}),
         (effects.ClockSway, {"size": 1.0, "period": 0.5}),
         (effects.ClockSway, {"size": float("inf")}),
+        (effects.LatePoses, {"late": float("nan")}),
+        (effects.LatePoses, {"settles": 0.0}),
     ],
 )
-def test_clocks_that_run_backwards_are_refused(effect, values):
+def test_what_cannot_happen_is_refused(effect, values):
     with pytest.raises(ValueError, match=next(iter(values))):
         effect(**values)
 
