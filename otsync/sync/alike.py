@@ -47,13 +47,13 @@ class Raw:
         return Raw(self.times[near], self.x[:, near])
 
     def at(self, t: np.ndarray) -> np.ndarray:
-        """(M,S,3) between two samples on a line; nan outside."""
+        """(M,S,3) between two samples on a line; nan outside, and in a gap, of which nothing is known."""
         right = np.clip(np.searchsorted(self.times, t), 1, len(self.times) - 1)
         step = self.times[right] - self.times[right - 1]
         share = ((t - self.times[right - 1]) / step)[None, :, None]
         x = (1 - share) * self.x[:, right - 1] + share * self.x[:, right]
-        outside = (t < self.times[0]) | (t > self.times[-1])
-        return np.where(outside[None, :, None], np.nan, x)
+        unknown = (t < self.times[0]) | (t > self.times[-1]) | ((share[0, :, 0] > 0) & ~self.sampled(t))
+        return np.where(unknown[None, :, None], np.nan, x)
 
     def sampled(self, t: np.ndarray) -> np.ndarray:
         """(S,) whether a moment lies between two samples that are no gap apart (:data:`GAP`)."""

@@ -441,7 +441,7 @@ def runs_on(answer: Answer, a: TrackSet, b: TrackSet, before: float, behind: flo
         return True  # nothing tells how well the positions agree elsewhere
     steps = np.arange(-round(OTHERS * 30), round(OTHERS * 30) + 1) / 30
     for low, high in ((before - BESIDE, before - MARGIN), (behind + MARGIN, behind + BESIDE)):
-        near = (t >= low) & (t <= high)
+        near = (t >= low) & (t <= high) & raw[1].sampled(clock.own(t))
         if near.sum() < LEAST_BESIDE:
             continue
         suits = [_level(*raw, clock, s, t[away], t[near]) for s in steps]
@@ -452,8 +452,13 @@ def runs_on(answer: Answer, a: TrackSet, b: TrackSet, before: float, behind: flo
 
 def _level(a: Raw, b: Raw, clock: Clock, late: float, known: np.ndarray, asked: np.ndarray) -> float:
     """How well positions agree at the moments ``asked`` of a's clock and an offset that is larger by ``late`` s, where
-    the differences at ``known`` moments, at the clock's own offset, are what is usual: see :func:`_suits`.
+    the differences at ``known`` moments, at the clock's own offset, are what is usual: see :func:`_suits`. Of those
+    moments that both videos show there; -inf where these are too few.
     """
     times = np.concatenate([known, asked])
     at_b = np.concatenate([clock.own(known), clock.own(asked - late)])
-    return float(_agreement(a.at(times) - b.at(at_b), np.arange(len(times)) < len(known))[len(known) :].mean())
+    apart = a.at(times) - b.at(at_b)
+    shown = (np.arange(len(times)) >= len(known)) & np.isfinite(apart[..., 0]).any(0)
+    if shown.sum() < LEAST_BESIDE:
+        return -math.inf
+    return float(_agreement(apart, np.arange(len(times)) < len(known))[shown].mean())

@@ -22,6 +22,7 @@ from ..costs.linear import binary_scale
 from ..geometry import directions
 from ..refine.samples import Pieces, detrended
 from ..types import Status, TrackSet
+from .alike import GAP
 from .verdict import Answer
 
 NEIGHBOURS = 3
@@ -114,6 +115,10 @@ def lag_of(tracks: TrackSet) -> Lag:
     parts = Pieces.at(frame, len(times), WINDOW)
     index = np.arange(len(times))
     within = (index >= parts.near) & (index < len(times) - parts.near)
+    # nor is a window whole in which frames are missing: all that moves jumps there
+    gaps = np.concatenate([[0], np.cumsum(np.diff(times) > GAP * frame)])
+    first, last = np.clip(index - parts.near, 0, None), np.clip(index + parts.near, None, len(times) - 1)
+    within &= gaps[first] == gaps[last]
     for frames, middle in parts:
         # curves of a piece alone: of an hour only a part is read
         t = times[frames]

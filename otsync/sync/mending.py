@@ -390,18 +390,19 @@ def cut_where_it_holds(
     Args:
         filmed: as they were filmed, on their videos' own clocks. tracks: on the clocks of the answers.
     """
-    shown = []
+    shown = []  # (K,2) per video: the moments of the frames before and behind each cut
     for v, video in enumerate(filmed):
         steps, breaks = Steps.of(video), broken.get(v, ())
-        shown.append(mended_times(steps.times, breaks)[0][unexplained(steps, breaks)])
+        behind = unexplained(steps, breaks)
+        shown.append(mended_times(steps.times, breaks)[0][np.stack([behind - 1, behind], 1)])
     found = set()
     for answer in answers:
         a, b = answer.pair
         if not answer.finite or not len(shown[a]) + len(shown[b]):
             continue
         clock = Clock(answer.refined.offset, answer.refined.rate)
-        for moment in (*shown[a], *clock.world(shown[b])):
-            if not runs_on(answer, tracks[a], tracks[b], float(moment), float(moment)):
+        for before, behind in (*shown[a], *clock.world(shown[b])):
+            if not runs_on(answer, tracks[a], tracks[b], float(before), float(behind)):
                 found.add(answer.pair)
     return found
 

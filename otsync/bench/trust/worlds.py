@@ -221,6 +221,21 @@ def bending(seed: int) -> World:
     return plain(seed, first=(In(1, ClockRamp(change)),))
 
 
+def times_given(seed: int, *, off: float = 0.0, preset: str = "mid") -> World:
+    """A second is missing from one video, and its file says so by its times.
+
+    Args:
+        off: s by which they say too much.
+    """
+    world = plain(seed, preset=preset, first=(In(1, Drop(1.0)),), within=15)
+    assert world.shown is not None
+    first, second = world.tracks
+    times = world.shown[1] - world.shown[1][0]
+    behind = int(np.argmax(np.diff(times))) + 1
+    told = replace(second, timestamps=times + off * (np.arange(len(times)) >= behind))
+    return World((first, told), world.shown)
+
+
 def paused(seed: int) -> World:
     """A recorder that was paused for .25 to .5 s, and goes on between two frames of before."""
     return plain(seed, first=(In(1, Drop(float(np.random.default_rng([seed, 903]).uniform(0.25, 0.5)))),))
@@ -289,6 +304,9 @@ CLASSES: dict[str, Callable[[int], World]] = {
     "freeze of 15, hard": partial(plain, preset="hard", first=(In(1, Freeze(15)),)),
     "freeze of 15, brutal": partial(plain, preset="brutal", first=(In(1, Freeze(15)),)),
     "a second missing": partial(plain, first=(In(1, Drop(1.0)),), within=15),
+    "a second missing, times given": times_given,
+    "a second missing, times given, hard": partial(times_given, preset="hard"),
+    "a second missing, times off": partial(times_given, off=-0.3),
     "recorder paused": paused,
     "halves exchanged": partial(plain, first=(In(1, Cut()),), within=15),
     "a replay": partial(plain, first=(In(1, Replay(1.0)),), within=15),
