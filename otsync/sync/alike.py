@@ -50,9 +50,9 @@ class Raw:
         """(M,S,3) between two samples on a line; nan outside, and in a gap, of which nothing is known."""
         right = np.clip(np.searchsorted(self.times, t), 1, len(self.times) - 1)
         step = self.times[right] - self.times[right - 1]
-        share = ((t - self.times[right - 1]) / step)[None, :, None]
-        x = (1 - share) * self.x[:, right - 1] + share * self.x[:, right]
-        unknown = (t < self.times[0]) | (t > self.times[-1]) | ((share[0, :, 0] > 0) & ~self.sampled(t))
+        share = (t - self.times[right - 1]) / step
+        x = (1 - share)[None, :, None] * self.x[:, right - 1] + share[None, :, None] * self.x[:, right]
+        unknown = (share < 0) | (share > 1) | ((share > 0) & (share < 1) & ~self.sampled(t))
         return np.where(unknown[None, :, None], np.nan, x)
 
     def sampled(self, t: np.ndarray) -> np.ndarray:

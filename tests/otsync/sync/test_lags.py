@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from otsync import synchronize
-from otsync.bench.trust.worlds import plain
+from otsync.bench.trust.worlds import plain, times_given
 from otsync.simulate import simulate
 from otsync.simulate.effects import Gaps, In, Lag, PositionNoise, Repeats
 from otsync.sync.lags import lag_of
@@ -54,6 +54,13 @@ def test_delays_are_told_from_none(noise, seed):
     assert lag_of(film(*noise, seed=seed)).told < 0.3 / FPS
     found = lag_of(film(LATE, *noise, seed=seed))
     assert found.told > 0.6 / FPS and found.sigma > 0.5 / FPS
+
+
+@pytest.mark.parametrize("seed", [611, 615])
+def test_frames_that_times_say_are_missing_are_no_delay(seed):
+    """All that moves jumps there; hard worlds without delays were `lagging` by half a frame."""
+    _, second = times_given(seed, preset="hard").tracks
+    assert lag_of(second).told < 0.2 / FPS
 
 
 def flat(tracks: TrackSet) -> TrackSet:

@@ -1,0 +1,33 @@
+"""Samples as they were seen: read between neighbours, and of a gap in a clock nothing is known."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from otsync.sync.alike import Raw
+
+FPS = 30.0
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    seed=st.integers(0, 2**31),
+    frames=st.integers(8, 60),
+    at=st.integers(3, 4),
+    missing=st.integers(2, 40),
+    moments=st.lists(st.floats(-1, 4), min_size=1, max_size=20),
+)
+def test_positions_lie_on_lines_between_samples_and_nowhere_in_a_gap(seed, frames, at, missing, moments):
+    rng = np.random.default_rng(seed)
+    k = np.arange(frames) + np.where(np.arange(frames) >= at, missing, 0)
+    x = rng.normal(size=(5, frames, 3))
+    raw, t = Raw(k / FPS, x), np.array([*moments, *(k / FPS)])
+    found = raw.at(t)
+    outside = (t < raw.times[0]) | (t > raw.times[-1])
+    inside = (t > raw.times[at - 1]) & (t < raw.times[at])
+    assert np.isnan(found[:, outside | inside]).all()
+    asked = ~outside & ~inside
+    lines = [[np.interp(t[asked], raw.times, axis) for axis in track.T] for track in x]
+    np.testing.assert_allclose(found[:, asked], np.swapaxes(lines, 1, 2), atol=1e-9)
