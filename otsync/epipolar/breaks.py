@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..clocks.common import nominal_fps, on_clock, within
-from ..clocks.cuts import CLEAR_PATH, Steps
+from ..clocks.cuts import CLEAR_PATH, GAP, Steps
 from ..clocks.lengths import jumping
 from ..clocks.stillness import pauses
 from ..geometry import seen_pixels
@@ -87,11 +87,13 @@ class Moment:
     Args:
         start: until then it ran. at: from then on it runs again; later where it stood still between them.
         sure: whether the path of its camera is cut there. Then both pieces must vouch for the same offset.
+        told: whether its own times say that frames are missing there.
     """
 
     start: float
     at: float
     sure: bool = False
+    told: bool = False
 
     @property
     def still(self) -> float:
@@ -128,7 +130,12 @@ def moments(tracks: TrackSet) -> list[Moment]:
     shown = sorted(path.cuts(CLEAR_PATH), key=lambda k: -float(path.jolts[k - 1]))[:MOST_MOMENTS]
     sure = [Moment(float(t[k]), float(t[k]), True) for k in shown]
     told = [Moment(float(t[i]), float(t[j])) for i, j in rests]
-    told += [Moment(float(t[k]), float(t[k])) for k in cuts if not any(abs(t[k] - m.at) <= NEARBY for m in sure)]
+    gap = np.diff(t) > GAP * np.median(np.diff(t)) if len(t) > 1 else np.zeros(0, bool)
+    told += [
+        Moment(float(t[k]), float(t[k]), told=bool(gap[k - 1]))
+        for k in cuts
+        if not any(abs(t[k] - m.at) <= NEARBY for m in sure)
+    ]
     long = [m for m in told if m.start - t[0] >= LEAST_PIECE - 1e-9 and t[-1] - m.at >= LEAST_PIECE - 1e-9]
     return [*sure, *long[:MOST_MOMENTS]]
 
@@ -156,6 +163,8 @@ def find_breaks(
         for moment in all_moments:
             pieces = asked.pieces(moment)
             doubt = math.inf if moment.sure and not pieces.vouched() else pieces.doubt()
+            if moment.told and doubt > 0 and asked.runs_on(moment, _beside(moment, all_moments)):
+                doubt = 0.0
             told.append((*pieces.best(*moment.jumps(1 / nominal_fps(tracks[v]))), doubt, moment))
         doubt = max((t[3] for t in told), default=0.0)
         if doubt <= DOUBTED:
@@ -222,6 +231,12 @@ class Asked:
                 first, last = pair.other.times[[0, -1]] + pair.offset
                 shared[k] = np.maximum(shared[k], np.minimum(grid + end, last) - np.maximum(grid + begin, first))
         return Evidence(grid, total[0], total[1], shared)
+
+    def runs_on(self, moment: Moment, spans: tuple[Span, Span]) -> bool:
+        """Whether most pairs measure one offset on both sides of a moment, each by itself, and know it to a frame."""
+        told = [pair.jump(self.refiner, self.own, spans, (self.around, self.around)) for pair in self.pairs]
+        known = np.array([t for t in told if t is not None]).reshape(-1, 2)
+        return bool(2 * (np.abs(known[:, 0]) + known[:, 1] <= AGREED).sum() > len(told))
 
     def measured(self, moment: Moment, spans: tuple[Span, Span], before: float, jump: float) -> Break | None:
         """The break as the pairs measure it, beside it; None where most of them do not agree."""
