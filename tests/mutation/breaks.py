@@ -1460,6 +1460,22 @@ BREAKS = (
         "where frames are missing all tracks jump, and seem late",
     ),
     Break(
+        "pixels-times-never-heard",
+        "otsync/epipolar/breaks.py",
+        "return bool(2 * (np.abs(known[:, 0]) + known[:, 1] <= AGREED).sum() > len(told))",
+        "return False",
+        ("tests/otsync/epipolar/test_breaks.py",),
+        "a file whose times say what it lacks is doubted all the same",
+    ),
+    Break(
+        "pixels-times-believed",
+        "otsync/epipolar/breaks.py",
+        "return bool(2 * (np.abs(known[:, 0]) + known[:, 1] <= AGREED).sum() > len(told))",
+        "return True",
+        ("tests/otsync/epipolar/test_breaks.py",),
+        "a file whose times say something else than what it lacks is trusted",
+    ),
+    Break(
         "pixels-pieces-unseen",
         "otsync/epipolar/breaks.py",
         "self.shared[:, k] >= LEAST_PIECE",
