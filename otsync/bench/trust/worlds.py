@@ -221,19 +221,18 @@ def bending(seed: int) -> World:
     return plain(seed, first=(In(1, ClockRamp(change)),))
 
 
-def times_given(seed: int, *, off: float = 0.0, preset: str = "mid") -> World:
-    """A second is missing from one video, and its file says so by its times.
+def times_given(seed: int, *, off: float = 0.0, made: Callable[..., World] = plain, **options: Any) -> World:
+    """A second is missing from the second video, or as much as ``options`` say, and its file says so by its times.
 
     Args:
-        off: s by which they say too much.
+        off: s by which they say too much. made: what makes the world, with ``options``.
     """
-    world = plain(seed, preset=preset, first=(In(1, Drop(1.0)),), within=15)
+    world = made(seed, **{"first": (In(1, Drop(1.0)),)} | options)
     assert world.shown is not None
-    first, second = world.tracks
     times = world.shown[1] - world.shown[1][0]
     behind = int(np.argmax(np.diff(times))) + 1
-    told = replace(second, timestamps=times + off * (np.arange(len(times)) >= behind))
-    return World((first, told), world.shown)
+    told = replace(world.tracks[1], timestamps=times + off * (np.arange(len(times)) >= behind))
+    return World((world.tracks[0], told, *world.tracks[2:]), world.shown, world.options)
 
 
 def paused(seed: int) -> World:
@@ -304,9 +303,9 @@ CLASSES: dict[str, Callable[[int], World]] = {
     "freeze of 15, hard": partial(plain, preset="hard", first=(In(1, Freeze(15)),)),
     "freeze of 15, brutal": partial(plain, preset="brutal", first=(In(1, Freeze(15)),)),
     "a second missing": partial(plain, first=(In(1, Drop(1.0)),), within=15),
-    "a second missing, times given": times_given,
-    "a second missing, times given, hard": partial(times_given, preset="hard"),
-    "a second missing, times off": partial(times_given, off=-0.3),
+    "a second missing, times given": partial(times_given, within=15),
+    "a second missing, times given, hard": partial(times_given, preset="hard", within=15),
+    "a second missing, times off": partial(times_given, off=-0.3, within=15),
     "recorder paused": paused,
     "halves exchanged": partial(plain, first=(In(1, Cut()),), within=15),
     "a replay": partial(plain, first=(In(1, Replay(1.0)),), within=15),
@@ -337,6 +336,8 @@ CLASSES: dict[str, Callable[[int], World]] = {
     "phones in hands": in_hands,
     "phones in hands, four lost": partial(in_hands, first=(In(1, Drop(4 / 30)),)),
     "phones in hands, ten lost": partial(in_hands, first=(In(1, Drop(10 / 30)),)),
+    "phones in hands, times given": partial(times_given, made=in_hands, first=(In(1, Drop(10 / 30)),)),
+    "phones in hands, times off": partial(times_given, made=in_hands, first=(In(1, Drop(10 / 30)),), off=-0.2),
     "phones in hands, poses off, ten lost": partial(in_hands, off=True, first=(In(1, Drop(10 / 30)),)),
     "phones in hands, one frozen": partial(in_hands, first=(In(1, Freeze(8)),)),
     "phones in hands, rate 4 %": partial(in_hands, rate=1.04),
