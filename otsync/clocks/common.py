@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from numpy.lib.stride_tricks import sliding_window_view
 
 from ..compute.indices import blocks, evenly
 from ..types import Matches, TrackSet
@@ -16,6 +17,12 @@ SAME_FPS = 1e-9
 
 EVEN = 1e-3
 """Frames that timestamps may lie beside an even grid: containers round them to ticks of a millisecond and less."""
+
+GAP = 2.5
+"""Frames beyond which what lies between two samples is a gap in a clock, of which nothing is known."""
+
+AROUND = 5
+"""Steps on either side of one that tell how long a frame is there."""
 
 WHOLE = 1e-6
 """Frames by which a clip may fall short of a whole number of them, for rounding."""
@@ -148,6 +155,17 @@ def nominal_fps(tracks: TrackSet) -> float:
     """Frames per second as declared, else from the timestamps' median step."""
     assert tracks.fps is not None or tracks.n_frames == 1
     return tracks.fps or USUAL_FPS
+
+
+def missing(times: Float[np.ndarray, " T"]) -> Bool[np.ndarray, " T-1"]:
+    """The steps over which frames are missing, by the times themselves: longer than :data:`GAP` of those around them.
+    A rate that changes (60 frames a second, then 20) leaves no gap.
+    """
+    steps = np.diff(times)
+    if len(steps) < 2:
+        return np.zeros(len(steps), bool)
+    around = sliding_window_view(np.pad(steps, AROUND, constant_values=np.nan), 2 * AROUND + 1)
+    return np.asarray(steps > GAP * np.nanmedian(around, 1))
 
 
 def is_uniform(tracks: TrackSet) -> bool:

@@ -13,12 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from ..clocks.common import nominal_fps, on_clock, within
-from ..clocks.cuts import CLEAR_PATH, GAP, Steps
+from ..clocks.common import missing, nominal_fps, on_clock, within
+from ..clocks.cuts import CLEAR_PATH, Steps
 from ..clocks.lengths import jumping
 from ..clocks.stillness import pauses
 from ..geometry import seen_pixels
-from ..types import Alignment, Break, Matches, Status, TrackSet
+from ..types import Alignment, Break, Matches, Status, TrackSet, mended_times
 from .poses import Views
 from .refine import EpipolarRefine
 from .scan import EpipolarScan, unit_of
@@ -87,7 +87,7 @@ class Moment:
     Args:
         start: until then it ran. at: from then on it runs again; later where it stood still between them.
         sure: whether the path of its camera is cut there. Then both pieces must vouch for the same offset.
-        told: whether its own times say that frames are missing there.
+        told: whether the times of its file say that frames are missing there.
     """
 
     start: float
@@ -120,8 +120,8 @@ class Found:
     broke: Break | None
 
 
-def moments(tracks: TrackSet) -> list[Moment]:
-    """When a video looks as if it was cut, or as if it stood still."""
+def moments(tracks: TrackSet, breaks: Sequence[Break] = ()) -> list[Moment]:
+    """When a video looks as if it was cut, or as if it stood still; ``breaks``: that were mended, on its own clock."""
     t, x = tracks.times, seen_pixels(tracks)
     rests = sorted(pauses(x), key=lambda p: p[0] - p[1])[:MOST_MOMENTS]
     steps = Steps.in_pixels(tracks)
@@ -130,9 +130,9 @@ def moments(tracks: TrackSet) -> list[Moment]:
     shown = sorted(path.cuts(CLEAR_PATH), key=lambda k: -float(path.jolts[k - 1]))[:MOST_MOMENTS]
     sure = [Moment(float(t[k]), float(t[k]), True) for k in shown]
     told = [Moment(float(t[i]), float(t[j])) for i, j in rests]
-    gap = np.diff(t) > GAP * np.median(np.diff(t)) if len(t) > 1 else np.zeros(0, bool)
+    gap, made = missing(t), mended_times(np.array([b.at for b in breaks]), breaks)[0]
     told += [
-        Moment(float(t[k]), float(t[k]), told=bool(gap[k - 1]))
+        Moment(float(t[k]), float(t[k]), told=bool(gap[k - 1] and (np.abs(made - t[k]) > NEARBY).all()))
         for k in cuts
         if not any(abs(t[k] - m.at) <= NEARBY for m in sure)
     ]
@@ -146,6 +146,7 @@ def find_breaks(
     tracks: Sequence[TrackSet],
     matches: Mapping[tuple[int, int], Matches],
     seconds: Float[np.ndarray, " V"],
+    mended: Mapping[int, Sequence[Break]] | None = None,
 ) -> list[Found]:
     """The videos whose pieces, beside a moment at which they look broken, one offset does not suit.
 
@@ -154,17 +155,18 @@ def find_breaks(
         matches: of the pairs that are asked, the surest first: of each video so many as :data:`MOST_PAIRS`.
         seconds: (V,) offsets of the videos, of which those of the others are taken as they are; nan where there is
             none.
+        mended: breaks of each video that ``tracks`` are mended of: a gap that this made is nothing its file says.
     """
     found = []
     for v in range(len(tracks)):
         asked = Asked.of(scan, refiner, tracks, matches, seconds, v)
-        all_moments = moments(tracks[v]) if asked.pairs else []
+        all_moments = moments(tracks[v], (mended or {}).get(v, ())) if asked.pairs else []
         told = []
         for moment in all_moments:
             pieces = asked.pieces(moment)
             doubt = math.inf if moment.sure and not pieces.vouched() else pieces.doubt()
-            if moment.told and doubt > 0 and asked.runs_on(moment, _beside(moment, all_moments)):
-                doubt = 0.0
+            if moment.told and doubt > DOUBTED and asked.runs_on(moment, _beside(moment, all_moments)):
+                continue
             told.append((*pieces.best(*moment.jumps(1 / nominal_fps(tracks[v]))), doubt, moment))
         doubt = max((t[3] for t in told), default=0.0)
         if doubt <= DOUBTED:
@@ -233,10 +235,13 @@ class Asked:
         return Evidence(grid, total[0], total[1], shared)
 
     def runs_on(self, moment: Moment, spans: tuple[Span, Span]) -> bool:
-        """Whether most pairs measure one offset on both sides of a moment, each by itself, and know it to a frame."""
+        """Whether most pairs, and more than one, measure the video's offset on both sides of a moment, each side by
+        itself from there on, and know the difference to a frame.
+        """
         told = [pair.jump(self.refiner, self.own, spans, (self.around, self.around)) for pair in self.pairs]
         known = np.array([t for t in told if t is not None]).reshape(-1, 2)
-        return bool(2 * (np.abs(known[:, 0]) + known[:, 1] <= AGREED).sum() > len(told))
+        agree = int((np.abs(known[:, 0]) + known[:, 1] <= AGREED).sum())
+        return agree >= LEAST_PAIRS and 2 * agree > len(told)
 
     def measured(self, moment: Moment, spans: tuple[Span, Span], before: float, jump: float) -> Break | None:
         """The break as the pairs measure it, beside it; None where most of them do not agree."""

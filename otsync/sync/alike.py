@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
+from ..clocks.common import missing
 from ..compute.medians import known_median
 from ..types import TrackSet
 
@@ -18,9 +19,6 @@ MARGIN = 3 / 30
 
 LEAST_KNOWN = 5
 """Samples that tell where a match's own constant difference lies, at least."""
-
-GAP = 2.5
-"""Frames beyond which what lies between two samples is a gap in a clock, of which nothing is known."""
 
 LEAST_BESIDE = 4
 """Frames that are asked beside a break, at least."""
@@ -48,18 +46,24 @@ class Raw:
 
     def at(self, t: np.ndarray) -> np.ndarray:
         """(M,S,3) between two samples on a line; nan outside, and in a gap, of which nothing is known."""
+        if len(self.times) < 2:
+            return np.full((len(self.x), len(t), 3), np.nan)
         right = np.clip(np.searchsorted(self.times, t), 1, len(self.times) - 1)
         step = self.times[right] - self.times[right - 1]
         share = (t - self.times[right - 1]) / step
         x = (1 - share)[None, :, None] * self.x[:, right - 1] + share[None, :, None] * self.x[:, right]
-        unknown = (share < 0) | (share > 1) | ((share > 0) & (share < 1) & ~self.sampled(t))
+        unknown = (share < 0) | (share > 1) | ((share > 0) & (share < 1) & self._missing[right - 1])
         return np.where(unknown[None, :, None], np.nan, x)
 
     def sampled(self, t: np.ndarray) -> np.ndarray:
-        """(S,) whether a moment lies between two samples that are no gap apart (:data:`GAP`)."""
-        right = np.clip(np.searchsorted(self.times, t), 1, len(self.times) - 1)
-        steps = np.diff(self.times)
-        return np.asarray(steps[right - 1] < GAP * np.median(steps))
+        """(S,) whether a moment lies between two samples that are no gap apart."""
+        if len(self.times) < 2:
+            return np.zeros(len(t), bool)
+        return np.asarray(~self._missing[np.clip(np.searchsorted(self.times, t), 1, len(self.times) - 1) - 1])
+
+    @cached_property
+    def _missing(self) -> np.ndarray:
+        return missing(self.times)
 
     @cached_property
     def _bends(self) -> np.ndarray:

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 
+from ..clocks.common import missing
 from ..clocks.splines import TrackSplines
 from ..compute.indices import evenly
 from ..compute.medians import known_median
@@ -22,7 +23,6 @@ from ..costs.linear import binary_scale
 from ..geometry import directions
 from ..refine.samples import Pieces, detrended
 from ..types import Status, TrackSet
-from .alike import GAP
 from .verdict import Answer
 
 NEIGHBOURS = 3
@@ -115,10 +115,12 @@ def lag_of(tracks: TrackSet) -> Lag:
     parts = Pieces.at(frame, len(times), WINDOW)
     index = np.arange(len(times))
     within = (index >= parts.near) & (index < len(times) - parts.near)
-    # nor is a window whole in which frames are missing: all that moves jumps there
-    gaps = np.concatenate([[0], np.cumsum(np.diff(times) > GAP * frame)])
+    # nor is a window whole in which frames are missing, for all that moves jumps there; but where hardly any other is
+    # left, delays must be asked for all the same
+    gaps = np.concatenate([[0], np.cumsum(missing(times))])
     first, last = np.clip(index - parts.near, 0, None), np.clip(index + parts.near, None, len(times) - 1)
-    within &= gaps[first] == gaps[last]
+    even = within & (gaps[first] == gaps[last])
+    within = even if 2 * even.sum() >= within.sum() else within
     for frames, middle in parts:
         # curves of a piece alone: of an hour only a part is read
         t = times[frames]

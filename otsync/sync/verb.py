@@ -183,7 +183,7 @@ def _mended_in_pixels(
     """The verdict, with clocks that break put right (``tracks`` and ``broken`` in place), or their pairs doubted."""
     refiner = refining if isinstance(refining, EpipolarRefine) else EpipolarRefine()
     for _ in range(MOST):
-        found = find_breaks(aligner, refiner, tracks, _matches(verdict), verdict.x)
+        found = find_breaks(aligner, refiner, tracks, _matches(verdict), verdict.x, broken)
         new = [f for f in found if f.broke is not None and not _known(f.broke, broken.get(f.video, ()))]
         if not new:
             break
@@ -197,7 +197,7 @@ def _mended_in_pixels(
         fresh = {answer.pair: answer for answer in map(run, [j for j in jobs if v in j.pair])}
         verdict = judged([fresh.get(a.pair, a) for a in verdict.answers])
     else:
-        found = find_breaks(aligner, refiner, tracks, _matches(verdict), verdict.x)
+        found = find_breaks(aligner, refiner, tracks, _matches(verdict), verdict.x, broken)
     breaking = {f.video for f in found}
     return judged([doubted(a) if breaking & set(a.pair) else a for a in verdict.answers]) if breaking else verdict
 

@@ -11,11 +11,22 @@ from otsync.sync.alike import Raw
 FPS = 30.0
 
 
+def test_a_rate_that_falls_leaves_no_gap():
+    """60 frames a second, then 20 in which each lies 3 usual steps from the next; a single frame tells nothing."""
+    times = np.concatenate([np.arange(90) / 60, 1.5 + np.arange(20) / 20])
+    raw = Raw(times, np.repeat(times[None, :, None], 3, 2))
+    t = np.linspace(0, times[-1], 300)
+    assert raw.sampled(t).all()
+    np.testing.assert_allclose(raw.at(t)[0, :, 0], t, atol=1e-12)
+    lone = Raw(times[:1], raw.x[:, :1])
+    assert np.isnan(lone.at(t)).all() and not lone.sampled(t).any()
+
+
 @settings(max_examples=50, deadline=None)
 @given(
     seed=st.integers(0, 2**31),
-    frames=st.integers(8, 60),
-    at=st.integers(3, 4),
+    frames=st.integers(12, 60),
+    at=st.integers(2, 6),
     missing=st.integers(2, 40),
     moments=st.lists(st.floats(-1, 4), min_size=1, max_size=20),
 )
