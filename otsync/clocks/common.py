@@ -158,14 +158,15 @@ def nominal_fps(tracks: TrackSet) -> float:
 
 
 def missing(times: Float[np.ndarray, " T"]) -> Bool[np.ndarray, " T-1"]:
-    """The steps over which frames are missing, by the times themselves: longer than :data:`GAP` of those around them.
-    A rate that changes (60 frames a second, then 20) leaves no gap.
+    """The steps over which frames are missing, by the times themselves: longer than :data:`GAP` of those around them,
+    and of the whole. A rate that changes (60 frames a second, then 20) leaves no gap, nor do frames that a clock put
+    right shows twice, a hair apart.
     """
     steps = np.diff(times)
     if len(steps) < 2:
         return np.zeros(len(steps), bool)
     around = sliding_window_view(np.pad(steps, AROUND, constant_values=np.nan), 2 * AROUND + 1)
-    return np.asarray(steps > GAP * np.nanmedian(around, 1))
+    return np.asarray(steps > GAP * np.maximum(np.nanmedian(around, 1), np.median(steps)))
 
 
 def is_uniform(tracks: TrackSet) -> bool:

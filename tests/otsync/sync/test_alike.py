@@ -18,6 +18,8 @@ def test_a_rate_that_falls_leaves_no_gap():
     t = np.linspace(0, times[-1], 300)
     assert raw.sampled(t).all()
     np.testing.assert_allclose(raw.at(t)[0, :, 0], t, atol=1e-12)
+    twice = np.sort(np.concatenate([times, times[20:60] + 1e-4]))  # a replay, put right
+    assert Raw(twice, np.zeros((1, len(twice), 3))).sampled(t).all()
     lone = Raw(times[:1], raw.x[:, :1])
     assert np.isnan(lone.at(t)).all() and not lone.sampled(t).any()
 
