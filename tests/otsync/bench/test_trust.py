@@ -223,7 +223,7 @@ def test_a_sweep_writes_what_each_value_trusts(tmp_path, monkeypatch):
 
 
 def test_tracks_without_depth_take_no_other_method_and_no_limit_of_one():
-    assert len(WITHOUT_DEPTH) == 6
+    assert len(WITHOUT_DEPTH) == 8
     for name in WITHOUT_DEPTH:
         with pytest.raises(ValueError, match=f"{name}: expected no other method, .*; found 'paper'"):
             one((name, "paper", 500))
