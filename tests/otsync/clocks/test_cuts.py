@@ -147,6 +147,9 @@ def test_a_cut_speaks_where_the_answer_does_not_hold_beside_it():
     assert said(0.5, (even, told)) and said(-0.5, (told, even))
     wrong = TrackSet(lacking, fps=FPS, timestamps=times - 0.3 * (times > 107 / FPS))
     assert said(0.0, (even, wrong)) and said(0.0, (wrong, even))
+    # right behind the gap alone, and the gap so long that the frames before it lie far from those behind it
+    long = TrackSet(lacking, fps=FPS, timestamps=times + 0.3 * (times > 107 / FPS))
+    assert said(-0.3, (even, long)) and said(0.3, (long, even))
 
 
 @pytest.mark.parametrize("preset", ["mid", pytest.param("hard", marks=pytest.mark.slow)])
