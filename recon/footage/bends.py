@@ -77,11 +77,11 @@ def bent(video: Video, seconds: float, wave: Float[np.ndarray, " T"]) -> tuple[V
         return video, 0.0
     slope = float((np.abs(np.diff(wave)) / np.diff(video.times)).max())
     seconds = float(np.clip(seconds, -STEEPEST / slope, STEEPEST / slope)) if slope else 0.0
-    return replace(video, fps=None, timestamps=video.times + seconds * wave), seconds
+    return replace(video, timestamps=video.times + seconds * wave), seconds
 
 
 def bent_tracks(tracks: TrackSet, video: Video, seconds: float, wave: Float[np.ndarray, " T"]) -> TrackSet:
     """Tracks of a video with its clock bent. video: before that."""
     if not seconds:
         return tracks
-    return replace(tracks, fps=None, timestamps=tracks.times + seconds * np.interp(tracks.times, video.times, wave))
+    return replace(tracks, timestamps=tracks.times + seconds * np.interp(tracks.times, video.times, wave))

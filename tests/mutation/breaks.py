@@ -1765,6 +1765,14 @@ BREAKS = (
         "what a scene was bent by is no part of its clocks, so that no fit unbends it",
     ),
     Break(
+        "fit-bends-track-anew",
+        "recon/footage/bends.py",
+        "return replace(video, timestamps=video.times + seconds * wave), seconds",
+        "return replace(video, fps=None, timestamps=video.times + seconds * wave), seconds",
+        ("tests/recon/footage/test_bends.py",),
+        "a bent clock has a rate of its own, so that nothing that is kept of its pixels is found",
+    ),
+    Break(
         "fit-share-never-measured",
         "recon/fit/verb.py",
         "kept, scale = (usual, 1.0) if told is None else (told.kept, told.scale)",

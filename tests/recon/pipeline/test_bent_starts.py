@@ -60,6 +60,8 @@ def test_a_scene_with_bends_is_that_of_bent_videos(world, unsure, given: bool):
         np.testing.assert_array_equal(f.times, scene.videos[scene.names.index(f.name)].times)
         np.testing.assert_allclose(g.times, f.times + f.bend * f.wave)
         assert g.bend == 0
+    if not given:  # a bend is of clocks alone: pixels are tracked once
+        assert len(list((world / "stages").glob("tracks-*"))) == len(ready.footage)
 
 
 def test_a_fit_unbends_clocks_and_tells_what_it_left(world, unsure):
