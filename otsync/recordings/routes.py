@@ -42,7 +42,7 @@ from ..sync.mending import on_own_clock
 from ..sync.method import Method
 from ..sync.verb import jump_sigma, synchronize
 from ..types import Offsets, Status, TrackSet, Video
-from ..types.checks import check_whole
+from ..types.checks import check_number, check_whole
 from .given import names_of, tracks_of
 from .kept_pairs import KeptPairs
 from .learned_depth import remedy, with_depth
@@ -68,6 +68,7 @@ def synchronize_scene(
     processes: int = 1,
     tell: Tell = lambda text: None,
     deadline: Deadline | None = None,
+    fine_enough: float | None = None,
 ) -> Synchronized:
     """Put the videos of a scene on one clock.
 
@@ -85,11 +86,15 @@ def synchronize_scene(
             alone. Programs that use more need Python's usual ``if __name__ == "__main__"``.
         tell: receives one line per stage.
         deadline: of the job that this is a part of: stereo is left out where it would take more than its share.
+        fine_enough: frames of the reference. Where pixels give every offset, unflagged and with a smaller sigma, route
+            "auto" leaves stereo out, for a job that goes on to fit the offsets to pictures; None: it never does.
 
     A video in which nothing can be followed is ``static``, with a clock of its own, where two others are left and it is
     not the reference; NothingToFollow otherwise.
     """
     check_whole("processes", processes, 1)
+    if fine_enough is not None:
+        check_number("fine_enough", fine_enough)
     solve = partial(
         _synchronized,
         route=route,
@@ -100,6 +105,7 @@ def synchronize_scene(
         processes=processes,
         tell=tell,
         deadline=deadline,
+        fine_enough=fine_enough,
     )
     return of_those_that_move(scene, reference, solve, tell)
 
@@ -116,6 +122,7 @@ def _synchronized(
     processes: int,
     tell: Tell,
     deadline: Deadline | None,
+    fine_enough: float | None,
 ) -> Synchronized:
     """:func:`synchronize_scene` of videos that all have something to follow; NothingToFollow names others."""
     for video in scene.videos:
@@ -154,8 +161,10 @@ def _synchronized(
     if chosen == "epipolar":
         return epipolar
     asked = named or route == "stereo"
-    late = "" if deadline is None or asked else _too_late(progress.seconds["epipolar"], deadline)
-    doubt = late or _too_doubtful(first, stages)
+    doubt = _too_doubtful(first, stages)
+    if not (asked or doubt):
+        late = "" if deadline is None else _too_late(progress.seconds["epipolar"], deadline)
+        doubt = late or ("" if fine_enough is None else _fine(first, fine_enough))
     if doubt:
         _refuse_unused(method, doubt)
         tell(doubt)
@@ -468,6 +477,16 @@ def _too_late(epipolar: float, deadline: Deadline) -> str:
     return (
         f"no stereo: it would take about {STEREO_COST * epipolar:.0f} s of the {deadline.left:.0f} s that the budget "
         "leaves; the epipolar answer stands"
+    )
+
+
+def _fine(first: Offsets, enough: float) -> str:
+    """Why stereo has nothing to add to the pixels' answer: sigma is below so many frames; empty where it has."""
+    most = float(np.max(first.sigma * first.fps[first.reference]))
+    if _flagged(first) or not most < enough:
+        return ""
+    return (
+        f"no stereo: pixels give every offset to {most:.2f} frame, and pictures refine it; the epipolar answer stands"
     )
 
 

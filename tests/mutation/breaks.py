@@ -1765,6 +1765,14 @@ BREAKS = (
         "what a scene was bent by is no part of its clocks, so that no fit unbends it",
     ),
     Break(
+        "fine-enough-forgets-flags",
+        "otsync/recordings/routes.py",
+        "if _flagged(first) or not most < enough:",
+        "if not most < enough:",
+        ("tests/otsync/recordings/test_placement.py",),
+        "a run leaves stereo out where the pixels' answer is doubted",
+    ),
+    Break(
         "fit-bends-track-anew",
         "recon/footage/bends.py",
         "return replace(video, timestamps=video.times + seconds * wave), seconds",

@@ -103,6 +103,35 @@ def test_an_empty_hull_leaves_the_epipolar_answer(tmp_path, monkeypatch):
         routes.synchronize_scene(scene, route="stereo")
 
 
+@pytest.mark.parametrize(
+    ("sigma", "enough", "doubted", "asked"),
+    [(0.2, 0.25, set(), False), (0.3, 0.25, set(), True), (0.2, None, set(), True), (0.2, 0.25, {"v1"}, True)],
+)
+def test_stereo_is_left_out_where_pixels_are_fine_enough(tmp_path, monkeypatch, sigma, enough, doubted, asked):
+    """Sigma in frames of the reference; a doubt of any video asks stereo, and so does the named route."""
+    write_recording(tmp_path, [0.0] * 5, frames=2)
+    known = offsets(set())
+    first = with_doubts(replace(known, sigma=np.r_[0.0, np.full(4, sigma)] / known.fps[known.reference]), doubted)
+    went = []
+
+    def empty(*args, **more):
+        went.append(args)
+        raise EmptyHull("masks: their visual hull is empty.")
+
+    monkeypatch.setattr(routes, "track_all", lambda *args: [None] * 5)
+    monkeypatch.setattr(routes, "select", lambda *args: None)
+    monkeypatch.setattr(routes, "pairs_in_pixels", lambda *args: first)
+    monkeypatch.setattr(routes, "stereo_depth", empty)
+    found = routes.synchronize_scene(open_scene(tmp_path), fine_enough=enough)
+    assert bool(went) == asked
+    assert any("pixels give every offset to 0.20 frame" in line for line in found.why) == (not asked)
+    np.testing.assert_array_equal(found.offsets.seconds, first.seconds)
+    with pytest.raises(EmptyHull):
+        routes.synchronize_scene(open_scene(tmp_path), route="stereo", fine_enough=enough)
+    with pytest.raises(ValueError, match="fine_enough: expected a finite number above 0; found -1"):
+        routes.synchronize_scene(open_scene(tmp_path), fine_enough=-1.0)
+
+
 def test_a_walk_that_was_filmed_since_is_told(tmp_path, capsys):
     """The remedy of a doubtful calibration is a new clip: sync says that it had no part in the cameras."""
     folder = tmp_path / "four phones"
