@@ -65,9 +65,11 @@ def run(
     if unknown:
         raise ValueError(f"--only: expected classes among {', '.join(CLASSES)}; found {', '.join(sorted(unknown))}.")
     chosen = tuple(only) or tuple(CLASSES)
-    jobs = [(name, "default", first_seed + k) for name in chosen for k in range(seeds)]
+    asked = [(name, "default") for name in chosen]
     if not only:
-        jobs += [(n, m, first_seed + k) for n in SHORT for m in METHODS if m != "default" for k in range(seeds)]
+        asked += [(n, m) for n in SHORT for m in METHODS if m != "default"]
+    # seed by seed: a draw that is stopped has answers of every class
+    jobs = [(name, method, first_seed + k) for k in range(seeds) for name, method in asked]
     about = {"seeds": seeds, "first_seed": first_seed}
     rows = list(measured(jobs, one, "trust", Kept(out / "trust_answers.jsonl")))
     write_rows(out, "trust", [written(r) for r in rows], about)
