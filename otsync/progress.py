@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -51,8 +52,7 @@ def bar(
     shown: bool = True,
 ) -> tqdm:
     """A bar on stderr where it is a terminal; a line now and then where it is a log or a pipe."""
-    from tqdm import tqdm
-
+    tqdm = _tqdm()
     known: dict[str, Any] = {"desc": what, "unit": unit, "total": total, "initial": initial, "leave": False}
     if _quiet or not shown:
         return tqdm(items, disable=True, **known)
@@ -77,10 +77,21 @@ class Lines:
 
 def say(text: str) -> None:
     """Print a line without tearing a bar."""
+    _tqdm().write(text, file=sys.stdout)
+    sys.stdout.flush()
+
+
+_LOCK = threading.RLock()
+
+
+def _tqdm() -> type[tqdm]:
+    """With a lock for threads alone. Its own is for processes, too: a semaphore that one which is ended leaves behind,
+    and no two processes of ours draw.
+    """
     from tqdm import tqdm
 
-    tqdm.write(text, file=sys.stdout)
-    sys.stdout.flush()
+    tqdm.set_lock(_LOCK)
+    return tqdm
 
 
 Tell = Callable[[str], None]

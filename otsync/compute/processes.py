@@ -98,6 +98,44 @@ class Processes:
                 pool.shutdown(wait=False, cancel_futures=True)
 
 
+@contextmanager
+def process_pool(
+    workers: int, begin: Callable[..., object] | None = None, arguments: tuple[Any, ...] = ()
+) -> Iterator[ProcessPoolExecutor]:
+    """An executor for independent jobs: where the block ends by an exception its processes end, whatever they do.
+
+    They begin anew, since a fork beside threads may wait for one forever; they never see Ctrl-C, which is the parent's;
+    and they end where that is killed.
+
+    Args:
+        workers: processes, each on as many threads as this one. begin: is called in each of them, with the arguments.
+    """
+    from multiprocessing import active_children, get_context
+
+    others = set(active_children())
+    pool = ProcessPoolExecutor(
+        workers, mp_context=get_context("spawn"), initializer=_begin_with, initargs=(get_threads(), begin, arguments)
+    )
+    try:
+        with _interrupts_kept_from_children():
+            for _ in range(workers):  # each begins with a call
+                pool.submit(os.getpid)
+        yield pool
+    except BaseException:  # what they are at would be waited for
+        pool.shutdown(wait=False, cancel_futures=True)
+        for child in set(active_children()) - others:
+            child.terminate()
+        raise
+    finally:
+        pool.shutdown()
+
+
+def _begin_with(threads: int, begin: Callable[..., object] | None, arguments: tuple[Any, ...]) -> None:
+    _begin(threads)
+    if begin is not None:
+        begin(*arguments)
+
+
 def _unpacked(packed: bytes) -> tuple[bool, Any]:
     """In another process: whether it can read what it was sent, and the answer."""
     try:

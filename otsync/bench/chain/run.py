@@ -13,9 +13,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +21,7 @@ import numpy as np
 
 from ...align.likelihood import LikelihoodScan
 from ...align.warping import DTW
+from ...compute.processes import process_pool
 from ...costs.epipolar import EpipolarDistance
 from ...costs.linear import Cosine, Cost
 from ...costs.positions import CurveDistance
@@ -161,7 +160,7 @@ def run(
     if done:
         say(f"{len(done)} cases are kept from an earlier run; {len(left)} are to be measured")
     if left:
-        with workers(cases, only) as pool:
+        with process_pool(len(os.sched_getaffinity(0)), begin, (cases, only)) as pool:
             for found in counted(pool.map(partial(measure, only=only), left), "chains", "case", len(left)):
                 rows += found
                 write_rows(out, "chain_answers", rows, about)  # a run that is stopped continues here
@@ -184,12 +183,6 @@ def continued(out: Path, about: dict[str, Any]) -> list[dict[str, Any]]:
 
 _cases: list[tuple[str, Callable[[], Case]]] = []
 """What a worker chooses from: sent to it once, since a recording's tracks are too large to send for every pair."""
-
-
-def workers(cases: list[tuple[str, Callable[[], Case]]], only: tuple[str, ...]) -> Executor:
-    """One process a core, each with the cases; begun anew, since a fork beside threads may wait for one forever."""
-    cores = len(os.sched_getaffinity(0))
-    return ProcessPoolExecutor(cores, mp_context=get_context("spawn"), initializer=begin, initargs=(cases, only))
 
 
 def begin(cases: list[tuple[str, Callable[[], Case]]], only: tuple[str, ...]) -> None:

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ...align.warping import DTW
+from ...compute.processes import process_pool
 from ...progress import counted, tell
 from ...sync.method import PAPER, Method
 from ...sync.verb import synchronize
@@ -94,25 +94,18 @@ def measured(
     Args:
         what: is counted, in the progress bar. kept: what was measured before, and is not measured again.
     """
-    import multiprocessing
-
     todo = [job for job in jobs if kept is None or kept.rows(job) is None]
     if kept is not None and len(todo) < len(jobs):
         tell(f"{what}: {len(jobs) - len(todo)} of {len(jobs)} worlds were answered before: {kept.path}")
-    workers = len(os.sched_getaffinity(0))
-    with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+    with process_pool(len(os.sched_getaffinity(0))) as pool:
         fresh = iter(counted(pool.map(answer, todo, chunksize=2), what, "world", total=len(todo)))
-        try:
-            for job in jobs:
-                rows = None if kept is None else kept.rows(job)
-                if rows is None:
-                    rows = next(fresh)
-                    if kept is not None:
-                        kept.keep(job, rows)
-                yield from rows
-        except BaseException:  # what is on its way would be waited for
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+        for job in jobs:
+            rows = None if kept is None else kept.rows(job)
+            if rows is None:
+                rows = next(fresh)
+                if kept is not None:
+                    kept.keep(job, rows)
+            yield from rows
 
 
 def one(job: tuple[str, str, int], changed: Method | None = None) -> list[dict[str, Any]]:

@@ -12,7 +12,7 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 
-from otsync.compute.processes import Processes
+from otsync.compute.processes import Processes, process_pool
 
 
 def double(x):
@@ -113,6 +113,14 @@ def nap(seconds):
     time.sleep(seconds)
 
 
+def counted_nap(seconds):
+    """Beside a bar of progress, whose own lock would be left behind."""
+    from otsync.progress import counted
+
+    for _ in counted([0], "naps", "nap"):
+        nap(seconds)
+
+
 def alive(pid):
     try:
         with open(f"/proc/{pid}/stat") as file:
@@ -121,10 +129,21 @@ def alive(pid):
         return False
 
 
-def napping(tmp_path):
+POOL = """
+import os, sys, time
+sys.path.insert(0, {here!r})
+from test_processes import counted_nap
+from otsync.compute.processes import process_pool
+if __name__ == "__main__":
+    with process_pool(2) as pool:
+        list(pool.map(counted_nap, [60.0, 60.0, 60.0]))
+"""
+
+
+def napping(tmp_path, code=CHILD):
     """A process of which two children nap, and these."""
     script = tmp_path / "parent.py"
-    script.write_text(CHILD.format(here=os.path.dirname(__file__)))
+    script.write_text(code.format(here=os.path.dirname(__file__)))
     parent = subprocess.Popen(
         [sys.executable, script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
     )
@@ -153,3 +172,30 @@ def test_ctrl_c_is_the_parents(tmp_path):
     assert all(map(alive, children))
     os.killpg(parent.pid, signal.SIGKILL)
     parent.communicate()
+
+
+def test_a_pool_s_processes_begin_as_they_are_told_and_answer_in_order():
+    with process_pool(2, begin, ("told",)) as pool:
+        assert list(pool.map(begun, [1, 2, 3])) == [(1, "told"), (2, "told"), (3, "told")]
+
+
+TOLD = []
+
+
+def begin(word):
+    TOLD.append(word)
+
+
+def begun(item):
+    return item, *TOLD
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="looks into /proc")
+@pytest.mark.parametrize("group", [False, True], ids=["parent", "all, as a terminal does"])
+def test_an_interrupted_pool_does_not_wait_for_its_jobs(tmp_path, group):
+    """And its processes say nothing; the one line is the parent's own."""
+    parent, children = napping(tmp_path, POOL)
+    (os.killpg if group else os.kill)(parent.pid, signal.SIGINT)
+    _, said = parent.communicate(timeout=50)  # naps take a minute
+    assert not any(map(alive, children))
+    assert said.count("Traceback") == 1 and said.rstrip().endswith("KeyboardInterrupt")
