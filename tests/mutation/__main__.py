@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
 from functools import partial
 
@@ -19,6 +20,7 @@ def main() -> int:
         slips = chosen(options.only)
     except ValueError as error:
         parser.error(str(error))
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that the copies are removed then, too
     outcomes = mutate(slips, workers=options.workers, whole=options.whole, tell=partial(print, flush=True))
     print(table(outcomes))
     return 0 if share(outcomes) >= PROMISED else 1
