@@ -16,7 +16,7 @@ from recon.fit.checkpoint import Snapshot
 from recon.fit.densify import Densify
 from recon.fit.optimize import Adam, Decay, check_rates
 from recon.fit.problem import Problem, assemble, scene_groups
-from recon.fit.uncertainty import FRAMES, newton_sigma
+from recon.fit.uncertainty import FRAMES, Votes, cast
 from recon.fit.witnesses import Told, told_by_bends
 from recon.losses.image import Seen
 from recon.losses.motion import Draw
@@ -140,7 +140,7 @@ class Run:
                 self._pull += r.pull
 
     def steps_after(self) -> int:
-        """Steps that take as long as what :meth:`sigma` looks at: three renderings a vote."""
+        """Steps that take as long as :meth:`votes`: three renderings a vote."""
         if "offsets" not in self.adam.groups:
             return 0
         votes = np.minimum(np.unique(self.problem.keys[:, 0], return_counts=True)[1], FRAMES).sum()
@@ -163,10 +163,10 @@ class Run:
         with torch.no_grad():
             return compose_over(compose(observe, p.effects, values)(shot), clip.behind(box))
 
-    def sigma(self, values: dict[str, Tensor], map: MapLike = map) -> np.ndarray:
-        """[V] seconds of each video's own clock: see :func:`recon.fit.uncertainty.newton_sigma`."""
+    def votes(self, values: dict[str, Tensor], map: MapLike = map) -> list[Votes]:
+        """What frames say of each video's own clock: see :func:`recon.fit.uncertainty.cast`."""
         p = self.problem
-        return newton_sigma(
+        return cast(
             lambda v, k, later: self.look(values, v, k, later),
             lambda v, k: p.clips[v].image(k, p.clips[v].box(k)),
             p.keys,
@@ -176,7 +176,7 @@ class Run:
         )
 
     def told(self, sigma: np.ndarray) -> Told | None:
-        """What the bends of the clocks tell, None where none were bent; ``sigma`` as of :meth:`sigma`."""
+        """What the bends of the clocks tell, None where none were bent; ``sigma``: seconds, of the votes."""
         left = self.values()["bends"].detach().cpu().numpy()
         return told_by_bends(np.array([c.footage.bend for c in self.problem.clips]), left, sigma) if len(left) else None
 

@@ -15,8 +15,9 @@ the fit and the clocks that it began with say together is told in :mod:`recon.fi
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -37,7 +38,21 @@ BEFORE = 0.6  # and from which on those are that they are held against
 LEFT = 1.5  # of the last move that is still to go: .6 / (1 - .6)
 
 
-def newton_sigma(
+class Votes(NamedTuple):
+    """What frames of one video say of its clock, in their order; see the head of this file.
+
+    frames: which. g, h: of each; -sum(g)/sum(h) is their step in seconds. residual, rate: the sums of
+    :func:`by_misfit`.
+    """
+
+    frames: np.ndarray
+    g: np.ndarray
+    h: np.ndarray
+    residual: np.ndarray
+    rate: np.ndarray
+
+
+def cast(
     look: Look,
     target: Target,
     keys: np.ndarray,
@@ -45,8 +60,8 @@ def newton_sigma(
     frame_step: float,
     frames: int = FRAMES,
     map: MapLike = map,
-) -> np.ndarray:
-    """[V] standard deviations in seconds of each video's clock; nan where nothing moves.
+) -> list[Votes]:
+    """The votes of each video; of less than two frames none are asked.
 
     Args:
         look: (video, frame, seconds) -> the image [h,w,3] that the scene gives, that much later than the frame.
@@ -54,14 +69,21 @@ def newton_sigma(
         keys: (K,2) the (video, frame) that took part in the fit. frames: of a video that vote, at most. map: calls
             the votes.
     """
-    variance = np.full(n_videos, np.nan)
+    votes = []
     for v in range(n_videos):
-        own = keys[keys[:, 0] == v, 1]
-        if len(own) < 2:
-            continue
-        chosen = own[scattered(len(own), frames)]
-        votes = np.array(list(map(partial(_vote, look, target, STEP * frame_step, v), chosen.tolist())))
-        variance[v] = max(sandwich(votes[:, 0], votes[:, 1]), by_misfit(votes[:, 2], votes[:, 3]) ** 2)
+        own = np.sort(keys[keys[:, 0] == v, 1])
+        chosen = own[scattered(len(own), frames)] if len(own) > 1 else own[:0]
+        found = list(map(partial(_vote, look, target, STEP * frame_step, v), chosen.tolist()))
+        votes.append(Votes(chosen, *np.array(found).reshape(-1, 4).T))
+    return votes
+
+
+def newton_sigma(votes: Sequence[Votes]) -> np.ndarray:
+    """[V] standard deviations in seconds of each video's clock; nan where nothing moves."""
+    variance = np.full(len(votes), np.nan)
+    for v, one in enumerate(votes):
+        if len(one.frames):
+            variance[v] = max(sandwich(one.g, one.h), by_misfit(one.residual, one.rate) ** 2)
     shown = int(np.isfinite(variance).sum())
     if shown > 1:  # V videos have 2 V numbers of a point, three of which tell where it is, and none of time
         variance *= 2 * shown / (2 * shown - 3)

@@ -28,9 +28,10 @@ from otsync.types import Offsets, Status
 from otsync.types.status import in_order
 from recon.fit.checkpoint import Checkpoint
 from recon.fit.options import FitOptions
+from recon.fit.parts import broken
 from recon.fit.problem import Problem, assemble, check_groups
 from recon.fit.run import Diverged, Run
-from recon.fit.uncertainty import averaged, unreached, unsettled
+from recon.fit.uncertainty import averaged, newton_sigma, unreached, unsettled
 from recon.fit.undisturbed import one_thread_each
 from recon.fit.witnesses import Told, reconciled, relative_sigma, repeated, scaled_start, share_kept, unseen
 from recon.footage.footage import Footage
@@ -255,8 +256,12 @@ def _finish(run: Run, seconds: float, map: MapLike) -> Reconstruction:
     told: Told | None = None
     flags = list(p.offsets.flags)
     if "offsets" in run.adam.groups:
-        refined, sigma, raised, told = _witnessed(run, refined, sigma, run.sigma(values, map), history)
-        for v, flag in raised:
+        votes = run.votes(values, map)
+        refined, sigma, raised, told = _witnessed(run, refined, sigma, newton_sigma(votes), history)
+        parts = broken(votes, p.scene.frame_step)
+        # where the reference's clock breaks all others are off by it
+        apart = [v for v in range(len(p.clips)) if v != p.reference] if p.reference in parts else parts
+        for v, flag in (*raised, *((v, Status.BROKEN_CLOCK) for v in apart)):
             flags[p.index[v]] = in_order((*flags[p.index[v]], flag))
     clocks = torch.as_tensor(refined).to(values["offsets"])
     scene = replace(scene, motion=scene.motion.shifted(-drift, clocks)).to("cpu")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from recon.fit.uncertainty import MISFIT, averaged, newton_sigma, sandwich, scattered, unreached, unsettled
+from recon.fit.uncertainty import MISFIT, averaged, cast, newton_sigma, sandwich, scattered, unreached, unsettled
 from recon.fit.witnesses import IMAGES, reconciled, relative_sigma, repeated, share_kept, unseen
 
 
@@ -45,7 +45,7 @@ def test_offset_errors_are_told():
 
     keys = np.array([(v, k) for v in range(3) for k in range(24)])
     wobble = np.random.default_rng(1).normal(size=(3, 24)) * 0.003
-    sigma = newton_sigma(
+    votes = cast(
         lambda v, k, later: pixels(k * frame_step + later),
         lambda v, k: pixels(k * frame_step + true[v] + wobble[v, k]),
         keys,
@@ -53,7 +53,7 @@ def test_offset_errors_are_told():
         frame_step,
         frames=24,
     )
-    sigma = relative_sigma(sigma, 0)
+    sigma = relative_sigma(newton_sigma(votes), 0)
     expected = np.sqrt(0.003**2 / 24 * 2 + true**2)
     assert sigma[0] == 0
     assert sigma[1:] == pytest.approx(expected[1:], rel=0.5)
@@ -62,8 +62,8 @@ def test_offset_errors_are_told():
 def test_a_video_that_shows_no_motion_has_no_sigma():
     still = torch.zeros(2, 2, 3)
     keys = np.array([(0, 0), (0, 1), (1, 0), (1, 1)])
-    sigma = newton_sigma(lambda v, k, later: still, lambda v, k: still, keys, 2, 1 / 30)
-    assert np.isnan(sigma).all()
+    votes = cast(lambda v, k, later: still, lambda v, k: still, keys, 2, 1 / 30)
+    assert np.isnan(newton_sigma(votes)).all()
 
 
 def test_what_a_fit_could_not_reach_stays_as_unsure_as_it_was():
@@ -79,14 +79,14 @@ def test_the_reference_s_own_error_counts():
     def pixels(seconds: float) -> torch.Tensor:
         return torch.sin(phase + 9 * seconds)
 
-    sigma = newton_sigma(
+    votes = cast(
         lambda v, k, later: pixels(k / 30 + later),
         lambda v, k: pixels(k / 30 + (0.004 if v == 0 else 0.0)),
         np.array([(v, k) for v in range(2) for k in range(12)]),
         2,
         1 / 30,
     )
-    sigma = relative_sigma(sigma, 0)
+    sigma = relative_sigma(newton_sigma(votes), 0)
     assert sigma[0] == 0 and sigma[1] == pytest.approx(2 * 0.004, rel=0.1)  # of two videos motion takes up a half
 
 
@@ -217,8 +217,8 @@ def test_a_scene_that_shows_its_frames_badly_is_unsure_of_their_clocks():
     keys = np.array([(v, k) for v in range(2) for k in range(20)])
 
     def sigma(early: float) -> float:
-        own = newton_sigma(lambda v, k, later: pixels(later), lambda v, k: target(early), keys, 2, 1 / 30)
-        return relative_sigma(own, 0)[1]
+        votes = cast(lambda v, k, later: pixels(later), lambda v, k: target(early), keys, 2, 1 / 30)
+        return relative_sigma(newton_sigma(votes), 0)[1]
 
     assert sigma(0.02) == pytest.approx(
         np.sqrt(2) * 2 * 0.02**2 / MISFIT, rel=0.05

@@ -1,0 +1,124 @@
+"""Votes of frames tell a clock that breaks: laws on votes, and fits of worlds that lost frames."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from otsync.types import Offsets, Status, TrackSet
+from recon.fit.parts import GAP, LEAST, broken, parting
+from recon.fit.uncertainty import Votes
+from recon.fit.verb import fit
+from recon.simulate.capture import Capture, synthetic
+from recon.simulate.recording import initial_scene
+
+STEP = 1 / 30
+
+
+def votes(seconds: np.ndarray, h: np.ndarray | None = None) -> Votes:
+    """Of frames of which each tells ``seconds``."""
+    h = np.ones(len(seconds)) if h is None else h
+    return Votes(np.arange(len(seconds)), -seconds * h, h, np.zeros(len(h)), h)
+
+
+def noise(seed: int, n: int = 48, size: float = 0.02) -> np.ndarray:
+    return np.random.default_rng(seed).normal(size=n) * size * STEP
+
+
+@given(
+    seed=st.integers(0, 99), at=st.integers(LEAST + 2, 42), gap=st.floats(0.2, 2.0), back=st.booleans(), n=st.just(48)
+)
+def test_a_step_is_found_where_it_is(seed, at, gap, back, n):
+    size = -gap if back else gap
+    told = noise(seed, n) + np.where(np.arange(n) < at, 0.0, size * STEP)
+    rng = np.random.default_rng(seed)
+    found = parting(votes(told, rng.uniform(0.5, 2.0, n)))
+    assert found is not None and found.frame == at
+    assert found.gap / STEP == pytest.approx(size, abs=0.05) and abs(found.gap) > 4 * found.sigma
+
+
+@given(seed=st.integers(0, 999), videos=st.integers(2, 14))
+def test_frames_that_agree_are_no_parts(seed, videos):
+    """However long the votes of neighbours wander together, below the least gap."""
+    rng = np.random.default_rng(seed)
+    told = [np.convolve(noise(seed + v, 60, 0.1), np.full(6, 1 / 6), "valid")[:48] for v in range(videos)]
+    assert broken([votes(t, rng.uniform(0.5, 2.0, 48)) for t in told], STEP) == []
+
+
+@given(seed=st.integers(0, 99), who=st.integers(0, 4), at=st.integers(8, 40))
+def test_the_one_that_breaks_is_told_from_those_it_pulls(seed, who, at):
+    after = np.arange(48) >= at
+    told = [noise(seed + v) + STEP * np.where(after, *((0.4, -0.4) if v == who else (-0.06, 0.06))) for v in range(5)]
+    assert broken(list(map(votes, told)), STEP) == [who]
+
+
+def test_what_all_videos_show_badly_is_no_clock_s():
+    after = np.arange(48) >= 20
+    told = [noise(v) + STEP * 0.3 * after * (-1) ** v for v in range(6)]
+    assert broken(list(map(votes, told)), STEP) == []
+    assert broken(list(map(votes, told[:2])), STEP) == [0, 1]  # of two nothing is usual
+
+
+def test_a_gap_that_noise_makes_is_none():
+    assert broken([votes(noise(v, size=2.0)) for v in range(5)], STEP) == []
+
+
+@pytest.mark.parametrize("told", [np.zeros(0), np.zeros(2 * LEAST - 1)])
+def test_few_frames_have_no_parts(told):
+    assert parting(votes(told)) is None and broken([votes(told)] * 3, STEP) == []
+
+
+def test_where_nothing_moves_there_are_no_parts():
+    still = votes(np.zeros(48), np.zeros(48))
+    assert parting(still) is None and broken([still, votes(noise(0))], STEP) == []
+    late = votes(noise(1) + STEP * GAP * 3 * (np.arange(48) > 30), np.r_[np.zeros(20), np.ones(28)])
+    assert broken([still, late], STEP) == [1]
+
+
+def lost(capture: Capture, video: int, at: int, frames: int) -> Capture:
+    """The capture of which one video lost frames, and does not say so."""
+    f, t, z = capture.footage[video], capture.tracks[video], capture.depth[video]
+    keep = np.r_[:at, at + frames : len(f)]
+    assert f.masks is not None and t.uv is not None
+    short = replace(
+        f, images=f.images[keep], masks=f.masks[keep], boxes=f.boxes[keep], bad=f.bad[keep], times=f.times[: len(keep)]
+    )
+    tracks = TrackSet(
+        t.positions()[:, keep], t.seen[:, keep], t.features, t.fps, None, t.name, t.uv[:, keep], camera=t.camera
+    )
+
+    def put(items, item):
+        return (*items[:video], item, *items[video + 1 :])
+
+    return replace(
+        capture,
+        footage=put(capture.footage, short),
+        tracks=put(capture.tracks, tracks),
+        depth=put(capture.depth, [z[int(k)] for k in keep]),
+    )
+
+
+def fitted(seed: int, broken: int | None, frames: int = 2, steps: int = 500) -> Offsets:
+    """The clocks that a fit finds of five videos of two seconds, one of which lost frames in the middle."""
+    capture = synthetic(seed, frames=60, offsets=0.0)
+    start = np.zeros(5)
+    if broken is not None:
+        capture = lost(capture, broken, 30, frames)
+        start[broken] = frames / 2 / 30
+    known = Offsets.known([f.name for f in capture.footage], start, 30)
+    loose = replace(known, sigma=np.r_[0, np.full(4, 0.2 / 30)])
+    return fit(initial_scene(capture, loose), capture.footage, loose, steps=steps).offsets
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [521, 522])
+@pytest.mark.parametrize("who", [None, 3, 0], ids=["none", "one", "the reference"])
+def test_a_fit_says_that_a_clock_breaks(seed, who):
+    """Two frames lost: off by a frame at either end, at a sigma of .17, and it was ok."""
+    found = fitted(seed, who)
+    said = [v for v, flags in enumerate(found.flags) if Status.BROKEN_CLOCK in flags]
+    assert said == {None: [], 3: [3], 0: [1, 2, 3, 4]}[who]
