@@ -19,7 +19,7 @@ import numpy as np
 from recon.fit.uncertainty import Votes, sandwich
 
 LEAST = 4
-"""Votes on either side of a break."""
+"""Votes of a part, and of the rest."""
 
 GAP = 0.15
 """Frames between the offsets of two parts, from which on a clock breaks. Worlds of ``recon.simulate.capture`` of which
@@ -34,30 +34,41 @@ OTHERS = 3.0
 
 
 class Parting(NamedTuple):
-    """Two parts of a video whose votes differ most.
+    """A part of a video whose votes differ most from those of the rest.
 
-    gap: seconds by which the offset of the second is larger. sigma: of the gap. frame: the second's first that voted.
+    gap: seconds by which its offset is larger. sigma: of the gap. first, last: the frames that voted at its ends.
     """
 
     gap: float
     sigma: float
-    frame: int
+    first: int
+    last: int
 
 
 def parting(votes: Votes) -> Parting | None:
-    """The two parts of a video that explain its votes best; None where too few of its frames show motion."""
-    g, h = votes.g, votes.h
-    found: tuple[float, Parting] | None = None
-    for k in range(LEAST, len(g) - LEAST + 1):
-        sides = [_offset(g[part], h[part]) for part in (slice(None, k), slice(k, None))]
-        (first, var_first, told_first), (second, var_second, told_second) = sides
-        if not (told_first > 0 and told_second > 0):
-            continue
-        gain = (second - first) ** 2 * told_first * told_second / (told_first + told_second)
-        if found is None or gain > found[0]:
-            sigma = float(np.sqrt(var_first + var_second))
-            found = gain, Parting(second - first, sigma, int(votes.frames[k]))
-    return None if found is None else found[1]
+    """The part of a video that, with an offset of its own, explains its votes best; None where too few show motion.
+
+    It ends the video where the clock breaks once, and lies within where it breaks and is right again (frames that were
+    lost, and later as many that stand still).
+    """
+    n, g, h = len(votes.g), votes.g, votes.h
+    G, H = (np.concatenate([[0.0], np.cumsum(x)]) for x in (g, h))
+    first, end = np.triu_indices(n + 1, LEAST)
+    kept = (first > 0) & (end - first <= n - LEAST)  # a first part is the rest of the other one
+    first, end = first[kept], end[kept]
+    inside, outside = H[end] - H[first], H[-1] - (H[end] - H[first])
+    moves = (inside > 0) & (outside > 0)
+    if not moves.any():
+        return None
+    first, end, inside, outside = first[moves], end[moves], inside[moves], outside[moves]
+    step = -(G[end] - G[first]) / inside
+    gap = step + (G[-1] - (G[end] - G[first])) / outside
+    best = int(np.argmax(gap**2 * inside * outside / (inside + outside)))
+    part = slice(first[best], end[best])
+    variance = _variance(g[part], h[part]) + _variance(np.delete(g, part), np.delete(h, part))
+    return Parting(
+        float(gap[best]), float(np.sqrt(variance)), int(votes.frames[first[best]]), int(votes.frames[end[best] - 1])
+    )
 
 
 def broken(votes: Sequence[Votes], frame_step: float) -> list[int]:
@@ -81,10 +92,6 @@ def broken(votes: Sequence[Votes], frame_step: float) -> list[int]:
     return out
 
 
-def _offset(g: np.ndarray, h: np.ndarray) -> tuple[float, float, float]:
-    """The step of a part in seconds, its variance, and its information; 0 of the last where nothing moves."""
-    told = float(h.sum())
-    if not told > 0:
-        return 0.0, 0.0, 0.0
-    step = -float(g.sum()) / told
-    return step, sandwich(g + h * step, h), told
+def _variance(g: np.ndarray, h: np.ndarray) -> float:
+    """Of the offset of a part, about itself."""
+    return sandwich(g - h * (g.sum() / h.sum()), h)

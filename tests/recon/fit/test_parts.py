@@ -37,8 +37,16 @@ def test_a_step_is_found_where_it_is(seed, at, gap, back, n):
     told = noise(seed, n) + np.where(np.arange(n) < at, 0.0, size * STEP)
     rng = np.random.default_rng(seed)
     found = parting(votes(told, rng.uniform(0.5, 2.0, n)))
-    assert found is not None and found.frame == at
+    assert found is not None and (found.first, found.last) == (at, n - 1)
     assert found.gap / STEP == pytest.approx(size, abs=0.05) and abs(found.gap) > 4 * found.sigma
+
+
+@given(seed=st.integers(0, 99), first=st.integers(6, 20), length=st.integers(10, 22), gap=st.floats(0.3, 2.0))
+def test_a_part_within_is_found_where_it_is(seed, first, length, gap):
+    inside = (np.arange(48) >= first) & (np.arange(48) < first + length)
+    found = parting(votes(noise(seed) - gap * STEP * inside))
+    assert found is not None and (found.first, found.last) == (first, first + length - 1)
+    assert found.gap / STEP == pytest.approx(-gap, abs=0.05) and abs(found.gap) > 4 * found.sigma
 
 
 @given(seed=st.integers(0, 999), videos=st.integers(2, 14))
