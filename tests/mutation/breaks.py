@@ -1775,8 +1775,8 @@ BREAKS = (
     Break(
         "fit-parts-unheard",
         "recon/fit/parts.py",
-        "if gaps[v] > max(GAP, OTHERS * usual) and abs(one.gap) > SURE * one.sigma:",
-        "if gaps[v] > 100 * max(GAP, OTHERS * usual) and abs(one.gap) > SURE * one.sigma:",
+        "if gaps[v] > max(GAP, OTHERS * usual, shown) and abs(one.gap) > SURE * one.sigma:",
+        "if gaps[v] > 100 * max(GAP, OTHERS * usual, shown) and abs(one.gap) > SURE * one.sigma:",
         ("tests/recon/fit/test_parts.py",),
         "a clock that breaks is trusted after a fit",
     ),
@@ -1787,6 +1787,14 @@ BREAKS = (
         "usual = 0.0",
         ("tests/recon/fit/test_parts.py",),
         "what a scene shows badly in every video passes for broken clocks",
+    ),
+    Break(
+        "fit-parts-badly-shown",
+        "recon/fit/parts.py",
+        "shown = SHOWN * float(np.median(misfits)) / frame_step if misfits else 0.0",
+        "shown = 0.0",
+        ("tests/recon/fit/test_parts.py",),
+        "of a poor fit of two videos every clock is said to break",
     ),
     Break(
         "fit-parts-of-noise",

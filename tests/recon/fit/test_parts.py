@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from otsync.types import Offsets, Status, TrackSet
 from recon.fit.parts import GAP, LEAST, broken, parting
-from recon.fit.uncertainty import Votes
+from recon.fit.uncertainty import MISFIT, Votes
 from recon.fit.verb import fit
 from recon.simulate.capture import Capture, synthetic
 from recon.simulate.recording import initial_scene
@@ -19,10 +19,10 @@ from recon.simulate.recording import initial_scene
 STEP = 1 / 30
 
 
-def votes(seconds: np.ndarray, h: np.ndarray | None = None) -> Votes:
-    """Of frames of which each tells ``seconds``."""
+def votes(seconds: np.ndarray, h: np.ndarray | None = None, misfit: float = 0.0) -> Votes:
+    """Of frames that each tell ``seconds``, and are shown so badly that all clocks may be ``misfit`` seconds off."""
     h = np.ones(len(seconds)) if h is None else h
-    return Votes(np.arange(len(seconds)), -seconds * h, h, np.zeros(len(h)), h)
+    return Votes(np.arange(len(seconds)), -seconds * h, h, MISFIT * misfit * h, h)
 
 
 def noise(seed: int, n: int = 48, size: float = 0.02) -> np.ndarray:
@@ -69,6 +69,14 @@ def test_what_all_videos_show_badly_is_no_clock_s():
     told = [noise(v) + STEP * 0.3 * after * (-1) ** v for v in range(6)]
     assert broken(list(map(votes, told)), STEP) == []
     assert broken(list(map(votes, told[:2])), STEP) == [0, 1]  # of two nothing is usual
+
+
+@pytest.mark.parametrize(("misfit", "said"), [(0.02, [0, 1]), (0.05, [])])
+def test_what_is_shown_badly_parts_without_a_break(misfit, said):
+    """Frames of misfit: of two videos nothing else tells it."""
+    after = np.arange(48) >= 20
+    told = [votes(noise(v) + STEP * 0.4 * after * (-1) ** v, misfit=misfit * STEP) for v in range(2)]
+    assert broken(told, STEP) == said
 
 
 def test_a_gap_that_noise_makes_is_none():
