@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
@@ -81,17 +82,18 @@ def say(text: str) -> None:
     sys.stdout.flush()
 
 
-_LOCK = threading.RLock()
-
-
+@cache
 def _tqdm() -> type[tqdm]:
     """With a lock for threads alone. Its own is for processes, too: a semaphore that one which is ended leaves behind,
     and no two processes of ours draw.
     """
     from tqdm import tqdm
 
-    tqdm.set_lock(_LOCK)
-    return tqdm
+    class Bar(tqdm):
+        """A class of its own, since whoever calls this library may have set the lock of tqdm's."""
+
+    Bar.set_lock(threading.RLock())
+    return Bar
 
 
 Tell = Callable[[str], None]

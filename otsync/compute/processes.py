@@ -116,14 +116,16 @@ def process_pool(
     pool = ProcessPoolExecutor(
         workers, mp_context=get_context("spawn"), initializer=_begin_with, initargs=(get_threads(), begin, arguments)
     )
+    own: set[Any] = set()
     try:
         with _interrupts_kept_from_children():
             for _ in range(workers):  # each begins with a call
                 pool.submit(os.getpid)
+            own = set(active_children()) - others
         yield pool
     except BaseException:  # what they are at would be waited for
         pool.shutdown(wait=False, cancel_futures=True)
-        for child in set(active_children()) - others:
+        for child in own:
             child.terminate()
         raise
     finally:

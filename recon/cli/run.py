@@ -30,6 +30,18 @@ FINE_ENOUGH = 0.25
 takes a fifth of a run. Of the Panoptic basketball scene (.16) its answer was no surer than the pixels'; of simulated
 limbs (.37; `recon simulate --cameras 14`, seed 7105), over which tracks slide, it was half as far off."""
 
+LONG = 1000
+"""Steps of a fit from which on little of its start's error is left."""
+
+
+def fine_enough(plan: Plan) -> float | None:
+    """Frames of sigma below which a run needs no stereo; None where it does: clocks are not fitted, or not for long, or
+    dense tracks want its depth.
+    """
+    steps = plan.fit.steps
+    refines = "offsets" in plan.fit.active_rates() and (steps is None or steps >= LONG)
+    return FINE_ENOUGH if refines and plan.features is None else None
+
 
 @dataclass
 class Run:
@@ -158,7 +170,7 @@ class Run:
                 processes=work.threads,
                 tell=tell,
                 deadline=work.deadline,
-                fine_enough=None if self.plan.features else FINE_ENOUGH,  # dense tracks want depth by stereo
+                fine_enough=fine_enough(self.plan),
             )
             progress.seconds |= {f"synchronise: {stage}": s for stage, s in coarse.seconds.items()}
             if self.plan.features is None:

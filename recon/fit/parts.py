@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy import stats
 
 from recon.fit.uncertainty import Votes, by_misfit, sandwich
 
@@ -27,28 +28,34 @@ one video lost a frame in the middle have .4 there, and .1 in the others, which 
 (seeds 501 to 505, 600 steps)."""
 
 SURE = 4.0
-"""Sigmas of a gap, from which on it counts: the break is sought where the gap is widest."""
+"""Sigmas of a gap, from which on it counts, since the break is sought where the gap is widest. Of a part of few votes
+more are asked, as many as Student's distribution has for the same doubt."""
 
 OTHERS = 3.0
 """Times the usual gap of the other videos: what a scene shows badly in all of them is no clock's."""
 
 
 SHOWN = 12.0
-"""Times the error that a scene may make of a clock by showing its frames badly, by the median over videos
-(:func:`recon.fit.uncertainty.by_misfit`). Films of ``recon simulate`` have gaps of up to ten times that after 300
-steps, without a break (.1 to .7 frame; seeds 80160 to 80168), worlds that lost frames 15 to 95 times."""
+"""Times the error that a scene may make of a clock by showing its frames badly
+(:func:`recon.fit.uncertainty.by_misfit`): of the video that is shown best, where the other videos' gaps are a guard as
+well; of two and three by the median. Films of ``recon simulate`` (30 frames a second) have gaps of up to ten times the
+median after 300 steps, without a break (.1 to .7 frame; seeds 80160 to 80168), most worlds that lost frames 15 to 95
+times. A break spoils what is shown, too: after a short fit a long one of two or three videos may be missed, and so are
+most where frames are far apart, since the error is of seconds."""
 
 
 class Parting(NamedTuple):
     """A part of a video whose votes differ most from those of the rest.
 
     gap: seconds by which its offset is larger. sigma: of the gap. first, last: the frames that voted at its ends.
+    votes: of the part or of the rest, whichever has fewer.
     """
 
     gap: float
     sigma: float
     first: int
     last: int
+    votes: int
 
 
 def parting(votes: Votes) -> Parting | None:
@@ -70,10 +77,15 @@ def parting(votes: Votes) -> Parting | None:
     step = -(G[end] - G[first]) / inside
     gap = step + (G[-1] - (G[end] - G[first])) / outside
     best = int(np.argmax(gap**2 * inside * outside / (inside + outside)))
-    part = slice(first[best], end[best])
+    part = slice(int(first[best]), int(end[best]))
     variance = _variance(g[part], h[part]) + _variance(np.delete(g, part), np.delete(h, part))
+    length = part.stop - part.start
     return Parting(
-        float(gap[best]), float(np.sqrt(variance)), int(votes.frames[first[best]]), int(votes.frames[end[best] - 1])
+        float(gap[best]),
+        float(np.sqrt(variance)),
+        int(votes.frames[part.start]),
+        int(votes.frames[part.stop - 1]),
+        min(length, n - length),
     )
 
 
@@ -85,8 +97,8 @@ def broken(votes: Sequence[Votes], frame_step: float) -> list[int]:
     """
     found = [parting(one) for one in votes]
     gaps = np.array([np.nan if one is None else abs(one.gap) / frame_step for one in found])
-    misfits = [by_misfit(one.residual, one.rate) for one in votes if one.rate.sum() > 0]
-    shown = SHOWN * float(np.median(misfits)) / frame_step if misfits else 0.0
+    misfits = [by_misfit(one.residual, one.rate) / frame_step for one in votes if one.rate.sum() > 0]
+    shown = SHOWN * float((np.min if len(misfits) > 3 else np.median)(misfits)) if misfits else 0.0
     out = []
     for v, one in enumerate(found):
         if one is None:
@@ -95,9 +107,14 @@ def broken(votes: Sequence[Votes], frame_step: float) -> list[int]:
         others = others[np.isfinite(others)]
         # of two or three videos each gives way to a break of another one nearly as much as that does
         usual = float(np.median(others)) if len(others) > 2 else 0.0
-        if gaps[v] > max(GAP, OTHERS * usual, shown) and abs(one.gap) > SURE * one.sigma:
+        if gaps[v] > max(GAP, OTHERS * usual, shown) and abs(one.gap) > sure(one.votes) * one.sigma:
             out.append(v)
     return out
+
+
+def sure(votes: int) -> float:
+    """Sigmas from which on a gap counts, of a part of so many votes."""
+    return float(stats.t.isf(stats.norm.sf(SURE), votes - 1))
 
 
 def _variance(g: np.ndarray, h: np.ndarray) -> float:

@@ -73,7 +73,7 @@ def chosen_bends(
 
 def bent(video: Video, seconds: float, wave: Float[np.ndarray, " T"]) -> tuple[Video, float]:
     """The video with its clock bent, and by how many seconds: less than was asked for where time would stand still."""
-    if not seconds:
+    if not seconds or len(video.frames) < 2:
         return video, 0.0
     slope = float((np.abs(np.diff(wave)) / np.diff(video.times)).max())
     seconds = float(np.clip(seconds, -STEEPEST / slope, STEEPEST / slope)) if slope else 0.0

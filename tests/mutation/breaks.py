@@ -1775,8 +1775,8 @@ BREAKS = (
     Break(
         "fit-parts-unheard",
         "recon/fit/parts.py",
-        "if gaps[v] > max(GAP, OTHERS * usual, shown) and abs(one.gap) > SURE * one.sigma:",
-        "if gaps[v] > 100 * max(GAP, OTHERS * usual, shown) and abs(one.gap) > SURE * one.sigma:",
+        "if gaps[v] > max(GAP, OTHERS * usual, shown) and abs(one.gap) > sure(one.votes) * one.sigma:",
+        "if gaps[v] > 100 * max(GAP, OTHERS * usual, shown) and abs(one.gap) > sure(one.votes) * one.sigma:",
         ("tests/recon/fit/test_parts.py",),
         "a clock that breaks is trusted after a fit",
     ),
@@ -1791,7 +1791,7 @@ BREAKS = (
     Break(
         "fit-parts-badly-shown",
         "recon/fit/parts.py",
-        "shown = SHOWN * float(np.median(misfits)) / frame_step if misfits else 0.0",
+        "shown = SHOWN * float((np.min if len(misfits) > 3 else np.median)(misfits)) if misfits else 0.0",
         "shown = 0.0",
         ("tests/recon/fit/test_parts.py",),
         "of a poor fit of two videos every clock is said to break",
@@ -1799,8 +1799,8 @@ BREAKS = (
     Break(
         "fit-parts-of-noise",
         "recon/fit/parts.py",
-        "SURE * one.sigma",
-        "0.0 * SURE * one.sigma",
+        "sure(one.votes) * one.sigma",
+        "0.0 * one.sigma",
         ("tests/recon/fit/test_parts.py",),
         "the widest gap of votes that are noise passes for a break",
     ),

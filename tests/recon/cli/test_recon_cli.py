@@ -954,3 +954,23 @@ def test_what_a_budget_went_into_before_anything_else_is_said(world, tmp_path, c
     nobody = ["run", str(world), "--out", str(tmp_path / "r"), "--budget", "60", "--held-out", "nobody"]
     assert otsync(nobody) == 2
     assert re.search(r"finding cameras took 0 s of the budget of 60 s; (59|60) s are left", capsys.readouterr().err)
+
+
+@pytest.mark.parametrize(
+    ("options", "needs"),
+    [
+        ({}, False),
+        ({"budget": 300.0}, False),
+        ({"steps": 3000}, False),
+        ({"steps": 300}, True),
+        ({"steps": 0}, True),
+        ({"freeze": ("offsets",)}, True),
+        ({"rates": {"means": 1e-3}}, True),
+    ],
+)
+def test_a_run_needs_stereo_where_its_fit_leaves_the_clocks(options, needs):
+    from recon.cli.run import FINE_ENOUGH, fine_enough
+    from recon.fit.options import FitOptions
+    from recon.pipeline.plan import Plan
+
+    assert fine_enough(Plan(fit=FitOptions(**options))) == (None if needs else FINE_ENOUGH)

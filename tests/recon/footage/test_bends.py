@@ -55,6 +55,8 @@ def test_a_bend_of_nothing_is_none():
     assert not chosen_bends(np.array([0.0, 0.01]), 1 / 30, 0.0).any()
     plain = video(clip(20))
     assert bent(plain, 0.0, wave(np.ones(20)))[0] is plain
+    one = video(clip(1))
+    assert bent(one, 0.005, wave(np.ones(1))) == (one, 0.0)
 
 
 def test_a_video_and_its_tracks_bend_alike():
