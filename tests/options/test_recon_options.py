@@ -51,6 +51,7 @@ from recon.result import EXPORTERS
 from recon.simulate.capture import synthetic
 from recon.simulate.recording import write_capture
 from tests.options.walk import options_of
+from tests.recon.worlds import votes_at_once
 
 COMMANDS = OWN | {name: p.value for name, p in entries("commands").items() if p.value.startswith("recon.")}
 """Where the dataclass of every command is: those of ``recon``, and what recon adds to ``otsync``."""
@@ -175,7 +176,7 @@ def plain(x: Any) -> Any:
 def lighter() -> Iterator[pytest.MonkeyPatch]:
     """Fits that do not ask how sure the clocks are, which takes longer than a few steps and is no option."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("recon.fit.run.Run.sigma", lambda self, values, map: np.zeros(len(self.problem.clips)))
+        patch.setattr("recon.fit.run.Run.votes", votes_at_once)
         yield patch
 
 

@@ -32,7 +32,7 @@ from recon.pipeline.plan import Plan
 from recon.pipeline.prepare import prepare
 from recon.scene.gaussians4d import Gaussians4D
 from recon.scene.seed import Seeding
-from tests.recon.worlds import FRAMES, SIZE, capture, write_world
+from tests.recon.worlds import FRAMES, SIZE, capture, votes_at_once, write_world
 
 STEP = 1 / 30
 
@@ -276,7 +276,7 @@ def test_every_row_can_be_measured_and_a_seed_is_the_fits_too(world, monkeypatch
         return fit(scene, footage, offsets, options)
 
     monkeypatch.setattr(bench, "fit", spied)
-    monkeypatch.setattr("recon.fit.run.Run.sigma", lambda self, values, map: np.zeros(len(self.problem.clips)))
+    monkeypatch.setattr("recon.fit.run.Run.votes", votes_at_once)
     cache = world[2]
     for name in names:
         row = OWN[name]
