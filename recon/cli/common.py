@@ -103,8 +103,14 @@ def reconstructed(
     parts = [out / name for name in ("scene.npz", "offsets.json", "metrics.json", "report.html")]
     wrote = f"wrote {', '.join(map(str, parts))} and {out / SCENE_PAGE}, which plays the scene in a browser"
     # a start that is only coarse is what a fit is for: its own answer is judged by its own sigma
-    ends = outcome.coarse.names, outcome.coarse.status, outcome.fitted.offsets.status
-    doubtful = [name for name, start, end in zip(*ends, strict=True) if not start.ok and not end.ok]
+    fitted, before = outcome.fitted.offsets, dict(zip(outcome.coarse.names, outcome.coarse.flags, strict=True))
+    begun = [n for n, end in zip(fitted.names, fitted.status, strict=True) if before[n] and not end.ok]
+    # the fit's own doubts; after few steps it knows a clock no better than to a frame, which its sigma says
+    raised = {
+        n: [f for f in flags if f not in (*before[n], Status.COARSE)]
+        for n, flags in zip(fitted.names, fitted.flags, strict=True)
+    }
+    doubtful = [n for n in fitted.names if n in begun or raised[n]]
     if as_json:
         figures = metrics_of(outcome.views, outcome.fitted.stats, outcome.lpips_reason)
         told = {"out": str(out), "offsets": offset_rows(outcome), "doubtful": doubtful, "metrics": figures}
@@ -114,10 +120,9 @@ def reconstructed(
         print(offset_table(outcome))
         print(view_table(outcome.views, outcome.lpips_reason))
         print(wrote)
-    if doubtful:
-        print(f"begun from offsets that are not to be trusted: {', '.join(doubtful)}", file=sys.stderr)
-    fitted = outcome.fitted.offsets
-    contradicted = [n for n, flags in zip(fitted.names, fitted.flags, strict=True) if Status.CONTRADICTED in flags]
-    for name in contradicted:
-        print(f"{name}: {Status.CONTRADICTED.code}: {Status.CONTRADICTED}", file=sys.stderr)
-    return 1 if doubtful or contradicted or outcome.left_out else 0
+    if begun:
+        print(f"begun from offsets that are not to be trusted: {', '.join(begun)}", file=sys.stderr)
+    for name, flags in raised.items():
+        for flag in flags:
+            print(f"{name}: {flag.code}: {flag}", file=sys.stderr)
+    return 1 if doubtful or outcome.left_out else 0

@@ -34,7 +34,6 @@ more are asked, as many as Student's distribution has for the same doubt."""
 OTHERS = 3.0
 """Times the usual gap of the other videos: what a scene shows badly in all of them is no clock's."""
 
-
 SHOWN = 12.0
 """Times the error that a scene may make of a clock by showing its frames badly
 (:func:`recon.fit.uncertainty.by_misfit`): of the video that is shown best, where the other videos' gaps are a guard as
@@ -95,19 +94,17 @@ def broken(votes: Sequence[Votes], frame_step: float) -> list[int]:
     Args:
         frame_step: seconds of a frame.
     """
-    found = [parting(one) for one in votes]
-    gaps = np.array([np.nan if one is None else abs(one.gap) / frame_step for one in found])
-    misfits = [by_misfit(one.residual, one.rate) / frame_step for one in votes if one.rate.sum() > 0]
-    shown = SHOWN * float((np.min if len(misfits) > 3 else np.median)(misfits)) if misfits else 0.0
+    found = {v: part for v, one in enumerate(votes) if (part := parting(one)) is not None}
+    if not found:
+        return []
+    gaps = {v: abs(part.gap) / frame_step for v, part in found.items()}
+    misfits = [by_misfit(votes[v].residual, votes[v].rate) / frame_step for v in found]
+    few = len(found) <= 3  # of these each gives way to a break of another one nearly as much as that does
+    shown = SHOWN * float(np.median(misfits) if few else np.min(misfits))
     out = []
-    for v, one in enumerate(found):
-        if one is None:
-            continue
-        others = np.delete(gaps, v)
-        others = others[np.isfinite(others)]
-        # of two or three videos each gives way to a break of another one nearly as much as that does
-        usual = float(np.median(others)) if len(others) > 2 else 0.0
-        if gaps[v] > max(GAP, OTHERS * usual, shown) and abs(one.gap) > sure(one.votes) * one.sigma:
+    for v, part in found.items():
+        usual = 0.0 if few else float(np.median([gap for u, gap in gaps.items() if u != v]))
+        if gaps[v] > max(GAP, OTHERS * usual, shown) and abs(part.gap) > sure(part.votes) * part.sigma:
             out.append(v)
     return out
 

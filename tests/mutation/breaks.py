@@ -1775,15 +1775,15 @@ BREAKS = (
     Break(
         "fit-parts-unheard",
         "recon/fit/parts.py",
-        "if gaps[v] > max(GAP, OTHERS * usual, shown) and abs(one.gap) > sure(one.votes) * one.sigma:",
-        "if gaps[v] > 100 * max(GAP, OTHERS * usual, shown) and abs(one.gap) > sure(one.votes) * one.sigma:",
+        "if gaps[v] > max(GAP, OTHERS * usual, shown) and abs(part.gap) > sure(part.votes) * part.sigma:",
+        "if gaps[v] > 100 * max(GAP, OTHERS * usual, shown) and abs(part.gap) > sure(part.votes) * part.sigma:",
         ("tests/recon/fit/test_parts.py",),
         "a clock that breaks is trusted after a fit",
     ),
     Break(
         "fit-parts-blame-all",
         "recon/fit/parts.py",
-        "usual = float(np.median(others)) if len(others) > 2 else 0.0",
+        "usual = 0.0 if few else float(np.median([gap for u, gap in gaps.items() if u != v]))",
         "usual = 0.0",
         ("tests/recon/fit/test_parts.py",),
         "what a scene shows badly in every video passes for broken clocks",
@@ -1791,7 +1791,7 @@ BREAKS = (
     Break(
         "fit-parts-badly-shown",
         "recon/fit/parts.py",
-        "shown = SHOWN * float((np.min if len(misfits) > 3 else np.median)(misfits)) if misfits else 0.0",
+        "shown = SHOWN * float(np.median(misfits) if few else np.min(misfits))",
         "shown = 0.0",
         ("tests/recon/fit/test_parts.py",),
         "of a poor fit of two videos every clock is said to break",
@@ -1799,8 +1799,8 @@ BREAKS = (
     Break(
         "fit-parts-of-noise",
         "recon/fit/parts.py",
-        "sure(one.votes) * one.sigma",
-        "0.0 * one.sigma",
+        "sure(part.votes) * part.sigma",
+        "0.0 * part.sigma",
         ("tests/recon/fit/test_parts.py",),
         "the widest gap of votes that are noise passes for a break",
     ),

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 
+from otsync.types import TrackSet
 from recon.fit.run import Run
 from recon.fit.uncertainty import Votes
 from recon.simulate.capture import Capture, synthetic
@@ -31,3 +33,31 @@ def votes_at_once(run: Run, values: Mapping[str, object], map: object) -> list[V
     """In the place of ``Run.votes``: every frame agrees, to the last bit, and none is rendered."""
     alike = Votes(np.arange(2), np.zeros(2), np.ones(2), np.zeros(2), np.ones(2))
     return [alike] * len(run.problem.clips)
+
+
+def filmed_anew(capture: Capture, video: int, shown: Sequence[int]) -> Capture:
+    """The capture of which one video shows these frames, at its constant rate: frames are lost, or stand still."""
+    f, t, z = capture.footage[video], capture.tracks[video], capture.depth[video]
+    keep = np.asarray(shown)
+    assert f.masks is not None and t.uv is not None
+    other = replace(
+        f,
+        images=f.images[keep],
+        masks=f.masks[keep],
+        boxes=f.boxes[keep],
+        bad=f.bad[keep],
+        times=f.times[0] + np.arange(len(keep)) * capture.frame_step,
+    )
+    tracks = TrackSet(
+        t.positions()[:, keep], t.seen[:, keep], t.features, t.fps, None, t.name, t.uv[:, keep], camera=t.camera
+    )
+
+    def put(items, item):
+        return (*items[:video], item, *items[video + 1 :])
+
+    return replace(
+        capture,
+        footage=put(capture.footage, other),
+        tracks=put(capture.tracks, tracks),
+        depth=put(capture.depth, [z[k] for k in keep.tolist()]),
+    )

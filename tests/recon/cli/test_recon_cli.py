@@ -29,9 +29,11 @@ from recon.cli import main
 from recon.pipeline.intake import only
 from recon.result.folder import load_result
 from recon.scene.gaussians4d import Gaussians4D
+from recon.simulate.capture import synthetic
+from recon.simulate.recording import write_capture
 from tests.plugins.outside import KINDS_OF_SCENES, OF_SCENES, file_with
 from tests.recon.pipeline.test_pipeline import same_files
-from tests.recon.worlds import FRAMES, SIZE, capture, write_world
+from tests.recon.worlds import FRAMES, SIZE, capture, filmed_anew, write_world
 
 ROOT = Path(__file__).parents[3]
 
@@ -450,6 +452,22 @@ def test_a_start_that_is_only_coarse_is_judged_by_the_fit(world, tmp_path, capsy
     offsets = load_result(tmp_path / "r").offsets
     assert offsets.ok == refined
     assert (code, "not to be trusted" in told) == ((0, False) if refined else (1, True))
+
+
+@pytest.mark.parametrize("as_json", [False, True])
+def test_a_clock_that_the_fit_alone_doubts_is_told_and_exits_with_one(tmp_path, capsys, as_json):
+    """Four frames are lost in the middle of cam3; the clocks it begins with say nothing of it."""
+    capture = synthetic(5, cameras=5, held_out=0, frames=40, size=SIZE, offsets=0.0)
+    world = tmp_path / "w"
+    write_capture(filmed_anew(capture, 3, [*range(20), *range(24, 40)]), world)
+    start = Offsets.known([f.name for f in capture.footage], [0.0, 0.0, 0.0, 2 / 30, 0.0], 30)
+    replace(start, sigma=np.r_[0, np.full(4, 0.2 / 30)]).save(world / "start.json")
+    tracks = [str(p) for p in sorted((world / "tracks").glob("*.npz"))]
+    code = fit(world, tmp_path / "r", "--tracks", *tracks, *["--json"] * as_json, steps=150)
+    told = capsys.readouterr()
+    assert code == 1 and "cam3: broken_clock: Parts of the overlap" in told.err and "begun from" not in told.err
+    if as_json:
+        assert json.loads(told.out)["doubtful"] == ["cam3"]
 
 
 def test_simulate_writes_a_recording_that_the_printed_command_fits(tmp_path, capsys):

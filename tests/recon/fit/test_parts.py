@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -9,12 +10,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from otsync.types import Offsets, Status, TrackSet
+from otsync.types import Offsets, Status
 from recon.fit.parts import GAP, LEAST, broken, parting
 from recon.fit.uncertainty import MISFIT, Votes
 from recon.fit.verb import fit
-from recon.simulate.capture import Capture, synthetic
+from recon.simulate.capture import synthetic
 from recon.simulate.recording import initial_scene
+from tests.recon.worlds import filmed_anew
 
 STEP = 1 / 30
 
@@ -103,39 +105,20 @@ def test_where_nothing_moves_there_are_no_parts():
     assert broken([still, late], STEP) == [1]
 
 
-def lost(capture: Capture, video: int, at: int, frames: int) -> Capture:
-    """The capture of which one video lost frames, and does not say so."""
-    f, t, z = capture.footage[video], capture.tracks[video], capture.depth[video]
-    keep = np.r_[:at, at + frames : len(f)]
-    assert f.masks is not None and t.uv is not None
-    short = replace(
-        f, images=f.images[keep], masks=f.masks[keep], boxes=f.boxes[keep], bad=f.bad[keep], times=f.times[: len(keep)]
-    )
-    tracks = TrackSet(
-        t.positions()[:, keep], t.seen[:, keep], t.features, t.fps, None, t.name, t.uv[:, keep], camera=t.camera
-    )
-
-    def put(items, item):
-        return (*items[:video], item, *items[video + 1 :])
-
-    return replace(
-        capture,
-        footage=put(capture.footage, short),
-        tracks=put(capture.tracks, tracks),
-        depth=put(capture.depth, [z[int(k)] for k in keep]),
-    )
-
-
-def fitted(seed: int, broken: int | None, frames: int = 2, steps: int = 500) -> Offsets:
-    """The clocks that a fit finds of five videos of two seconds, one of which lost frames in the middle."""
-    capture = synthetic(seed, frames=60, offsets=0.0)
+def fitted(seed: int, who: int | None, shown: Sequence[int], steps: int = 500) -> Offsets:
+    """The clocks that a fit finds of five videos of two seconds, one of which shows other frames than it says."""
+    capture = synthetic(seed, frames=FRAMES, offsets=0.0)
     start = np.zeros(5)
-    if broken is not None:
-        capture = lost(capture, broken, 30, frames)
-        start[broken] = frames / 2 / 30
-    known = Offsets.known([f.name for f in capture.footage], start, 30)
+    if who is not None:
+        capture = filmed_anew(capture, who, shown)
+        start[who] = np.mean(np.asarray(shown) - np.arange(len(shown))) / 30
+    known = Offsets.known([f.name for f in capture.footage], start - start[0], 30)
     loose = replace(known, sigma=np.r_[0, np.full(4, 0.2 / 30)])
     return fit(initial_scene(capture, loose), capture.footage, loose, steps=steps).offsets
+
+
+def said(found: Offsets) -> list[int]:
+    return [v for v, flags in enumerate(found.flags) if Status.BROKEN_CLOCK in flags]
 
 
 @pytest.mark.slow
@@ -143,6 +126,29 @@ def fitted(seed: int, broken: int | None, frames: int = 2, steps: int = 500) -> 
 @pytest.mark.parametrize("who", [None, 3, 0], ids=["none", "one", "the reference"])
 def test_a_fit_says_that_a_clock_breaks(seed, who):
     """Two frames lost: off by a frame at either end, at a sigma of .17, and it was ok."""
-    found = fitted(seed, who)
-    said = [v for v, flags in enumerate(found.flags) if Status.BROKEN_CLOCK in flags]
-    assert said == {None: [], 3: [3], 0: [1, 2, 3, 4]}[who]
+    found = said(fitted(seed, who, without(30, 2)))
+    assert found == {None: [], 3: [3], 0: [1, 2, 3, 4]}[who]
+
+
+FRAMES = 60
+
+
+def without(at: int, lost: int, until: int = FRAMES) -> list[int]:
+    """Frames of a clip of which some are lost."""
+    return [k for k in range(until) if not at <= k < at + lost]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [523, 524, 525])
+@pytest.mark.parametrize(
+    ("shown", "steps"),
+    [
+        (without(30, 10), 150),
+        ([*range(30), *[30] * 3, *range(30, FRAMES - 3)], 500),
+        ([*without(20, 3, 40), *[40] * 3, *range(40, FRAMES)], 500),
+        (np.round(np.arange(57) * 1.04).astype(int).tolist(), 500),
+    ],
+    ids=["ten lost, a short fit", "three stand still", "lost and later still", "4 % of rate"],
+)
+def test_a_fit_says_whose_clock_is_uneven(seed, shown, steps):
+    assert said(fitted(seed, 2, shown, steps)) == [2]
