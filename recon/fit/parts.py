@@ -3,7 +3,7 @@
 A fit gives each video one offset. A clock that breaks (a frozen or lost stretch, a cut, a pause) has two, and the fit
 finds one between them, surely: the scene follows the other videos, so the frames before the break all vote one way
 (:mod:`recon.fit.uncertainty`), and those behind it the other. Pictures tell this where tracks do not, and they tell it
-of the answer itself.
+of the answer itself. Of a rate that is wrong the votes are a ramp instead.
 
 Of a time that is off by a frame and more a vote tells less than that: images are not linear so far, and the scene gives
 way a little. So a gap says that a clock breaks, and not by how much.
@@ -88,13 +88,45 @@ def parting(votes: Votes) -> Parting | None:
     )
 
 
+def tilt(votes: Votes) -> Parting | None:
+    """The two halves of a video whose votes lie along a line, as those of a rate that is wrong do; None where too few
+    show motion.
+
+    Of such votes two parts with an offset each scatter by themselves, so that their gap looks unsure.
+    """
+    n, g, h = len(votes.g), votes.g, votes.h
+    if n < 2 * LEAST or not h.sum() > 0:
+        return None
+    at = votes.frames - (h @ votes.frames) / h.sum()
+    weight = h * at**2
+    if not weight.sum() > 0:
+        return None
+    slope = -(g @ at) / weight.sum()
+    # about the line: what is left of a slope of 0 is noise alone
+    variance = sandwich(at * (g - h * (g.sum() / h.sum()) + h * slope * at), weight)
+    half = (votes.frames[-1] - votes.frames[0]) / 2
+    middle = n // 2
+    return Parting(
+        float(slope * half),
+        float(np.sqrt(variance) * half),
+        int(votes.frames[middle]),
+        int(votes.frames[-1]),
+        n,
+    )
+
+
 def broken(votes: Sequence[Votes], frame_step: float) -> list[int]:
-    """Videos whose clocks break.
+    """Videos whose clocks break, or run at another rate than they say.
 
     Args:
         frame_step: seconds of a frame.
     """
-    found = {v: part for v, one in enumerate(votes) if (part := parting(one)) is not None}
+    return sorted({v for of in (parting, tilt) for v in _apart(list(map(of, votes)), votes, frame_step)})
+
+
+def _apart(partings: Sequence[Parting | None], votes: Sequence[Votes], frame_step: float) -> list[int]:
+    """Videos whose parts are further apart than what they show, and what the other ones do, makes them."""
+    found = {v: part for v, part in enumerate(partings) if part is not None}
     if not found:
         return []
     gaps = {v: abs(part.gap) / frame_step for v, part in found.items()}
