@@ -1773,6 +1773,14 @@ BREAKS = (
         "a run leaves stereo out where the pixels' answer is doubted",
     ),
     Break(
+        "second-neighbours-forgotten",
+        "otsync/match/synchronous.py",
+        "i, j = mutual(cost, self.neighbours)",
+        "i, j = mutual(cost)",
+        ("tests/otsync/match/test_synchronous.py",),
+        "noisy tracks are matched with their nearest partner alone",
+    ),
+    Break(
         "fit-parts-unheard",
         "recon/fit/parts.py",
         "if gaps[v] > max(GAP, OTHERS * usual, shown) and",
