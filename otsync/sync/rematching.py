@@ -120,7 +120,7 @@ def rematching(jobs: list[Job], verdict: Verdict) -> list[Job]:
 
 
 def at_known_times(matcher: Matcher | None, clock: Clock, flat: bool = False) -> Matcher:
-    """What matches a pair once more: as the matcher says, else mutual nearest neighbours at equal times.
+    """What matches a pair once more: as the matcher says, else near neighbours of each other at equal times.
 
     ``flat``: the tracks are pixels only, which epipolar distances compare.
     """
