@@ -38,6 +38,10 @@ NOISY = frozenset(
 A clock that breaks, a rate, things at rest are not among them: matches that were made at one time agree with it.
 """
 
+NEIGHBOURS = 2
+"""Partners of a track in matches that an answer is made of. Those that an answer is tested by have one: second partners
+would let a few that are wrong look like many."""
+
 CLEARLY = 0.3
 """Share of its evidence by which the time that wins must be ahead of every other."""
 
@@ -52,13 +56,15 @@ def contested(jobs: list[Job], verdict: Verdict, map: MapLike) -> dict[Pair, Ans
     """
     answers = {a.pair: a for a in verdict.answers}
     asked = [job for job in jobs if asks(job, answers[job.pair], verdict) and noisy(answers[job.pair])]
-    winners = {pair: winner(several) for pair, several in at_peaks(asked, answers, map).items()}
+    winners = {pair: winner(several) for pair, several in at_peaks(asked, answers, map, NEIGHBOURS).items()}
     return {pair: best for pair, best in winners.items() if best is not None}
 
 
-def at_peaks(jobs: list[Job], answers: Mapping[Pair, Answer], map: MapLike) -> dict[Pair, list[Answer]]:
+def at_peaks(
+    jobs: list[Job], answers: Mapping[Pair, Answer], map: MapLike, neighbours: int = 1
+) -> dict[Pair, list[Answer]]:
     """The answers of pairs at each peak of their scans, by matches that are made there; without those that fail."""
-    tasks = [again for job in jobs for again in at_each(job, answers[job.pair].scanned.hypotheses[:, 0])]
+    tasks = [again for job in jobs for again in at_each(job, answers[job.pair].scanned.hypotheses[:, 0], neighbours)]
     found: dict[Pair, list[Answer]] = {}
     for answer in map(run, tasks) if tasks else ():
         if answer.finite:
@@ -98,9 +104,10 @@ def evidence_of(answer: Answer) -> float:
     return answer.scanned.stats.get("evidence", 0.0) * len(answer.matches)
 
 
-def at_each(job: Job, times: Iterable[float]) -> list[Job]:
+def at_each(job: Job, times: Iterable[float], neighbours: int = 1) -> list[Job]:
     """The work on a pair, to be matched once more at each of some offsets, s."""
-    return [dataclasses.replace(job, matcher=at_known_times(job.matcher, Clock(float(t), 1.0))) for t in times]
+    clocks = [Clock(float(t), 1.0) for t in times]
+    return [dataclasses.replace(job, matcher=at_known_times(job.matcher, c, neighbours=neighbours)) for c in clocks]
 
 
 def rematching(jobs: list[Job], verdict: Verdict) -> list[Job]:
@@ -115,14 +122,15 @@ def rematching(jobs: list[Job], verdict: Verdict) -> list[Job]:
             float((verdict.x[j] - verdict.x[i]) / verdict.rates[i]), float(verdict.rates[j] / verdict.rates[i])
         )
         flat = job.a.xyz is None or job.b.xyz is None
-        again.append(dataclasses.replace(job, matcher=at_known_times(job.matcher, clock, flat)))
+        again.append(dataclasses.replace(job, matcher=at_known_times(job.matcher, clock, flat, NEIGHBOURS)))
     return again
 
 
-def at_known_times(matcher: Matcher | None, clock: Clock, flat: bool = False) -> Matcher:
+def at_known_times(matcher: Matcher | None, clock: Clock, flat: bool = False, neighbours: int = 1) -> Matcher:
     """What matches a pair once more: as the matcher says, else near neighbours of each other at equal times.
 
-    ``flat``: the tracks are pixels only, which epipolar distances compare.
+    ``flat``: the tracks are pixels only, which epipolar distances compare. ``neighbours``: of a track, where the
+    matcher does not say.
     """
     told = None if matcher is None else matcher.at(clock)
     if told is not None and flat and told.needs_xyz:
@@ -134,4 +142,4 @@ def at_known_times(matcher: Matcher | None, clock: Clock, flat: bool = False) ->
     costs = (Cosine(),) if matcher is None else matcher.costs
     if flat:
         return UnbalancedOT(costs=(*costs, EpipolarDistance(clock=clock)))
-    return SynchronousMatching(clock.offset, clock.rate, costs)
+    return SynchronousMatching(clock.offset, clock.rate, costs, neighbours=neighbours)

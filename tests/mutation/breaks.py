@@ -220,6 +220,14 @@ BREAKS = (
         "times are told apart without places",
     ),
     Break(
+        "witnesses-of-one-track",
+        "otsync/sync/witnesses.py",
+        "if i not in taken[0] and j not in taken[1]:",
+        "if True:",
+        ("tests/otsync/sync/test_witnesses.py",),
+        "a neighbourhood of few tracks with several partners each says its time as if it had many",
+    ),
+    Break(
         "witnesses-of-one-place",
         "otsync/sync/witnesses.py",
         "fit = fit_clock(*curves, clock",
@@ -1779,6 +1787,14 @@ BREAKS = (
         "i, j = mutual(cost)",
         ("tests/otsync/match/test_synchronous.py",),
         "noisy tracks are matched with their nearest partner alone",
+    ),
+    Break(
+        "second-neighbours-far-away",
+        "otsync/match/synchronous.py",
+        "kept = cost[i, j] <= TIMES * np.quantile(cost[nearest], AS_NEAR)",
+        "kept = np.isfinite(cost[i, j])",
+        ("tests/otsync/match/test_synchronous.py",),
+        "things that move by themselves are matched with others",
     ),
     Break(
         "fit-parts-unheard",

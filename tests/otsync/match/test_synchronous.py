@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from otsync import TrackSet
 from otsync.match.synchronous import SynchronousMatching, mutual
 from otsync.simulate import simulate
 
@@ -51,6 +52,15 @@ def test_second_neighbours_are_near_as_well():
         return float(np.median(truth.match_errors(found, 0, 1)[0])) / truth.size
 
     assert apart(two) < apart(nearest) + 0.03
+
+
+def test_things_that_move_by_themselves_have_one_track_each():
+    """Their second neighbours are other things."""
+    rng = np.random.default_rng(3)
+    steps = rng.normal(size=(40, 90, 3)).cumsum(1) / 9
+    sets = [TrackSet(steps + rng.normal(size=steps.shape) * 0.01, fps=30, frame="w") for _ in range(2)]
+    found = SynchronousMatching(0.0)(*sets)
+    assert len(found) == 40 and (found.pairs[:, 0] == found.pairs[:, 1]).all()
 
 
 @pytest.mark.parametrize("wrong", [0, -1, 1.5])
