@@ -47,7 +47,7 @@ class Parting(NamedTuple):
     """A part of a video whose votes differ most from those of the rest.
 
     gap: seconds by which its offset is larger. sigma: of the gap. first, last: the frames that voted at its ends.
-    votes: of the part or of the rest, whichever has fewer.
+    votes: of the part or of the rest, whichever has fewer; of a slope, as many as would tell as much if all told alike.
     """
 
     gap: float
@@ -78,13 +78,12 @@ def parting(votes: Votes) -> Parting | None:
     best = int(np.argmax(gap**2 * inside * outside / (inside + outside)))
     part = slice(int(first[best]), int(end[best]))
     variance = _variance(g[part], h[part]) + _variance(np.delete(g, part), np.delete(h, part))
-    length = part.stop - part.start
     return Parting(
         float(gap[best]),
         float(np.sqrt(variance)),
         int(votes.frames[part.start]),
         int(votes.frames[part.stop - 1]),
-        min(length, n - length),
+        min(part.stop - part.start, n - (part.stop - part.start)),
     )
 
 
@@ -98,20 +97,19 @@ def tilt(votes: Votes) -> Parting | None:
     if n < 2 * LEAST or not h.sum() > 0:
         return None
     at = votes.frames - (h @ votes.frames) / h.sum()
-    weight = h * at**2
-    if not weight.sum() > 0:
+    weight, half = h * at**2, (votes.frames[-1] - votes.frames[0]) / 2
+    if not weight.sum() > 1e-9 * h.sum() * half**2:  # one frame alone moves
         return None
     slope = -(g @ at) / weight.sum()
     # about the line: what is left of a slope of 0 is noise alone
     variance = sandwich(at * (g - h * (g.sum() / h.sum()) + h * slope * at), weight)
-    half = (votes.frames[-1] - votes.frames[0]) / 2
     middle = n // 2
     return Parting(
         float(slope * half),
         float(np.sqrt(variance) * half),
         int(votes.frames[middle]),
         int(votes.frames[-1]),
-        n,
+        max(2, int(weight.sum() ** 2 / np.square(weight).sum())),  # a slope hangs on those that are far out
     )
 
 
@@ -121,24 +119,25 @@ def broken(votes: Sequence[Votes], frame_step: float) -> list[int]:
     Args:
         frame_step: seconds of a frame.
     """
-    return sorted({v for of in (parting, tilt) for v in _apart(list(map(of, votes)), votes, frame_step)})
-
-
-def _apart(partings: Sequence[Parting | None], votes: Sequence[Votes], frame_step: float) -> list[int]:
-    """Videos whose parts are further apart than what they show, and what the other ones do, makes them."""
-    found = {v: part for v, part in enumerate(partings) if part is not None}
+    found = {v: told for v, one in enumerate(votes) if (told := _partings(one))}
     if not found:
         return []
-    gaps = {v: abs(part.gap) / frame_step for v, part in found.items()}
+    gaps = {v: max(abs(part.gap) for part in told) / frame_step for v, told in found.items()}
     misfits = [by_misfit(votes[v].residual, votes[v].rate) / frame_step for v in found]
     few = len(found) <= 3  # of these each gives way to a break of another one nearly as much as that does
     shown = SHOWN * float(np.median(misfits) if few else np.min(misfits))
     out = []
-    for v, part in found.items():
+    for v, told in found.items():
         usual = 0.0 if few else float(np.median([gap for u, gap in gaps.items() if u != v]))
-        if gaps[v] > max(GAP, OTHERS * usual, shown) and abs(part.gap) > sure(part.votes) * part.sigma:
+        least = max(GAP, OTHERS * usual, shown) * frame_step
+        if any(abs(part.gap) > max(least, sure(part.votes) * part.sigma) for part in told):
             out.append(v)
     return out
+
+
+def _partings(votes: Votes) -> list[Parting]:
+    """The part that has an offset of its own, and the halves that a rate parts."""
+    return [part for of in (parting, tilt) if (part := of(votes)) is not None]
 
 
 def sure(votes: int) -> float:

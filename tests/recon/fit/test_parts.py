@@ -100,15 +100,32 @@ def test_what_is_shown_badly_parts_without_a_break(misfit, said):
 
 
 @pytest.mark.parametrize("n", [10, 16, 24, 48])
-@pytest.mark.parametrize("videos", [2, 3, 5])
-def test_gaps_that_noise_makes_are_seldom_breaks(videos, n):
+@pytest.mark.parametrize(("videos", "uneven"), [(2, 1.0), (3, 1.0), (5, 1.0), (5, 2.0)])
+def test_gaps_that_noise_makes_are_seldom_breaks(videos, n, uneven):
     """Of half a frame, in frames that are shown without a fault otherwise, each with a weight of its own."""
     said = 0
     for seed in range(60):
         rng = np.random.default_rng(seed)
-        told = [votes(rng.normal(size=n) * 0.5 * STEP, rng.lognormal(size=n)) for _ in range(videos)]
+        told = [votes(rng.normal(size=n) * 0.5 * STEP, rng.lognormal(0, uneven, n)) for _ in range(videos)]
         said += len(broken(told, STEP))
     assert said <= 0.03 * 60 * videos
+
+
+def test_votes_that_wander_in_every_video_are_seldom_ramps():
+    """Neighbouring frames err alike, by a third of a frame; the parts of all videos are as far apart."""
+    said = 0
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        drawn = rng.normal(size=(5, 52)) * 0.3 * STEP
+        told = [np.convolve(one, np.full(5, 5**-0.5), "valid") for one in drawn]
+        said += len(broken([votes(t) for t in told], STEP))
+    assert said <= 0.03 * 60 * 5
+
+
+def test_one_frame_that_moves_has_no_slope():
+    moving = np.zeros(48)
+    moving[7] = 1 / 3
+    assert tilt(votes(np.full(48, STEP), moving)) is None
 
 
 @pytest.mark.parametrize("told", [np.zeros(0), np.zeros(2 * LEAST - 1)])
