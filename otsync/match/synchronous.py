@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ..clocks.splines import sampled
 from ..costs.linear import Cosine, Cost, binary_scale, total_cost
@@ -29,8 +29,8 @@ FARTHEST = 3.0
 """Units at which the distance of place is cut off."""
 
 AS_NEAR, TIMES = 0.9, 2.0
-"""A pair of second neighbours may cost so many times what this share of the nearest pairs does not exceed. Things that
-move apart have a track each, and their second neighbours are other things: these are far dearer."""
+"""Second neighbours may be so many times as far apart, in place and motion, as this share of the nearest pairs is at
+most. Things that move by themselves have a track each, and their second neighbours are other things, far away."""
 
 
 @dataclass(frozen=True)
@@ -42,9 +42,8 @@ class SynchronousMatching(Matcher):
     Place counts only when both sets declare one world frame. Pairs hardly ever seen together are not matched.
 
     Two tracks match where each is among the other's nearest ``neighbours``. Tracks on one limb move nearly alike, so a
-    second neighbour has noise of its own and little error beside it: of 40 brutal worlds 16 answers are trusted, of 40
-    with few tracks 11, and of 40 hard ones 37, where the nearest alone gives 14, 9 and 34 (seeds 600 to 639). Second
-    ones that are further away than :data:`AS_NEAR` and :data:`TIMES` allow are left out.
+    second neighbour has noise of its own and little error beside it. Second ones that are much further away than most
+    nearest ones are left out (:data:`AS_NEAR`, :data:`TIMES`).
 
     Args:
         offset, rate: t_a = rate * t_b + offset, from :func:`otsync.align`.
@@ -57,7 +56,7 @@ class SynchronousMatching(Matcher):
     rate: float = 1.0
     costs: tuple[Cost, ...] = (Cosine(),)
     limit: int = 2000
-    neighbours: int = 2
+    neighbours: int = 1
 
     def __post_init__(self) -> None:
         check_whole("neighbours", self.neighbours, 1)
@@ -74,10 +73,12 @@ class SynchronousMatching(Matcher):
 
     def __call__(self, a: TrackSet, b: TrackSet) -> Matches:
         own_a, own_b = longest_seen(a, self.limit), longest_seen(b, self.limit)
-        cost = self.cost(a.take(own_a), b.take(own_b))
+        first, second = a.take(own_a), b.take(own_b)
+        apart = joined(0.0, *self.distances(first, second), placed(a, b))
+        cost = apart + self.unlike(first, second)
         if not np.isfinite(cost).any():
             return Matches(np.zeros((0, 2), int), flags=(Status.NO_OVERLAP,))
-        i, j = self._near(cost)
+        i, j = self._near(cost, apart)
         value = cost[i, j]
         order = np.argsort(value, kind="stable")
         flags = () if len(i) else (Status.NO_MATCH,)
@@ -85,23 +86,26 @@ class SynchronousMatching(Matcher):
             np.stack([own_a[i], own_b[j]], 1)[order],
             -value[order],
             flags=flags,
-            stats={"objective": float(value.sum()), "mass": len(i) / max(min(len(a), len(b)), 1)},
+            stats={
+                "objective": float(value.sum()),
+                "mass": min(len(np.unique(i)), len(np.unique(j))) / max(min(len(a), len(b)), 1),
+            },
         )
 
     def cost(self, a: TrackSet, b: TrackSet) -> Float[np.ndarray, "Na Nb"]:
         """In units; infinite where two tracks are not seen together at enough moments."""
         return joined(self.unlike(a, b), *self.distances(a, b), placed(a, b))
 
-    def _near(self, cost: Float[np.ndarray, "Na Nb"]) -> tuple[Int[np.ndarray, " M"], Int[np.ndarray, " M"]]:
-        """The nearest ones, and of the others those that are about as near as most of these."""
+    def _near(
+        self, cost: Float[np.ndarray, "Na Nb"], apart: Float[np.ndarray, "Na Nb"]
+    ) -> tuple[Int[np.ndarray, " M"], Int[np.ndarray, " M"]]:
+        """The nearest ones, and of the others those that are hardly further ``apart`` than most of these."""
         nearest = mutual(cost)
         if self.neighbours == 1 or not len(nearest[0]):
             return nearest
         i, j = mutual(cost, self.neighbours)
-        kept = cost[i, j] <= TIMES * np.quantile(cost[nearest], AS_NEAR)
-        first = np.zeros(cost.shape, bool)
-        first[nearest] = True
-        kept |= first[i, j]
+        kept = apart[i, j] <= TIMES * np.quantile(apart[nearest], AS_NEAR)
+        kept |= np.isin(i * cost.shape[1] + j, nearest[0] * cost.shape[1] + nearest[1])
         return i[kept], j[kept]
 
     def unlike(self, a: TrackSet, b: TrackSet) -> Float[np.ndarray, "Na Nb"] | float:
@@ -169,14 +173,23 @@ def mutual(
     cost: Float[np.ndarray, "Na Nb"], neighbours: int = 1
 ) -> tuple[Int[np.ndarray, " M"], Int[np.ndarray, " M"]]:
     """Rows and columns that are each among the other's so many cheapest, at a finite cost."""
-    near = np.isfinite(cost)
-    for axis in (0, 1):
-        among = np.zeros(cost.shape, bool)
-        cheapest = np.argsort(cost, axis, kind="stable")
-        np.put_along_axis(among, np.take(cheapest, range(min(neighbours, cost.shape[axis])), axis), True, axis)
-        near &= among
-    i, j = np.nonzero(near)
+    if not cost.size:
+        return np.zeros(0, int), np.zeros(0, int)
+    if neighbours == 1:
+        best_b, best_a = cost.argmin(1), cost.argmin(0)
+        i = np.flatnonzero((best_a[best_b] == np.arange(len(cost))) & np.isfinite(cost.min(1)))
+        return i, best_b[i]
+    i, j = np.nonzero(_cheapest(cost, neighbours) & _cheapest(cost.T, neighbours).T & np.isfinite(cost))
     return i, j
+
+
+def _cheapest(cost: Float[np.ndarray, "Na Nb"], count: int) -> Bool[np.ndarray, "Na Nb"]:
+    """Which columns are among the ``count`` cheapest of each row; the first of those that cost the same."""
+    left, rows, among = cost.copy(), np.arange(len(cost)), np.zeros(cost.shape, bool)
+    for _ in range(min(count, cost.shape[1])):
+        best = left.argmin(1)
+        among[rows, best], left[rows, best] = True, np.inf
+    return among
 
 
 def longest_seen(tracks: TrackSet, limit: int) -> Int[np.ndarray, " n"]:

@@ -162,7 +162,7 @@ class SplineRefine(Refiner):
             | rate_stats
             | {
                 "matches": float(len(matches)),
-                "effective_matches": fit.effective_matches,
+                "effective_matches": min(fit.effective_matches, *(float(len(np.unique(c))) for c in matches.pairs.T)),
                 "moved": abs(fit.clock.offset - alignment.offset),
                 "spread": spread,
                 "blur": fit.blur,

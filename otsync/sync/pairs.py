@@ -32,7 +32,11 @@ CLEAR = 40.0
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """What one pair needs, self-contained so that any executor can carry it."""
+    """What one pair needs, self-contained so that any executor can carry it.
+
+    Args:
+        fitting: makes the matches of the refiner, where these are not those that the answer is told and tested by.
+    """
 
     pair: Pair
     a: TrackSet
@@ -41,6 +45,7 @@ class Job:
     aligner: Aligner
     refiner: Refiner
     matches: Matches | None
+    fitting: Matcher | None = None
 
     def on(self, other: Job) -> Job:
         """The same algorithms on the tracks of another one."""
@@ -64,11 +69,13 @@ def _answer(job: Job) -> Answer:
             return Answer(job.pair, matches, failed, failed)
         scanned = align(job.a, job.b, matches, job.aligner, throw=False)
         scanned = dataclasses.replace(scanned, flags=(*(f for f in matches.flags if f in DOUBTS), *scanned.flags))
-        refined = scanned
+        refined, fitted = scanned, None
         if np.isfinite(scanned.offset):
-            refined = refine(job.a, job.b, matches, scanned, job.refiner, throw=False)
+            if job.fitting is not None and len(matches):
+                fitted = match(job.a, job.b, job.fitting, throw=False).without_plan()
+            refined = refine(job.a, job.b, matches if fitted is None else fitted, scanned, job.refiner, throw=False)
             refined = without_answered_doubt(refined)
-        return Answer(job.pair, matches, scanned, refined)
+        return Answer(job.pair, matches, scanned, refined, fitted)
     except Exception as error:
         log.warning("pair %s: %s: %s", job.pair, type(error).__name__, error)
         failed = Alignment(float("nan"), flags=(Status.FAILED,))
@@ -106,7 +113,7 @@ class Refit:
         return cls(
             tracks[i],
             tracks[j],
-            answer.matches,
+            answer.matches if answer.fitted is None else answer.fitted,
             start,
             refiner if refiner.rate == "fixed" else refiner.with_rate("fixed"),
         )

@@ -39,8 +39,8 @@ A clock that breaks, a rate, things at rest are not among them: matches that wer
 """
 
 NEIGHBOURS = 2
-"""Partners of a track in matches that an answer is made of. Those that an answer is tested by have one: second partners
-would let a few that are wrong look like many."""
+"""Partners of a track in the matches that a fit is given. What tells an answer, and what it is tested by, has one: of
+second partners a few that are wrong look like many."""
 
 CLEARLY = 0.3
 """Share of its evidence by which the time that wins must be ahead of every other."""
@@ -56,15 +56,17 @@ def contested(jobs: list[Job], verdict: Verdict, map: MapLike) -> dict[Pair, Ans
     """
     answers = {a.pair: a for a in verdict.answers}
     asked = [job for job in jobs if asks(job, answers[job.pair], verdict) and noisy(answers[job.pair])]
-    winners = {pair: winner(several) for pair, several in at_peaks(asked, answers, map, NEIGHBOURS).items()}
+    winners = {pair: winner(several) for pair, several in at_peaks(asked, answers, map).items()}
     return {pair: best for pair, best in winners.items() if best is not None}
 
 
-def at_peaks(
-    jobs: list[Job], answers: Mapping[Pair, Answer], map: MapLike, neighbours: int = 1
-) -> dict[Pair, list[Answer]]:
+def at_peaks(jobs: list[Job], answers: Mapping[Pair, Answer], map: MapLike) -> dict[Pair, list[Answer]]:
     """The answers of pairs at each peak of their scans, by matches that are made there; without those that fail."""
-    tasks = [again for job in jobs for again in at_each(job, answers[job.pair].scanned.hypotheses[:, 0], neighbours)]
+    tasks = [
+        fitted_by_neighbours(again)
+        for job in jobs
+        for again in at_each(job, answers[job.pair].scanned.hypotheses[:, 0])
+    ]
     found: dict[Pair, list[Answer]] = {}
     for answer in map(run, tasks) if tasks else ():
         if answer.finite:
@@ -104,10 +106,9 @@ def evidence_of(answer: Answer) -> float:
     return answer.scanned.stats.get("evidence", 0.0) * len(answer.matches)
 
 
-def at_each(job: Job, times: Iterable[float], neighbours: int = 1) -> list[Job]:
+def at_each(job: Job, times: Iterable[float]) -> list[Job]:
     """The work on a pair, to be matched once more at each of some offsets, s."""
-    clocks = [Clock(float(t), 1.0) for t in times]
-    return [dataclasses.replace(job, matcher=at_known_times(job.matcher, c, neighbours=neighbours)) for c in clocks]
+    return [dataclasses.replace(job, matcher=at_known_times(job.matcher, Clock(float(t), 1.0))) for t in times]
 
 
 def rematching(jobs: list[Job], verdict: Verdict) -> list[Job]:
@@ -122,15 +123,22 @@ def rematching(jobs: list[Job], verdict: Verdict) -> list[Job]:
             float((verdict.x[j] - verdict.x[i]) / verdict.rates[i]), float(verdict.rates[j] / verdict.rates[i])
         )
         flat = job.a.xyz is None or job.b.xyz is None
-        again.append(dataclasses.replace(job, matcher=at_known_times(job.matcher, clock, flat, NEIGHBOURS)))
+        again.append(fitted_by_neighbours(dataclasses.replace(job, matcher=at_known_times(job.matcher, clock, flat))))
     return again
 
 
-def at_known_times(matcher: Matcher | None, clock: Clock, flat: bool = False, neighbours: int = 1) -> Matcher:
+def fitted_by_neighbours(job: Job) -> Job:
+    """The work, with :data:`NEIGHBOURS` partners of a track for the fit, where its matcher tells the nearest ones."""
+    nearest = job.matcher
+    if not isinstance(nearest, SynchronousMatching):
+        return job
+    return dataclasses.replace(job, fitting=dataclasses.replace(nearest, neighbours=NEIGHBOURS))
+
+
+def at_known_times(matcher: Matcher | None, clock: Clock, flat: bool = False) -> Matcher:
     """What matches a pair once more: as the matcher says, else near neighbours of each other at equal times.
 
-    ``flat``: the tracks are pixels only, which epipolar distances compare. ``neighbours``: of a track, where the
-    matcher does not say.
+    ``flat``: the tracks are pixels only, which epipolar distances compare.
     """
     told = None if matcher is None else matcher.at(clock)
     if told is not None and flat and told.needs_xyz:
@@ -142,4 +150,4 @@ def at_known_times(matcher: Matcher | None, clock: Clock, flat: bool = False, ne
     costs = (Cosine(),) if matcher is None else matcher.costs
     if flat:
         return UnbalancedOT(costs=(*costs, EpipolarDistance(clock=clock)))
-    return SynchronousMatching(clock.offset, clock.rate, costs, neighbours=neighbours)
+    return SynchronousMatching(clock.offset, clock.rate, costs)

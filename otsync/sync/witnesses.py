@@ -162,7 +162,7 @@ def parted(task: tuple[Answer, Job]) -> float:
     answer, job = task
     a, b = job.a, job.b
     refiner = SplineRefine()
-    matches = one_of_each(strongest(answer.matches, readable(refiner.limit, a, b)))
+    matches = strongest(answer.matches, readable(refiner.limit, a, b))
     first, second = refiner.splines(a, b, matches)
     weight = None if matches.weight is None else matches.shares
     clock = Clock(answer.refined.offset, answer.refined.rate)
@@ -184,23 +184,6 @@ def parted(task: tuple[Answer, Job]) -> float:
         if off > worst and common_motion(*curves, fit.clock, fit.weights, window) >= ALIKE:
             worst = off
     return worst
-
-
-def one_of_each(matches: Matches) -> Matches:
-    """The best match of every track, and none that shares a track with a better one.
-
-    A neighbourhood of few tracks with several partners each would say its time as if it had many.
-    """
-    assert matches.score is not None
-    taken: tuple[set[int], set[int]] = (set(), set())
-    kept = []
-    for m in np.argsort(-matches.score, kind="stable"):
-        i, j = map(int, matches.pairs[m])
-        if i not in taken[0] and j not in taken[1]:
-            taken[0].add(i)
-            taken[1].add(j)
-            kept.append(int(m))
-    return matches.take(np.sort(np.array(kept, int)))
 
 
 def left_over(task: tuple[Answer, Job]) -> Job | None:

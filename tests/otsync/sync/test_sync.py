@@ -170,7 +170,7 @@ def test_synchronous_distances_against_numpy():
     d = d / np.mean(extent)
     np.testing.assert_allclose(place, np.minimum(np.linalg.norm(d, axis=3), 1.0).mean(2), rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(motion, np.sqrt(d.var(2).sum(2)), rtol=1e-6, atol=1e-6)
-    found = SynchronousMatching(0.0, neighbours=1)(a, dataclasses.replace(b, features=a.features[::-1]))
+    found = SynchronousMatching(0.0)(a, dataclasses.replace(b, features=a.features[::-1]))
     np.testing.assert_array_equal(
         found.pairs[np.argsort(found.pairs[:, 0])], np.stack([np.arange(8), np.arange(8)[::-1]], 1)
     )
