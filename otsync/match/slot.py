@@ -28,8 +28,7 @@ class Matcher:
     def at(self, clock: Clock) -> Matcher | None:
         """The matcher to use once the clock of b against a's is known.
 
-        None: as for any matcher, near neighbours of each other at equal times
-        (:class:`otsync.match.SynchronousMatching`).
+        None: as for any matcher, mutual nearest neighbours at equal times (:class:`otsync.match.SynchronousMatching`).
         """
         return None
 

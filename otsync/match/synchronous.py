@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from ..clocks.splines import sampled
 from ..costs.linear import Cosine, Cost, binary_scale, total_cost
 from ..costs.positions import SynchronousDistance
 from ..types import Clock, Matches, Status, TrackSet
-from ..types.checks import check_whole
 from .slot import Matcher
 
 MOMENTS = 48
@@ -28,38 +27,25 @@ FEATURE, PLACE, MOTION = 0.25, 1 / 3, 1 / 9
 FARTHEST = 3.0
 """Units at which the distance of place is cut off."""
 
-AS_NEAR, TIMES = 0.9, 2.0
-"""Second neighbours may be so many times as far apart, in place and motion, as this share of the nearest pairs is at
-most. Things that move by themselves have a track each, and their second neighbours are other things, far away."""
-
 
 @dataclass(frozen=True)
 class SynchronousMatching(Matcher):
-    """Near neighbours in features, place and motion at synchronised times: a matcher for one pair of videos.
+    """Mutual nearest neighbours in features, place and motion at synchronised times: a matcher for one pair of videos.
 
     The cost of two tracks is the sum of their feature distance, the mean (each moment cut off at three units) of their
     distance at the same moments, and the rms of that distance after removing its mean, each in units of its own scale.
     Place counts only when both sets declare one world frame. Pairs hardly ever seen together are not matched.
 
-    Two tracks match where each is among the other's nearest ``neighbours``. Tracks on one limb move nearly alike, so a
-    second neighbour has noise of its own and little error beside it. Second ones that are much further away than most
-    nearest ones are left out (:data:`AS_NEAR`, :data:`TIMES`).
-
     Args:
         offset, rate: t_a = rate * t_b + offset, from :func:`otsync.align`.
         costs: the linear terms of features, as of any matcher.
         limit: of larger sets only so many tracks take part, those seen longest: the cost is a dense matrix.
-        neighbours: matches of a track, at most; 1: mutual nearest neighbours.
     """
 
     offset: float
     rate: float = 1.0
     costs: tuple[Cost, ...] = (Cosine(),)
     limit: int = 2000
-    neighbours: int = 1
-
-    def __post_init__(self) -> None:
-        check_whole("neighbours", self.neighbours, 1)
 
     @property
     def clock(self) -> Clock:
@@ -73,12 +59,10 @@ class SynchronousMatching(Matcher):
 
     def __call__(self, a: TrackSet, b: TrackSet) -> Matches:
         own_a, own_b = longest_seen(a, self.limit), longest_seen(b, self.limit)
-        first, second = a.take(own_a), b.take(own_b)
-        apart = joined(0.0, *self.distances(first, second), placed(a, b))
-        cost = apart + self.unlike(first, second)
+        cost = self.cost(a.take(own_a), b.take(own_b))
         if not np.isfinite(cost).any():
             return Matches(np.zeros((0, 2), int), flags=(Status.NO_OVERLAP,))
-        i, j = self._near(cost, apart)
+        i, j = mutual(cost)
         value = cost[i, j]
         order = np.argsort(value, kind="stable")
         flags = () if len(i) else (Status.NO_MATCH,)
@@ -86,27 +70,12 @@ class SynchronousMatching(Matcher):
             np.stack([own_a[i], own_b[j]], 1)[order],
             -value[order],
             flags=flags,
-            stats={
-                "objective": float(value.sum()),
-                "mass": min(len(np.unique(i)), len(np.unique(j))) / max(min(len(a), len(b)), 1),
-            },
+            stats={"objective": float(value.sum()), "mass": len(i) / max(min(len(a), len(b)), 1)},
         )
 
     def cost(self, a: TrackSet, b: TrackSet) -> Float[np.ndarray, "Na Nb"]:
         """In units; infinite where two tracks are not seen together at enough moments."""
         return joined(self.unlike(a, b), *self.distances(a, b), placed(a, b))
-
-    def _near(
-        self, cost: Float[np.ndarray, "Na Nb"], apart: Float[np.ndarray, "Na Nb"]
-    ) -> tuple[Int[np.ndarray, " M"], Int[np.ndarray, " M"]]:
-        """The nearest ones, and of the others those that are hardly further ``apart`` than most of these."""
-        nearest = mutual(cost)
-        if self.neighbours == 1 or not len(nearest[0]):
-            return nearest
-        i, j = mutual(cost, self.neighbours)
-        kept = apart[i, j] <= TIMES * np.quantile(apart[nearest], AS_NEAR)
-        kept |= np.isin(i * cost.shape[1] + j, nearest[0] * cost.shape[1] + nearest[1])
-        return i[kept], j[kept]
 
     def unlike(self, a: TrackSet, b: TrackSet) -> Float[np.ndarray, "Na Nb"] | float:
         """The part of features, in units; 0 without any."""
@@ -169,27 +138,11 @@ def joined(
     return np.where(np.isfinite(motion), cost, np.inf)
 
 
-def mutual(
-    cost: Float[np.ndarray, "Na Nb"], neighbours: int = 1
-) -> tuple[Int[np.ndarray, " M"], Int[np.ndarray, " M"]]:
-    """Rows and columns that are each among the other's so many cheapest, at a finite cost."""
-    if not cost.size:
-        return np.zeros(0, int), np.zeros(0, int)
-    if neighbours == 1:
-        best_b, best_a = cost.argmin(1), cost.argmin(0)
-        i = np.flatnonzero((best_a[best_b] == np.arange(len(cost))) & np.isfinite(cost.min(1)))
-        return i, best_b[i]
-    i, j = np.nonzero(_cheapest(cost, neighbours) & _cheapest(cost.T, neighbours).T & np.isfinite(cost))
-    return i, j
-
-
-def _cheapest(cost: Float[np.ndarray, "Na Nb"], count: int) -> Bool[np.ndarray, "Na Nb"]:
-    """Which columns are among the ``count`` cheapest of each row; the first of those that cost the same."""
-    left, rows, among = cost.copy(), np.arange(len(cost)), np.zeros(cost.shape, bool)
-    for _ in range(min(count, cost.shape[1])):
-        best = left.argmin(1)
-        among[rows, best], left[rows, best] = True, np.inf
-    return among
+def mutual(cost: Float[np.ndarray, "Na Nb"]) -> tuple[Int[np.ndarray, " M"], Int[np.ndarray, " M"]]:
+    """Rows and columns that are each other's cheapest, at a finite cost."""
+    best_b, best_a = cost.argmin(1), cost.argmin(0)
+    i = np.flatnonzero((best_a[best_b] == np.arange(len(cost))) & np.isfinite(cost.min(1)))
+    return i, best_b[i]
 
 
 def longest_seen(tracks: TrackSet, limit: int) -> Int[np.ndarray, " n"]:

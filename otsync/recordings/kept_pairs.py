@@ -20,7 +20,7 @@ from ..types import Alignment, Matches, Similarity, Status, TrackSet
 
 log = logging.getLogger("otsync")
 
-MADE_BY = 12
+MADE_BY = 11
 """Raised when the same pair gets another answer, or more of one, than before: what was kept is then made anew."""
 
 MANY = 12
@@ -55,7 +55,7 @@ class KeptPairs:
             if isinstance(item, OwnJob):
                 key = (*key, item.solver, item.start)
             else:
-                key = (*key, item.matcher, item.aligner, item.refiner, item.fitting)
+                key = (*key, item.matcher, item.aligner, item.refiner)
             try:
                 self.cache.path("pair", key)
             except ValueError as error:  # an algorithm whose content cannot be read would be mistaken for another
@@ -87,8 +87,6 @@ def pack(answer: Answer) -> dict[str, np.ndarray]:
     out = {"told": np.array(json.dumps(told)), "pairs": matches.pairs, "score": np.asarray(matches.score, float)}
     if matches.weight is not None:
         out["weight"] = matches.weight
-    if answer.fitted is not None:
-        out |= {"fitted_pairs": answer.fitted.pairs, "fitted_score": np.asarray(answer.fitted.score, float)}
     for name, alignment in (("scanned", answer.scanned), ("refined", answer.refined)):
         out[f"{name}_hypotheses"] = np.asarray(alignment.hypotheses, float)
         if len(alignment.parts):
@@ -133,8 +131,7 @@ def unpack(pair: tuple[int, int], arrays: dict[str, np.ndarray]) -> Answer:
         )
 
     matches = Matches(arrays["pairs"], arrays["score"], weight=arrays.get("weight"), **words(told["matches"]))
-    fitted = Matches(arrays["fitted_pairs"], arrays["fitted_score"]) if "fitted_pairs" in arrays else None
-    return Answer(pair, matches, alignment("scanned"), alignment("refined"), fitted)
+    return Answer(pair, matches, alignment("scanned"), alignment("refined"))
 
 
 def _words(result: Matches | Alignment) -> dict[str, Any]:

@@ -32,11 +32,7 @@ CLEAR = 40.0
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """What one pair needs, self-contained so that any executor can carry it.
-
-    Args:
-        fitting: makes the matches of the refiner, where these are not those that the answer is told and tested by.
-    """
+    """What one pair needs, self-contained so that any executor can carry it."""
 
     pair: Pair
     a: TrackSet
@@ -45,7 +41,6 @@ class Job:
     aligner: Aligner
     refiner: Refiner
     matches: Matches | None
-    fitting: Matcher | None = None
 
     def on(self, other: Job) -> Job:
         """The same algorithms on the tracks of another one."""
@@ -69,13 +64,11 @@ def _answer(job: Job) -> Answer:
             return Answer(job.pair, matches, failed, failed)
         scanned = align(job.a, job.b, matches, job.aligner, throw=False)
         scanned = dataclasses.replace(scanned, flags=(*(f for f in matches.flags if f in DOUBTS), *scanned.flags))
-        refined, fitted = scanned, None
+        refined = scanned
         if np.isfinite(scanned.offset):
-            if job.fitting is not None and len(matches):
-                fitted = match(job.a, job.b, job.fitting, throw=False).without_plan()
-            refined = refine(job.a, job.b, matches if fitted is None else fitted, scanned, job.refiner, throw=False)
+            refined = refine(job.a, job.b, matches, scanned, job.refiner, throw=False)
             refined = without_answered_doubt(refined)
-        return Answer(job.pair, matches, scanned, refined, fitted)
+        return Answer(job.pair, matches, scanned, refined)
     except Exception as error:
         log.warning("pair %s: %s: %s", job.pair, type(error).__name__, error)
         failed = Alignment(float("nan"), flags=(Status.FAILED,))
@@ -113,7 +106,7 @@ class Refit:
         return cls(
             tracks[i],
             tracks[j],
-            answer.matches if answer.fitted is None else answer.fitted,
+            answer.matches,
             start,
             refiner if refiner.rate == "fixed" else refiner.with_rate("fixed"),
         )

@@ -38,10 +38,6 @@ NOISY = frozenset(
 A clock that breaks, a rate, things at rest are not among them: matches that were made at one time agree with it.
 """
 
-NEIGHBOURS = 2
-"""Partners of a track in the matches that a fit is given. What tells an answer, and what it is tested by, has one: of
-second partners a few that are wrong look like many."""
-
 CLEARLY = 0.3
 """Share of its evidence by which the time that wins must be ahead of every other."""
 
@@ -62,11 +58,7 @@ def contested(jobs: list[Job], verdict: Verdict, map: MapLike) -> dict[Pair, Ans
 
 def at_peaks(jobs: list[Job], answers: Mapping[Pair, Answer], map: MapLike) -> dict[Pair, list[Answer]]:
     """The answers of pairs at each peak of their scans, by matches that are made there; without those that fail."""
-    tasks = [
-        fitted_by_neighbours(again)
-        for job in jobs
-        for again in at_each(job, answers[job.pair].scanned.hypotheses[:, 0])
-    ]
+    tasks = [again for job in jobs for again in at_each(job, answers[job.pair].scanned.hypotheses[:, 0])]
     found: dict[Pair, list[Answer]] = {}
     for answer in map(run, tasks) if tasks else ():
         if answer.finite:
@@ -123,20 +115,12 @@ def rematching(jobs: list[Job], verdict: Verdict) -> list[Job]:
             float((verdict.x[j] - verdict.x[i]) / verdict.rates[i]), float(verdict.rates[j] / verdict.rates[i])
         )
         flat = job.a.xyz is None or job.b.xyz is None
-        again.append(fitted_by_neighbours(dataclasses.replace(job, matcher=at_known_times(job.matcher, clock, flat))))
+        again.append(dataclasses.replace(job, matcher=at_known_times(job.matcher, clock, flat)))
     return again
 
 
-def fitted_by_neighbours(job: Job) -> Job:
-    """The work, with :data:`NEIGHBOURS` partners of a track for the fit, where its matcher tells the nearest ones."""
-    nearest = job.matcher
-    if not isinstance(nearest, SynchronousMatching):
-        return job
-    return dataclasses.replace(job, fitting=dataclasses.replace(nearest, neighbours=NEIGHBOURS))
-
-
 def at_known_times(matcher: Matcher | None, clock: Clock, flat: bool = False) -> Matcher:
-    """What matches a pair once more: as the matcher says, else near neighbours of each other at equal times.
+    """What matches a pair once more: as the matcher says, else mutual nearest neighbours at equal times.
 
     ``flat``: the tracks are pixels only, which epipolar distances compare.
     """

@@ -68,17 +68,12 @@ MOST_RATE = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """The outcome of one pair: its matches, the aligner's answer, and the refiner's.
-
-    Args:
-        fitted: the matches that the refiner was given, where they are not those of the answer.
-    """
+    """The outcome of one pair: its matches, the aligner's answer, and the refiner's."""
 
     pair: Pair
     matches: Matches
     scanned: Alignment
     refined: Alignment
-    fitted: Matches | None = None
 
     @property
     def finite(self) -> bool:

@@ -4,8 +4,8 @@ Every matcher x every way from matches to an offset x matched again or not, each
 a user would call it, in situations that matchers differ in: the simulator's presets, few tracks, tracks of strangers,
 a wide baseline, people who look alike, no depth; and, with a recording, pairs of its cameras. The row "paper" is
 :data:`otsync.sync.method.PAPER`. Matched again means: by the matcher itself where it can be (cheapest partners,
-unbalanced OT), else by near neighbours of each other at equal times, by the matcher's own costs. A missing answer
-counts as the largest error that there can be.
+unbalanced OT), else by mutual nearest neighbours at equal times, by the matcher's own costs. A missing answer counts as
+the largest error that there can be.
 """
 
 from __future__ import annotations

@@ -10,12 +10,11 @@ import pytest
 from otsync import Matches, synchronize
 from otsync.align.likelihood import LikelihoodScan
 from otsync.bench.trust.worlds import CLASSES
-from otsync.recordings.kept_pairs import pack, unpack
 from otsync.refine.splines import SplineRefine
 from otsync.simulate import simulate
 from otsync.sync.graph import Graph
-from otsync.sync.pairs import Job, Refit, run
-from otsync.sync.rematching import CLEARLY, NOISY, at_each, contested, evidence_of, fitted_by_neighbours, winner
+from otsync.sync.pairs import Job, run
+from otsync.sync.rematching import CLEARLY, NOISY, contested, winner
 from otsync.sync.verdict import Answer, Verdict, judge
 from otsync.types import Alignment, Status
 
@@ -43,22 +42,6 @@ def test_times_with_about_as_much_evidence_stay_in_doubt():
 def test_evidence_is_that_of_all_matches():
     few, many = answer(0.5, 40.0, matches=5), answer(-1.0, 30.0, matches=20)
     assert winner([few, many]) is many
-
-
-def test_a_fit_is_given_second_neighbours_and_nothing_else_is():
-    """What tells an answer, and what it is tested by, has one partner of every track."""
-    tracks, truth = simulate("football", preset="mid", videos=2, seed=8)
-    (once,) = at_each(Job((0, 1), *tracks, None, LikelihoodScan(), SplineRefine(), None), (truth.offset(0, 1),))
-    alone, both = run(once), run(fitted_by_neighbours(once))
-    np.testing.assert_array_equal(alone.matches.pairs, both.matches.pairs)
-    assert alone.fitted is None and both.scanned.offset == alone.scanned.offset
-    assert evidence_of(both) == evidence_of(alone)
-    assert both.fitted is not None and len(both.fitted) > 1.5 * len(both.matches)
-    assert both.refined.stats["matches"] == len(both.fitted)
-    assert Refit.of(both, 0.0, 1.0, tracks, SplineRefine()).matches is both.fitted
-    kept = unpack((0, 1), pack(both)).fitted
-    assert kept is not None
-    np.testing.assert_array_equal(kept.pairs, both.fitted.pairs)
 
 
 def test_partners_of_one_track_do_not_make_matches_many():
