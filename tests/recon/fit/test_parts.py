@@ -182,8 +182,10 @@ def without(at: int, lost: int, until: int = FRAMES) -> list[int]:
         ([*range(30), *[30] * 3, *range(30, FRAMES - 3)], 500),
         ([*without(20, 3, 40), *[40] * 3, *range(40, FRAMES)], 500),
         (np.round(np.arange(57) * 1.04).astype(int).tolist(), 500),
+        (np.round(np.arange(FRAMES) * 0.96).astype(int).tolist(), 500),
+        (np.round(np.arange(58) * 1.02).astype(int).tolist(), 500),
     ],
-    ids=["ten lost", "three stand still", "lost and later still", "4 % of rate"],
+    ids=["ten lost", "three stand still", "lost and later still", "4 % fast", "4 % slow", "2 % fast"],
 )
 def test_a_fit_says_whose_clock_is_uneven(seed, shown, steps):
     assert said(fitted(seed, 2, shown, steps)) == [2]
