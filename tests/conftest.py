@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import settings
 
 from otsync import TrackSet
 from tests.slow import mark
@@ -16,6 +17,10 @@ from tests.slow import mark
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN and threading.current_thread() is threading.main_thread():
     # a shell starts background jobs with Ctrl-C ignored, and children inherit that; what interrupts does is tested here
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# no verdict depends on how busy the machine is
+settings.register_profile("otsync", deadline=None)
+settings.load_profile("otsync")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

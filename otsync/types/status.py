@@ -28,8 +28,9 @@ class Status(StrEnum):
         "container's timestamps; with depth, let the rate be fitted (rate='fit', the default)."
     )
     BROKEN_CLOCK = (
-        "Parts of the overlap seem to have offsets of their own: a video froze, lost frames, was paused or cut, or "
-        "tracks slide over what they follow. Look at the parts; give the true timestamps, or cut the recording there."
+        "Parts of the overlap seem to have offsets of their own, or frames are shown far better at another time of the "
+        "scene: a video froze, lost frames, was paused or cut, tracks slide over what they follow, or a fit began far "
+        "off. Look at the parts; give the true timestamps, or cut the recording there."
     )
     LAGGING = (
         "Tracks of this video, or of the reference, come late by delays of their own: those of a tracker that filters "

@@ -14,9 +14,10 @@ from torch import Tensor
 from otsync.compute.threads import MapLike
 from recon.fit.checkpoint import Snapshot
 from recon.fit.densify import Densify
+from recon.fit.lags import FIRST, LAGS, Lagged, lagged
 from recon.fit.optimize import Adam, Decay, check_rates
 from recon.fit.problem import Problem, assemble, scene_groups
-from recon.fit.uncertainty import FRAMES, Votes, cast
+from recon.fit.uncertainty import FRAMES, Look, Target, Votes, cast
 from recon.fit.witnesses import Told, told_by_bends
 from recon.losses.image import Seen
 from recon.losses.motion import Draw
@@ -140,11 +141,12 @@ class Run:
                 self._pull += r.pull
 
     def steps_after(self) -> int:
-        """Steps that take as long as :meth:`votes`: three renderings a vote."""
+        """Steps that take as long as :meth:`votes`, three renderings each, and what :meth:`lagged` asks of all."""
         if "offsets" not in self.adam.groups:
             return 0
-        votes = np.minimum(np.unique(self.problem.keys[:, 0], return_counts=True)[1], FRAMES).sum()
-        return int(3 * votes / self.problem.batch)
+        frames = np.unique(self.problem.keys[:, 0], return_counts=True)[1]
+        renderings = 3 * np.minimum(frames, FRAMES) + (2 * len(LAGS) + 1) * np.minimum(frames, FIRST)
+        return int(renderings.sum() / self.problem.batch)
 
     def reach(self, group: str) -> float:
         """How far Adam's steps so far can have moved an entry of a group, in the group's own unit."""
@@ -165,15 +167,19 @@ class Run:
 
     def votes(self, values: dict[str, Tensor], map: MapLike = map) -> list[Votes]:
         """What frames say of each video's own clock: see :func:`recon.fit.uncertainty.cast`."""
+        look, target = self._shown(values)
         p = self.problem
-        return cast(
-            lambda v, k, later: self.look(values, v, k, later),
-            lambda v, k: p.clips[v].image(k, p.clips[v].box(k)),
-            p.keys,
-            len(p.clips),
-            self.scene.frame_step,
-            map=map,
-        )
+        return cast(look, target, p.keys, len(p.clips), self.scene.frame_step, map=map)
+
+    def lagged(self, values: dict[str, Tensor], votes: Sequence[Votes], map: MapLike = map) -> list[Lagged]:
+        """How each video's frames are shown at other times: see :func:`recon.fit.lags.lagged`."""
+        look, target = self._shown(values)
+        return lagged(look, target, partial(self.world_time, values), votes, self.scene.frame_step, map)
+
+    def _shown(self, values: dict[str, Tensor]) -> tuple[Look, Target]:
+        """Frames as the scene gives them, and as they are."""
+        clips = self.problem.clips
+        return partial(self.look, values), lambda v, k: clips[v].image(k, clips[v].box(k))
 
     def told(self, sigma: np.ndarray) -> Told | None:
         """What the bends of the clocks tell, None where none were bent; ``sigma``: seconds, of the votes."""

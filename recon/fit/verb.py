@@ -27,6 +27,7 @@ from otsync.progress import Deadline, bar
 from otsync.types import Offsets, Status
 from otsync.types.status import in_order
 from recon.fit.checkpoint import Checkpoint
+from recon.fit.lags import displaced
 from recon.fit.options import FitOptions
 from recon.fit.parts import broken
 from recon.fit.problem import Problem, assemble, check_groups
@@ -258,7 +259,7 @@ def _finish(run: Run, seconds: float, map: MapLike) -> Reconstruction:
     if "offsets" in run.adam.groups:
         votes = run.votes(values, map)
         refined, sigma, raised, told = _witnessed(run, refined, sigma, newton_sigma(votes), history)
-        parts = broken(votes, p.scene.frame_step)
+        parts = sorted({*broken(votes, p.scene.frame_step), *displaced(run.lagged(values, votes, map))})
         # where the reference's clock breaks all others are off by it
         apart = [v for v in range(len(p.clips)) if v != p.reference] if p.reference in parts else parts
         for v, flag in (*raised, *((v, Status.BROKEN_CLOCK) for v in apart)):

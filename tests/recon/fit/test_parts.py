@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -152,6 +153,29 @@ def fitted(seed: int, who: int | None, shown: Sequence[int], steps: int = 500) -
     return fit(initial_scene(capture, loose), capture.footage, loose, steps=steps).offsets
 
 
+def begun(seed: int, off: float, steps: int, **world: Any) -> Offsets:
+    """The clocks that a fit finds where the third one begins so many frames off, and is said to be known."""
+    capture = synthetic(seed, offsets=0.0, **world)
+    names = [f.name for f in capture.footage]
+    start = np.zeros(len(names))
+    start[2] = off / 30
+    known = Offsets.known(names, start, 30)
+    loose = replace(known, sigma=np.r_[0, np.full(len(names) - 1, 0.2 / 30)])
+    return fit(initial_scene(capture, loose), capture.footage, loose, steps=steps).offsets
+
+
+def test_a_fit_that_began_ten_frames_off_says_so():
+    assert said(begun(591, 10, 120, cameras=4, frames=30, size=(96, 64))) == [2]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [587, 588])
+@pytest.mark.parametrize("off", [5, 12, 25])
+def test_a_fit_that_began_far_off_says_so(seed, off):
+    """It ended where it began, at a sigma of .14, and was ok."""
+    assert said(begun(seed, off, 500, frames=FRAMES)) == [2]
+
+
 def said(found: Offsets) -> list[int]:
     return [v for v, flags in enumerate(found.flags) if Status.BROKEN_CLOCK in flags]
 
@@ -184,8 +208,21 @@ def without(at: int, lost: int, until: int = FRAMES) -> list[int]:
         (np.round(np.arange(57) * 1.04).astype(int).tolist(), 500),
         (np.round(np.arange(FRAMES) * 0.96).astype(int).tolist(), 500),
         (np.round(np.arange(58) * 1.02).astype(int).tolist(), 500),
+        ([*range(30), *range(30)], 500),
+        ([*range(20), *range(39, 19, -1), *range(40, FRAMES)], 500),
+        ([*range(20), *[20] * 15, *range(20, FRAMES - 15)], 500),
     ],
-    ids=["ten lost", "three stand still", "lost and later still", "4 % fast", "4 % slow", "2 % fast"],
+    ids=[
+        "ten lost",
+        "three stand still",
+        "lost and later still",
+        "4 % fast",
+        "4 % slow",
+        "2 % fast",
+        "a second twice",
+        "backwards within",
+        "fifteen stand still",
+    ],
 )
 def test_a_fit_says_whose_clock_is_uneven(seed, shown, steps):
     assert said(fitted(seed, 2, shown, steps)) == [2]
