@@ -1823,10 +1823,26 @@ BREAKS = (
     Break(
         "fit-lags-unheard",
         "recon/fit/lags.py",
-        "if int(_better(one, BETTER).sum()) >= LEAST]",
-        "if int(_better(one, BETTER).sum()) > FRAMES]",
+        "if own < np.clip(USUAL * np.median(others) if others else 0.0, *BETTER):",
+        "if own < 0.0:",
         ("tests/recon/fit/test_lags.py",),
         "a video that shows a second twice is trusted after a fit",
+    ),
+    Break(
+        "fit-lags-alone",
+        "recon/fit/lags.py",
+        "if own < np.clip(USUAL * np.median(others) if others else 0.0, *BETTER):",
+        "if own < BETTER[0]:",
+        ("tests/recon/fit/test_lags.py",),
+        "a video that is shown equally well at any time is trusted, however surely the others have one",
+    ),
+    Break(
+        "fit-lags-blame-all",
+        "recon/fit/lags.py",
+        "if own < np.clip(USUAL * np.median(others) if others else 0.0, *BETTER):",
+        "if own < BETTER[1]:",
+        ("tests/recon/fit/test_lags.py",),
+        "of a poor fit clocks are doubted that are right",
     ),
     Break(
         "fit-lags-of-any-frames",

@@ -99,3 +99,13 @@ def test_where_nothing_is_filmed_nothing_is_told():
 def test_where_nothing_moves_no_time_is_better():
     still = np.zeros((FRAMES, 3))
     assert displaced([Lagged(np.arange(FRAMES), np.array([-1, 0, 1]), still)]) == []
+
+
+@pytest.mark.parametrize(("others", "said"), [(1.0, []), (1.4, []), (1.8, [1])])
+def test_where_the_others_are_sure_less_is_asked(others, said):
+    """A tenth better at another time: of a poor fit that is chance."""
+
+    def at_another(share: float) -> Lagged:
+        return Lagged(np.arange(FRAMES), np.array([-1, 0, 1]), np.array([[2.0 * share, 2.0, np.nan]] * FRAMES))
+
+    assert displaced([at_another(others), at_another(0.9), at_another(others)]) == said
