@@ -26,6 +26,7 @@ from recon.observe.effects import Rendered, Shot, compose, prior
 from recon.scene.gaussians4d import Gaussians4D, scene_arrays, scene_from_arrays
 
 RECORDS = 200  # rows of history in a fit
+UNSEEN = -30.0  # logit of an opacity that nobody sees
 
 
 class Diverged(RuntimeError):
@@ -145,7 +146,7 @@ class Run:
         if "offsets" not in self.adam.groups:
             return 0
         frames = np.unique(self.problem.keys[:, 0], return_counts=True)[1]
-        renderings = 3 * np.minimum(frames, FRAMES) + (2 * len(LAGS) + 1) * np.minimum(frames, FIRST)
+        renderings = 3 * np.minimum(frames, FRAMES) + (2 * len(LAGS) + 2) * np.minimum(frames, FIRST)
         return int(renderings.sum() / self.problem.batch)
 
     def reach(self, group: str) -> float:
@@ -174,7 +175,9 @@ class Run:
     def lagged(self, values: dict[str, Tensor], votes: Sequence[Votes], map: MapLike = map) -> list[Lagged]:
         """How each video's frames are shown at other times: see :func:`recon.fit.lags.lagged`."""
         look, target = self._shown(values)
-        return lagged(look, target, partial(self.world_time, values), votes, self.scene.frame_step, map)
+        still = values | {"opacity_logits": torch.full_like(values["opacity_logits"], UNSEEN)}
+        empty = partial(self.look, still)
+        return lagged(look, empty, target, partial(self.world_time, values), votes, self.scene.frame_step, map)
 
     def _shown(self, values: dict[str, Tensor]) -> tuple[Look, Target]:
         """Frames as the scene gives them, and as they are."""

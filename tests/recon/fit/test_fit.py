@@ -678,7 +678,7 @@ def test_the_clocks_are_the_mean_of_the_last_steps_and_doubt_what_they_had_left_
 
 
 def test_votes_take_as_long_as_some_steps(capture, scene):
-    renderings = sum(3 * len(f.times) + FIRST * (2 * len(LAGS) + 1) for f in capture.footage)
+    renderings = sum(3 * len(f.times) + FIRST * (2 * len(LAGS) + 2) for f in capture.footage)
     for options, want in ((FitOptions(batch=2), renderings / 2), (FitOptions(freeze=("offsets",)), 0)):
         problem = Problem.of(scene, capture.footage, believed(capture), options)
         assert Run(problem, options.active_rates(), None, None).steps_after() == want
