@@ -46,9 +46,9 @@ LEAST = 2
 
 BETTER = 0.8
 """Of the sum of squares at its own time, below which another time shows a frame far better. After short and poor fits
-the second lowest of eight was .88 and more in 90 videos of films (``otsync bench films --seeds 12 --first-seed
-80172``); it is 1.5 and more in fourteen cameras of basketball, and .2 to .7 in most clocks that were 5 to 30 frames
-off."""
+the second lowest of eight was .88 and more in 58 videos of films (``otsync bench films --seeds 12 --first-seed
+80172``); of three frames and fewer lags it was 1.6 and more in fourteen cameras of basketball. It is .2 to .7 in most
+clocks that are 5 to 30 frames off."""
 
 NOTHING = 0.9
 """Of the sum of squares of the scene without what moves, that another time must be below as well. Where a post stands
