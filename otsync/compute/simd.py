@@ -151,6 +151,18 @@ def load(typingctx, array, index):
 
 
 @_intrinsic
+def repeat(typingctx, array, index):
+    """array[index] in every lane, without numba's look at whether the index is negative."""
+    kind = _SCALARS[array.dtype]
+
+    def lower(context, builder, sig, args):
+        data = context.make_array(sig.args[0])(context, builder, args[0]).data
+        return _spread(builder, builder.load(builder.gep(data, [args[1]])), sig.args[0].dtype)
+
+    return kind(array, index), lower
+
+
+@_intrinsic
 def store(typingctx, array, index, vector):
     """array[index : index + LANES] = vector."""
 

@@ -13,6 +13,9 @@ from ..types import TrackSet
 
 TRACK_BLOCK = 128
 
+SMALL = 1e-150
+"""Sums of squares from here on, up to its reciprocal, are exact to rounding."""
+
 
 def binary_scale(x: np.ndarray, where: np.ndarray | None = None) -> float:
     """The power of two next to the largest finite magnitude of ``x``, of those ``where`` (1 when there is none).
@@ -29,14 +32,18 @@ def binary_scale(x: np.ndarray, where: np.ndarray | None = None) -> float:
 def unit_features(features: Float[np.ndarray, "N D"], *, center: bool = False) -> Float[np.ndarray, "N D"]:
     """Rows of unit norm in float64, after subtracting the set's mean when ``center``.
 
-    Rows are brought to order one first: squares of 1e±200 neither overflow nor vanish. A row that centring makes
-    zero (it equals the mean) stays zero: at cosine distance 1 from everything, it carries no information.
+    Rows far from order one are brought there first: squares of 1e±200 neither overflow nor vanish. A row that centring
+    makes zero (it equals the mean) stays zero: at cosine distance 1 from everything, it carries no information.
     """
     tiny = np.finfo(float).tiny
     f = np.array(features, float)
-    top = np.maximum(f.max(1, initial=0.0), -f.min(1, initial=0.0))
-    f /= np.maximum(top, tiny)[:, None]
-    f /= np.maximum(np.sqrt(np.einsum("nd,nd->n", f, f)), tiny)[:, None]
+    square = np.einsum("nd,nd->n", f, f)
+    far = ~((square > SMALL) & (square < 1 / SMALL))
+    if far.any():
+        top = np.maximum(f[far].max(1, initial=0.0), -f[far].min(1, initial=0.0))
+        f[far] /= np.maximum(top, tiny)[:, None]
+        square[far] = np.einsum("nd,nd->n", f[far], f[far])
+    f /= np.maximum(np.sqrt(square), tiny)[:, None]
     if center:
         f -= f.mean(0)
         norm = np.sqrt(np.einsum("nd,nd->n", f, f))

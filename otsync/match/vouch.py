@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -367,12 +368,14 @@ def chirality(a: Float[np.ndarray, "M F 3"], b: Float[np.ndarray, "M G 3"]) -> f
 
 def side(points: Float[np.ndarray, "M F 3"], quads: Int[np.ndarray, "Q 4"]) -> Int[np.ndarray, " Q"]:
     """+1 or -1 where the triple product of a quad's edges keeps its sign over the frames, 0 where it does not."""
-    x = points[quads].astype(float)
-    edges = x[:, 1:] - x[:, :1]
-    length = np.linalg.norm(edges, axis=-1, keepdims=True)
-    u, v, w = (edges / np.maximum(length, np.finfo(float).tiny)).swapaxes(0, 1)
-    volume = np.einsum("qtc,qtc->qt", np.cross(u, v), w)
-    return (volume > FLAT).all(1).astype(int) - (volume < -FLAT).all(1).astype(int)
+    points = points.astype(float) / binary_scale(points)  # products of three lengths stay within float64
+    first, *others = (points[quads[:, k]].transpose(2, 0, 1) for k in range(4))
+    u, v, w = (other - first for other in others)
+    volume = (
+        u[0] * (v[1] * w[2] - v[2] * w[1]) + u[1] * (v[2] * w[0] - v[0] * w[2]) + u[2] * (v[0] * w[1] - v[1] * w[0])
+    )
+    size = math.prod((e[0] ** 2 + e[1] ** 2 + e[2] ** 2) ** 0.5 for e in (u, v, w))
+    return (volume > FLAT * size).all(1).astype(int) - (volume < -FLAT * size).all(1).astype(int)
 
 
 def poses(xyz: Float[np.ndarray, "M T 3"], seen: Bool[np.ndarray, "M T"], frames: int) -> Float[np.ndarray, "M F 3"]:

@@ -178,6 +178,9 @@ class TrackSet:
     def _unfit(self, value: np.ndarray) -> Bool[np.ndarray, "N T"]:
         """Which visible samples of a field are not finite. Of long clips few tracks at a time are looked at."""
         bad = np.zeros_like(self.seen)
+        with np.errstate(over="ignore", invalid="ignore"):
+            if np.isfinite(value.sum()):  # of finite numbers, or of such as only their sum is not: these are looked at
+                return bad
         for some in blocks(len(bad), self.n_frames):
             finite = np.isfinite(value[some])
             for known in np.moveaxis(finite, -1, 0) if value.ndim == 3 else [finite]:

@@ -721,10 +721,26 @@ BREAKS = (
     Break(
         "match-anchored-no-truncation",
         "otsync/match/anchored/kernels.py",
-        "total += min(d * d, tau2)",
-        "total += d * d",
+        "p, q = p + minimum(u * u, tau2), q + minimum(v * v, tau2)",
+        "p, q = p + u * u, q + v * v",
         ANCHORED,
         "the cost of signatures is not truncated",
+    ),
+    Break(
+        "match-anchored-left-too-soon",
+        "otsync/match/anchored/kernels.py",
+        "near = any_lane(((p + q) + (r + s)) * each + least < best[K - 1])",
+        "near = any_lane(((p + q) + (r + s)) * each + feature < best[K - 1])",
+        ANCHORED,
+        "candidates are left although features may make up for their signatures",
+    ),
+    Break(
+        "match-anchored-other-frames",
+        "otsync/match/anchored/kernels.py",
+        "u, v, w = t * M + j, (T + t) * M + j, (2 * T + t) * M + j",
+        "u, v, w = j, T * M + j, 2 * T * M + j",
+        ANCHORED,
+        "tracks are compared with where a landmark was in its first frame",
     ),
     Break(
         "match-anchored-landmarks-crowd",

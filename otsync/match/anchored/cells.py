@@ -11,6 +11,10 @@ POSES = 6
 """Frames that tell tracks apart."""
 
 
+NOWHERE = 1e15
+"""Where centres are that only fill a vector: no track is as near to one as to any other."""
+
+
 def k_means(cloud: Cloud, n: int, rng: np.random.Generator, rounds: int = 4) -> Int[np.ndarray, " N"]:
     """A group for every track: at most ``n`` groups, numbered without gaps.
 
@@ -33,8 +37,11 @@ def k_means(cloud: Cloud, n: int, rng: np.random.Generator, rounds: int = 4) -> 
 
 def nearest(points: Float[np.ndarray, "N D"], centers: Float[np.ndarray, "M D"]) -> Int[np.ndarray, " N"]:
     """Index of the nearest centre of every point."""
+    from ...compute.simd import LANES
     from . import kernels
 
     label = np.empty(len(points), np.int64)
-    run(kernels.nearest, len(points), points, np.ascontiguousarray(centers.T), label, block=256)
+    lying = np.pad(centers.T, ((0, 0), (0, -len(centers) % LANES)), constant_values=NOWHERE)
+    flat = np.ascontiguousarray(points).reshape(-1)
+    run(kernels.nearest, len(points), flat, points.shape[1], lying.reshape(-1), label, block=256)
     return label

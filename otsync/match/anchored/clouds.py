@@ -55,11 +55,17 @@ class Cloud:
         """Positions at ``frames`` times over the clip; of an unseen track at the nearest frame where it is seen."""
         from . import kernels
 
-        T = len(self.weight)
-        at = evenly(T, frames)
-        out = np.empty((len(self), 3 * len(at)), np.float32)
-        run(kernels.poses, len(self), self.columns, self.weight, at, out)
-        return out
+        if frames not in self._poses:
+            at = evenly(len(self.weight), frames)
+            out = np.empty((len(self), 3 * len(at)), np.float32)
+            run(kernels.poses, len(self), self.columns, self.weight, at, out)
+            self._poses[frames] = out
+        return self._poses[frames]
+
+    @cached_property
+    def _poses(self) -> dict[int, Float[np.ndarray, "N 3F"]]:
+        """Those that were asked for, by the number of frames: every round of the solver asks again."""
+        return {}
 
     def groups(self, label: Int[np.ndarray, " N"], n: int) -> Cloud:
         """The mean tracks of ``n`` groups, none empty: position over the members seen, mean unit feature and label."""

@@ -40,8 +40,8 @@ KEPT = 0.4
 CHALLENGE_ROUNDS = 1
 """Rounds of the challenger: enough to see what its answer costs."""
 
-GROUPS = 16
-"""Groups of b's cells in which partners of a cell are sought."""
+GROUPS = 12
+"""Groups of b's cells in which partners of a cell are sought: a tenth of all."""
 
 
 class Options(Protocol):
@@ -189,8 +189,9 @@ class Start:
 
     def refine(self, level: Level, options: Options, marks: tuple[Cloud, Cloud], rounds: int) -> Solution:
         """Cells by their signatures; the best matches are the landmarks of the next of ``rounds``."""
+        every = np.arange(len(marks[0]))
+        marks = spread(*marks, every, every, options.landmarks)
         for _ in range(rounds + 1):
-            marks = spread(marks, options.landmarks)
             allowed = shortlist(self.anchors.signatures(marks), self.anchors.linear, level.scale, GROUPS).index
             found = shortlist(
                 level.signatures(marks),
@@ -202,26 +203,23 @@ class Start:
             )
             i, j, cost = found.one_to_one(len(level.b))
             best = max(min(options.landmarks, len(i)), int(KEPT * len(i)))
-            marks = level.a.take(i[:best]), level.b.take(j[:best])
+            marks = spread(level.a, level.b, i[:best], j[:best], options.landmarks)
         half = (len(i) + 1) // 2
-        side = chirality(
-            *(c.take(k[:half]).poses(FRAMES).reshape(half, -1, 3) for c, k in ((level.a, i), (level.b, j)))
-        )
+        side = chirality(*(c.poses(FRAMES)[k[:half]].reshape(half, -1, 3) for c, k in ((level.a, i), (level.b, j))))
         linear = float(level.linear.cost(i[:half], j[:half]).mean())
         geometry = float(cost[:half].mean()) - level.scale.beta * linear
         relative = linear / level.scale.chance if level.scale.chance > 0 else 0.5
-        return Solution(i, j, cost, found, spread(marks, options.landmarks), geometry, relative, side)
+        return Solution(i, j, cost, found, marks, geometry, relative, side)
 
 
-def spread(marks: tuple[Cloud, Cloud], n: int) -> tuple[Cloud, Cloud]:
-    """At most ``n`` landmark pairs, far from each other in a, the best one first."""
+def spread(a: Cloud, b: Cloud, i: Int[np.ndarray, " M"], j: Int[np.ndarray, " M"], n: int) -> tuple[Cloud, Cloud]:
+    """At most ``n`` of the pairs (i, j), as clouds: far from each other in a, the first one first."""
     from . import kernels
 
-    a, b = marks
-    if len(a) <= n:
-        return marks
-    chosen = kernels.spread_out(a.poses(POSES), n, 0)
-    return a.take(chosen), b.take(chosen)
+    if len(i) > n:
+        chosen = kernels.spread_out(a.poses(POSES)[i], n, 0)
+        i, j = i[chosen], j[chosen]
+    return a.take(i), b.take(j)
 
 
 def disagreement(level: Level, group: Int[np.ndarray, " Na"], one: Solution, other: Solution) -> float:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from ...compute.indices import ascending
 from ...costs.linear import Cost, Factored
 from .clouds import Cloud, run
 
@@ -56,6 +59,11 @@ class Linear:
             vs.append((root * v[b.index]).astype(np.float32))
         return cls(np.hstack(us), np.hstack(vs), float(sum(c.weight for c in factored)), others, a, b)
 
+    @cached_property
+    def least(self) -> float:
+        """What the compiled part is nowhere below, by Cauchy and Schwarz."""
+        return self.offset - math.prod(float(np.linalg.norm(u, axis=1).max(initial=0.0)) for u in (self.ua, self.ub))
+
     def basis(self) -> Float[np.ndarray, "D R"]:
         """Orthonormal directions that keep what the rows of both sets say: their leading singular vectors."""
         both = np.concatenate([self.ua, self.ub]).astype(float)
@@ -83,10 +91,18 @@ class Linear:
 
 def distances(cloud: Cloud, landmarks: Cloud) -> Float[np.ndarray, "N L"]:
     """D_track of every track to every landmark of its video, nan where never seen together."""
+    from ...compute.simd import LANES
     from ...costs.kernels import max_distance_block
+    from . import kernels
 
-    out = np.empty((len(cloud), len(landmarks)), np.float32)
     gaps, n = cloud.gaps or landmarks.gaps, len(landmarks)
+    if not gaps and len(cloud) >= LANES and n:
+        fours = np.pad(landmarks.columns, ((0, 0), (0, 0), (0, -n % 4)), mode="edge") if n % 4 else landmarks.columns
+        lying = np.empty((fours.shape[2], len(cloud)), np.float32)
+        T = len(cloud.weight)
+        run(kernels.apart, len(cloud), cloud.columns.reshape(-1), fours.reshape(-1), T, lying.reshape(-1), block=128)
+        return np.ascontiguousarray(lying[:n].T)
+    out = np.empty((len(cloud), n), np.float32)
 
     def work(i0: int, i1: int) -> None:
         max_distance_block(cloud.columns, landmarks.columns, cloud.weight, landmarks.weight, gaps, i0, i1, 0, n, out)
@@ -121,7 +137,7 @@ class Candidates:
 
         i, k = np.nonzero(self.index >= 0)
         j, cost = self.index[i, k], self.cost[i, k]
-        order = np.argsort(cost, kind="stable")
+        order = ascending(cost)
         kept = order[kernels.one_to_one(i[order], j[order], len(self.index), n_b)]
         return i[kept], j[kept], cost[kept]
 
@@ -143,21 +159,25 @@ def shortlist(
     if groups is None or allowed is None:
         groups, allowed = (np.zeros(len(sa), np.int64), np.zeros(len(sb), np.int64)), np.zeros((1, 1), np.int64)
     group, of_b = groups
-    member = np.argsort(of_b, kind="stable")
-    start = np.searchsorted(of_b[member], np.arange(int(of_b.max(initial=0)) + 2))
+    start, member = lanes_of(of_b)
     index = np.full((len(sa), keep), -1, np.int64)
     cost = np.full((len(sa), keep), np.inf, np.float32)
     tau2 = np.float32(scale.tau**2)
+    unit = np.float32(scale.beta) * tau2
     run(
         kernels.shortlist,
         len(sa),
-        sa,
-        sb,
-        linear.ua,
-        linear.ub,
+        fours(sa).reshape(-1),
+        in_lanes(fours(sb), member),
+        sa.shape[1] + -sa.shape[1] % 4,
+        fours(linear.ua).reshape(-1),
+        in_lanes(fours(linear.ub), member),
+        linear.ua.shape[1] + -linear.ua.shape[1] % 4,
+        sa.shape[1],
         tau2,
-        np.float32(scale.beta) * tau2,
+        unit,
         np.float32(linear.offset),
+        unit * np.float32(linear.least - 1e-4 * abs(linear.offset)),  # what rounding may take away
         group,
         allowed,
         start,
@@ -173,3 +193,28 @@ def shortlist(
         order = np.argsort(cost, axis=1, kind="stable")
         index, cost = np.take_along_axis(index, order, 1), np.take_along_axis(cost, order, 1)
     return Candidates(index, cost)
+
+
+def lanes_of(group: Int[np.ndarray, " M"]) -> tuple[Int[np.ndarray, " G1"], Int[np.ndarray, "E W"]]:
+    """Where groups lie in blocks as wide as a vector: group g has start[g]:start[g+1]; the members of each block, -1
+    for none. No block holds members of two groups.
+    """
+    from ...compute.simd import LANES
+
+    order = np.argsort(group, kind="stable")
+    size = np.bincount(group)
+    start = np.concatenate([[0], np.cumsum(-(-size // LANES))])
+    first = np.concatenate([[0], np.cumsum(size)[:-1]])  # of each group, in the order
+    member = np.full(start[-1] * LANES, -1)
+    member[(LANES * start[:-1] - first)[group[order]] + np.arange(len(group))] = order
+    return start, member.reshape(-1, LANES)
+
+
+def in_lanes(rows: Float[np.ndarray, "M L"], member: Int[np.ndarray, "E W"]) -> Float[np.ndarray, " ELW"]:
+    """[E,L,W], flat: what the kernel reads at once lies side by side."""
+    return np.ascontiguousarray(rows[member].transpose(0, 2, 1)).reshape(-1)
+
+
+def fours(rows: Float[np.ndarray, "N L"]) -> Float[np.ndarray, "N M"]:
+    """With as many zeros behind each row as make a multiple of four."""
+    return np.pad(rows, ((0, 0), (0, -rows.shape[1] % 4))) if rows.shape[1] % 4 else rows

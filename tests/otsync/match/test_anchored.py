@@ -7,12 +7,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
 from scipy.sparse import issparse
 
 from otsync import AnchoredFGW, Cosine, FusedGromovWasserstein, Labels, Matches, Status, TrackSet, match, matcher_for
+from otsync.compute.indices import ascending
+from otsync.compute.simd import LANES
 from otsync.match.anchored import kernels
+from otsync.match.anchored.cells import nearest
 from otsync.match.anchored.clouds import clouds
-from otsync.match.anchored.signatures import Scale, signatures
+from otsync.match.anchored.signatures import Linear, Scale, distances, lanes_of, shortlist, signatures
 from otsync.match.vouch import chirality
 from otsync.metrics import match_quality
 from otsync.simulate import matching_world
@@ -291,39 +297,72 @@ def test_columns_poses_and_groups_equal_numpy():
     np.testing.assert_array_equal(groups.weight > 0, np.isfinite(mean[0]))
 
 
-def test_shortlist_equals_brute_force():
+@pytest.mark.parametrize(("L", "D", "members"), [(6, 4, 30), (64, 64, 300), (1, 5, 7)])
+def test_shortlist_equals_brute_force(L, D, members):
     rng = np.random.default_rng(5)
-    sa, sb = rng.random((20, 6)).astype(np.float32), rng.random((30, 6)).astype(np.float32)
-    sa[0, 0], sb[3, 1] = 1e9, -1e9
-    ua, ub = rng.normal(size=(20, 4)).astype(np.float32), rng.normal(size=(30, 4)).astype(np.float32)
-    group, of_b = rng.integers(0, 3, 20), np.sort(rng.integers(0, 4, 30))
+    sa, sb = rng.random((20, L)).astype(np.float32), rng.random((members, L)).astype(np.float32)
+    sa[0, 0], sb[3, -1] = 1e9, -1e9
+    ua, ub = rng.normal(size=(20, D)).astype(np.float32), rng.normal(size=(members, D)).astype(np.float32)
+    group, of_b = rng.integers(0, 3, 20), rng.integers(0, 4, members)
     allowed = np.array([[0, 1], [2, -1], [3, 1]])
-    index, value = np.full((20, 5), -1), np.full((20, 5), np.inf, np.float32)
-    start = np.searchsorted(of_b, np.arange(5))
-    tau2, weight = np.float32(0.04), np.float32(0.3)
-    kernels.shortlist(
-        sa, sb, ua, ub, tau2, weight, np.float32(1), group, allowed, start, np.arange(30), index, value, 0, 20
-    )
-    cost = np.minimum((sa[:, None] - sb[None]) ** 2, 0.04).mean(2) + 0.3 * (1 - ua @ ub.T)
+    linear = Linear(ua, ub, 1.0, (), None, None)
+    found = shortlist((sa, sb), linear, Scale(1.0, 0.2, 0.3, 0.0), 5, (group, of_b), allowed)
+    cost = np.minimum((sa[:, None] - sb[None]) ** 2 / 0.04, 1).mean(2) + 0.3 * (1 - ua @ ub.T)
     for i in range(20):
-        members = np.flatnonzero(np.isin(of_b, allowed[group[i]]))
-        best = members[np.argsort(cost[i, members])][:5]
-        np.testing.assert_array_equal(index[i, : len(best)], best)
-        np.testing.assert_allclose(value[i, : len(best)], cost[i, best], rtol=1e-4, atol=1e-6)
+        among = np.flatnonzero(np.isin(of_b, allowed[group[i]]))
+        best = among[np.argsort(cost[i, among])][:5]
+        np.testing.assert_array_equal(found.index[i, : len(best)], best)
+        np.testing.assert_allclose(found.cost[i, : len(best)], cost[i, best], rtol=1e-4, atol=1e-5)
+        assert (found.index[i, len(best) :] == -1).all() and np.isinf(found.cost[i, len(best) :]).all()
+    everyone = shortlist((sa, sb), linear, Scale(1.0, 0.2, 0.3, 0.0), 5)
+    np.testing.assert_array_equal(everyone.index[:, 0], cost.argmin(1))
 
 
-def test_nearest_spread_and_one_to_one():
+def test_a_group_fills_whole_vectors():
+    of_b = np.random.default_rng(3).integers(0, 6, 200)
+    of_b[of_b == 4] = 5  # a group without members
+    start, member = lanes_of(of_b)
+    assert member.shape[1] == LANES
+    for g in range(6):
+        inside = member[start[g] : start[g + 1]].ravel()
+        np.testing.assert_array_equal(inside[inside >= 0], np.flatnonzero(of_b == g))
+        assert len(inside) == -(-(of_b == g).sum() // LANES) * LANES
+
+
+@pytest.mark.parametrize(("n", "marks"), [(3, 5), (LANES, 4), (77, 7), (300, 64)])
+def test_distances_equal_numpy_with_and_without_gaps(n, marks):
+    rng = np.random.default_rng(9)
+    xyz = rng.normal(size=(n + marks, 11, 3))
+    for seen in (np.ones(xyz.shape[:2], bool), rng.random(xyz.shape[:2]) < 0.8):
+        seen[:, 0] = True
+        cloud, _ = clouds(*[TrackSet(xyz, seen, fps=30)] * 2)
+        found = distances(cloud.take(np.arange(n)), cloud.take(np.arange(n, n + marks)))
+        x = np.where(cloud.weight > 0, cloud.columns, np.nan).transpose(2, 1, 0)
+        expected = np.nanmax(np.linalg.norm(x[:n, None] - x[None, n:], axis=-1), axis=-1)
+        np.testing.assert_allclose(found, expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize(("n", "m"), [(50, 7), (1, 1), (33, 40)])
+def test_nearest_equals_numpy(n, m):
     rng = np.random.default_rng(6)
-    points, centers = rng.normal(size=(50, 4)).astype(np.float32), rng.normal(size=(7, 4)).astype(np.float32)
-    label = np.empty(50, np.int64)
-    kernels.nearest(points, np.ascontiguousarray(centers.T), label, 0, 50)
-    np.testing.assert_array_equal(label, ((points[:, None] - centers) ** 2).sum(2).argmin(1))
+    points, centers = rng.normal(size=(n, 4)).astype(np.float32), rng.normal(size=(m, 4)).astype(np.float32)
+    centers[m // 2] = centers[0]  # of equals the first
+    np.testing.assert_array_equal(nearest(points, centers), ((points[:, None] - centers) ** 2).sum(2).argmin(1))
+
+
+def test_spread_and_one_to_one():
+    points = np.random.default_rng(6).normal(size=(50, 4)).astype(np.float32)
     chosen = kernels.spread_out(points, 5, 3)
     for k in range(1, 5):
         apart = ((points[:, None] - points[chosen[:k]]) ** 2).sum(2).min(1)
         assert apart[chosen[k]] == pytest.approx(apart.max())
     i, j = np.array([0, 0, 1, 2, 2]), np.array([1, 0, 1, 1, 2])
     np.testing.assert_array_equal(kernels.one_to_one(i, j, 3, 3), [0, 4])
+
+
+@given(hnp.arrays(np.float32, st.integers(0, 40), elements=st.floats(width=32, allow_nan=False)))
+def test_ascending_is_numpys_stable_order(values):
+    np.testing.assert_array_equal(ascending(values), np.argsort(values, kind="stable"))
 
 
 def test_chirality_of_a_mirror_image_is_the_complement():
