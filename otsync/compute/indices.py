@@ -50,16 +50,19 @@ def lives(seen: Bool[np.ndarray, "N T"]) -> Int[np.ndarray, "N 2"]:
 
 
 def ascending(values: Float[np.ndarray, " N"]) -> Int[np.ndarray, " N"]:
-    """The stable order of float32 values, none of them nan: ten times as fast as numpy's stable sort of them.
+    """The stable order of float32 values, nan as large as infinity: several times as fast as numpy's stable sort.
 
     The bits of a float ascend with it, once those of negative ones are turned; with the place behind them no two keys
-    are equal, so any sort is stable.
+    are equal, so any sort is stable. TypeError for other numbers: they would be rounded.
 
     Example:
         >>> ascending(np.array([2, -1, 0, -0.0, -np.inf, -1], np.float32)).tolist()
         [4, 1, 5, 2, 3, 0]
     """
-    bits = (np.asarray(values, np.float32) + np.float32(0)).view(np.uint32)  # -0 equals 0
+    if values.dtype != np.float32:
+        raise TypeError(f"values: expected float32; found {values.dtype}.")
+    values = np.where(np.isnan(values), np.float32(np.inf), values + np.float32(0))  # -0 equals 0
+    bits = values.view(np.uint32)
     key = np.where(bits >> 31, ~bits, bits | np.uint32(1 << 31)).astype(np.uint64) << np.uint64(32)
     key |= np.arange(len(bits), dtype=np.uint64)
     key.sort()

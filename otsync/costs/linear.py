@@ -37,13 +37,14 @@ def unit_features(features: Float[np.ndarray, "N D"], *, center: bool = False) -
     """
     tiny = np.finfo(float).tiny
     f = np.array(features, float)
-    square = np.einsum("nd,nd->n", f, f)
-    far = ~((square > SMALL) & (square < 1 / SMALL))
-    if far.any():
-        top = np.maximum(f[far].max(1, initial=0.0), -f[far].min(1, initial=0.0))
-        f[far] /= np.maximum(top, tiny)[:, None]
-        square[far] = np.einsum("nd,nd->n", f[far], f[far])
-    f /= np.maximum(np.sqrt(square), tiny)[:, None]
+    with np.errstate(over="ignore", invalid="ignore"):  # whether features are numbers is checked by who takes them
+        square = np.einsum("nd,nd->n", f, f)
+        far = ~((square > SMALL) & (square < 1 / SMALL))
+        if far.any():
+            top = np.maximum(f[far].max(1, initial=0.0), -f[far].min(1, initial=0.0))
+            f[far] /= np.maximum(top, tiny)[:, None]
+            square[far] = np.einsum("nd,nd->n", f[far], f[far])
+        f /= np.maximum(np.sqrt(square), tiny)[:, None]
     if center:
         f -= f.mean(0)
         norm = np.sqrt(np.einsum("nd,nd->n", f, f))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -368,14 +367,12 @@ def chirality(a: Float[np.ndarray, "M F 3"], b: Float[np.ndarray, "M G 3"]) -> f
 
 def side(points: Float[np.ndarray, "M F 3"], quads: Int[np.ndarray, "Q 4"]) -> Int[np.ndarray, " Q"]:
     """+1 or -1 where the triple product of a quad's edges keeps its sign over the frames, 0 where it does not."""
-    points = points.astype(float) / binary_scale(points)  # products of three lengths stay within float64
-    first, *others = (points[quads[:, k]].transpose(2, 0, 1) for k in range(4))
-    u, v, w = (other - first for other in others)
-    volume = (
-        u[0] * (v[1] * w[2] - v[2] * w[1]) + u[1] * (v[2] * w[0] - v[0] * w[2]) + u[2] * (v[0] * w[1] - v[1] * w[0])
-    )
-    size = math.prod((e[0] ** 2 + e[1] ** 2 + e[2] ** 2) ** 0.5 for e in (u, v, w))
-    return (volume > FLAT * size).all(1).astype(int) - (volume < -FLAT * size).all(1).astype(int)
+    first, *others = (points[quads[:, k]].astype(float).transpose(2, 0, 1) for k in range(4))
+    edges = [other - first for other in others]
+    u, v, w = (e / np.maximum(np.hypot(np.hypot(e[0], e[1]), e[2]), np.finfo(float).tiny) for e in edges)
+    across = (v[1] * w[2] - v[2] * w[1], v[2] * w[0] - v[0] * w[2], v[0] * w[1] - v[1] * w[0])
+    volume = u[0] * across[0] + u[1] * across[1] + u[2] * across[2]
+    return (volume > FLAT).all(1).astype(int) - (volume < -FLAT).all(1).astype(int)
 
 
 def poses(xyz: Float[np.ndarray, "M T 3"], seen: Bool[np.ndarray, "M T"], frames: int) -> Float[np.ndarray, "M F 3"]:

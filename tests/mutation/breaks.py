@@ -743,6 +743,14 @@ BREAKS = (
         "tracks are compared with where a landmark was in its first frame",
     ),
     Break(
+        "match-anchored-refused-by-other-names",
+        "otsync/match/anchored/solver.py",
+        "                    raise refused from None",
+        "                    del refused",
+        ANCHORED,
+        "an error names the videos as the solver exchanged them",
+    ),
+    Break(
         "match-anchored-landmarks-crowd",
         "otsync/match/anchored/kernels.py",
         "apart[i] = min(apart[i], d)",

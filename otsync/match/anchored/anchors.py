@@ -12,8 +12,8 @@ from ...compute.pot import pot
 LP_PIVOTS = 10_000_000
 
 SETTLED = 1e-3
-"""Relative gain of a step of conditional gradient that ends the descent. Where it is smaller, it moves a few anchors,
-which the rounds on cells decide anew: 1e-5 took twice as many transport problems, and its answers were no better."""
+"""Relative gain of a step of conditional gradient that ends the descent. Smaller ones move a few anchors, and the
+rounds on cells decide these anew: 1e-5 took twice as many transport problems, and its answers were no better."""
 
 
 @dataclass(frozen=True, eq=False)

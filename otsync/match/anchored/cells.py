@@ -12,7 +12,7 @@ POSES = 6
 
 
 NOWHERE = 1e15
-"""Where centres are that only fill a vector: no track is as near to one as to any other."""
+"""Where centres are that only fill a vector: farther from every track than any other centre."""
 
 
 def k_means(cloud: Cloud, n: int, rng: np.random.Generator, rounds: int = 4) -> Int[np.ndarray, " N"]:

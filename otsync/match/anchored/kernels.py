@@ -1,6 +1,7 @@
 """Compiled inner loops of the anchored solver. A leaf, as :mod:`otsync.kernels`, whose pattern it follows.
 
-Blocks write to disjoint places and every sum runs in one order, so results do not depend on the number of threads.
+Every sum runs in one order, and where two blocks write to one place they write the same, so results do not depend on
+the number of threads.
 """
 
 from __future__ import annotations
@@ -156,7 +157,7 @@ def spread_out(points, n, first):
 
 
 @kernel()
-def apart(a, b, T, out, i0, i1):
+def farthest(a, b, T, out, i0, i1):
     """D_track of tracks i0:i1 of a to all of b, where all are seen in all T frames.
 
     a (3,T,N), b (3,T,M) and out (M,N) as rows of floats; N at least LANES, M a multiple of four.

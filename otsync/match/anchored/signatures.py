@@ -100,7 +100,7 @@ def distances(cloud: Cloud, landmarks: Cloud) -> Float[np.ndarray, "N L"]:
         fours = np.pad(landmarks.columns, ((0, 0), (0, 0), (0, -n % 4)), mode="edge") if n % 4 else landmarks.columns
         lying = np.empty((fours.shape[2], len(cloud)), np.float32)
         T = len(cloud.weight)
-        run(kernels.apart, len(cloud), cloud.columns.reshape(-1), fours.reshape(-1), T, lying.reshape(-1), block=128)
+        run(kernels.farthest, len(cloud), cloud.columns.reshape(-1), fours.reshape(-1), T, lying.reshape(-1), block=128)
         return np.ascontiguousarray(lying[:n].T)
     out = np.empty((len(cloud), n), np.float32)
 
@@ -164,6 +164,7 @@ def shortlist(
     cost = np.full((len(sa), keep), np.inf, np.float32)
     tau2 = np.float32(scale.tau**2)
     unit = np.float32(scale.beta) * tau2
+    least = linear.least - 1e-4 * (abs(linear.offset) + abs(linear.offset - linear.least))  # rounding may take it away
     run(
         kernels.shortlist,
         len(sa),
@@ -177,7 +178,7 @@ def shortlist(
         tau2,
         unit,
         np.float32(linear.offset),
-        unit * np.float32(linear.least - 1e-4 * abs(linear.offset)),  # what rounding may take away
+        unit * np.float32(least),
         group,
         allowed,
         start,

@@ -83,16 +83,23 @@ class AnchoredFGW(StructuralMatcher):
         b.check("b")
         with blas_for(self.anchors):
             try:
-                cloud_a, cloud_b = clouds(*common_labels(a, b))
-                if not len(cloud_a) or not len(cloud_b):
+                found = self._solve(a, b)
+            except Exception:
+                try:
                     self._check(a, b)
-                    return nothing((len(a), len(b)))
-                if not comes_first(cloud_a, cloud_b):
-                    return self._match(cloud_b, cloud_a, len(b), len(a)).swapped()
-                return self._match(cloud_a, cloud_b, len(a), len(b))
-            except ValueError:
-                self._check(a, b)
+                except Exception as refused:
+                    raise refused from None
                 raise
+            if Status.NO_INFORMATION in found.flags:  # perhaps before anybody looked at all tracks
+                self._check(a, b)
+            return found
+
+    def _solve(self, a: TrackSet, b: TrackSet) -> Matches:
+        """The answer for two videos in either order."""
+        cloud_a, cloud_b = clouds(*common_labels(a, b))
+        if not comes_first(cloud_a, cloud_b):
+            return self._match(cloud_b, cloud_a, len(b), len(a)).swapped()
+        return self._match(cloud_a, cloud_b, len(a), len(b))
 
     def _check(self, a: TrackSet, b: TrackSet) -> None:
         """Refuse what the costs cannot use, where a is still the caller's a, and b the caller's b."""
@@ -100,6 +107,8 @@ class AnchoredFGW(StructuralMatcher):
             cost.pairs(a, b, np.zeros(1, int), np.zeros(1, int))
 
     def _match(self, a: Cloud, b: Cloud, n_a: int, n_b: int) -> Matches:
+        if not len(a) or not len(b):
+            return nothing((n_a, n_b))
         rng = np.random.default_rng(self.seed)
         grouped = max(len(a), len(b)) > 1.5 * self.cells
         if grouped:
