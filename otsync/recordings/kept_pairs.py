@@ -20,7 +20,7 @@ from ..types import Alignment, Matches, Similarity, Status, TrackSet
 
 log = logging.getLogger("otsync")
 
-MADE_BY = 13
+MADE_BY = 14
 """Raised when the same pair gets another answer, or more of one, than before: what was kept is then made anew."""
 
 MANY = 12

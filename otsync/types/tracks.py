@@ -179,7 +179,7 @@ class TrackSet:
         """Which visible samples of a field are not finite. Of long clips few tracks at a time are looked at."""
         bad = np.zeros_like(self.seen)
         with np.errstate(over="ignore", invalid="ignore"):
-            if np.isfinite(value.sum()):  # of finite numbers, or of such as only their sum is not: these are looked at
+            if np.isfinite(value.sum()):  # then every one is; where the sum alone is not, each is looked at
                 return bad
         for some in blocks(len(bad), self.n_frames):
             finite = np.isfinite(value[some])

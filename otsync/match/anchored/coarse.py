@@ -40,9 +40,8 @@ KEPT = 0.4
 CHALLENGE_ROUNDS = 1
 """Rounds of the challenger: enough to see what its answer costs."""
 
-GROUPS = 12
-"""Groups of b's cells in which partners of a cell are sought: a tenth of all. More of them where groups are so small
-that partners would be lacking."""
+GROUPS = 16
+"""Groups of b's cells in which partners of a cell are sought."""
 
 
 class Options(Protocol):
@@ -192,9 +191,8 @@ class Start:
         """Cells by their signatures; the best matches are the landmarks of the next of ``rounds``."""
         every = np.arange(len(marks[0]))
         marks = spread(*marks, every, every, options.landmarks)
-        wide = max(GROUPS, -(-options.partners * len(self.anchors.b) // len(level.b)))
         for _ in range(rounds + 1):
-            allowed = shortlist(self.anchors.signatures(marks), self.anchors.linear, level.scale, wide).index
+            allowed = shortlist(self.anchors.signatures(marks), self.anchors.linear, level.scale, GROUPS).index
             found = shortlist(
                 level.signatures(marks),
                 level.linear,

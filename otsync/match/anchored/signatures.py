@@ -97,10 +97,9 @@ def distances(cloud: Cloud, landmarks: Cloud) -> Float[np.ndarray, "N L"]:
 
     gaps, n = cloud.gaps or landmarks.gaps, len(landmarks)
     if not gaps and len(cloud) >= LANES and n:
-        fours = np.pad(landmarks.columns, ((0, 0), (0, 0), (0, -n % 4)), mode="edge") if n % 4 else landmarks.columns
-        lying = np.empty((fours.shape[2], len(cloud)), np.float32)
-        T = len(cloud.weight)
-        run(kernels.farthest, len(cloud), cloud.columns.reshape(-1), fours.reshape(-1), T, lying.reshape(-1), block=128)
+        marks, T = fours(landmarks.columns), len(cloud.weight)
+        lying = np.empty((marks.shape[2], len(cloud)), np.float32)
+        run(kernels.farthest, len(cloud), cloud.columns.reshape(-1), marks.reshape(-1), T, lying.reshape(-1), block=128)
         return np.ascontiguousarray(lying[:n].T)
     out = np.empty((len(cloud), n), np.float32)
 
@@ -160,6 +159,7 @@ def shortlist(
         groups, allowed = (np.zeros(len(sa), np.int64), np.zeros(len(sb), np.int64)), np.zeros((1, 1), np.int64)
     group, of_b = groups
     start, member = lanes_of(of_b)
+    rows_a, rows_b, traits_a, traits_b = map(fours, (sa, sb, linear.ua, linear.ub))
     index = np.full((len(sa), keep), -1, np.int64)
     cost = np.full((len(sa), keep), np.inf, np.float32)
     tau2 = np.float32(scale.tau**2)
@@ -168,12 +168,12 @@ def shortlist(
     run(
         kernels.shortlist,
         len(sa),
-        fours(sa).reshape(-1),
-        in_lanes(fours(sb), member),
-        sa.shape[1] + -sa.shape[1] % 4,
-        fours(linear.ua).reshape(-1),
-        in_lanes(fours(linear.ub), member),
-        linear.ua.shape[1] + -linear.ua.shape[1] % 4,
+        rows_a.reshape(-1),
+        in_lanes(rows_b, member),
+        rows_a.shape[1],
+        traits_a.reshape(-1),
+        in_lanes(traits_b, member),
+        traits_a.shape[1],
         sa.shape[1],
         tau2,
         unit,
@@ -216,6 +216,7 @@ def in_lanes(rows: Float[np.ndarray, "M L"], member: Int[np.ndarray, "E W"]) -> 
     return np.ascontiguousarray(rows[member].transpose(0, 2, 1)).reshape(-1)
 
 
-def fours(rows: Float[np.ndarray, "N L"]) -> Float[np.ndarray, "N M"]:
+def fours(rows: Float[np.ndarray, "*N L"]) -> Float[np.ndarray, "*N M"]:
     """With as many zeros behind each row as make a multiple of four."""
-    return np.pad(rows, ((0, 0), (0, -rows.shape[1] % 4))) if rows.shape[1] % 4 else rows
+    more = -rows.shape[-1] % 4
+    return np.pad(rows, ((0, 0),) * (rows.ndim - 1) + ((0, more),)) if more else np.ascontiguousarray(rows)
