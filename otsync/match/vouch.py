@@ -99,6 +99,8 @@ def vouch(found: Matches, a: TrackSet, b: TrackSet, costs: tuple[Cost, ...], clo
         chirality_of(a, b, i, j) < MIRRORED
         or moves_mirrored(a, b, i, j, clock)
         or one_of_several(a, b, i, j, costs, features, structure)
+        # the tracks that are matched may themselves be one of several: b shows one of two like objects
+        or one_of_several(b, a, j, i, costs, Likeness.of(costs, b, a, j, i), structure)
     ):
         flags.add(Status.AMBIGUOUS)
     if not flags and forced(a, b, i, j, features):
@@ -223,22 +225,41 @@ def one_of_several(
     known = np.isfinite(profile).all(2)
     profile_cost = np.where(known, np.where(np.isfinite(profile), profile, 0.0).mean(2) / unit, 1.0)
     looks = None if features.table is None else features.table[some]
-    price = profile_cost / max(float(profile_cost.mean()), 1e-12) + (0.0 if looks is None else looks)
-    price = np.where(elsewhere, price, np.inf)
-    other = price.argmin(1)
-    can = np.isfinite(price[np.arange(len(i)), other])
+    by_place = profile_cost / max(float(profile_cost.mean()), 1e-12)
+    if looks is None or features.pairs is None:
+        return explains(a, b, i, features.others, np.where(elsewhere, by_place, np.inf), structure)
+    here = features.pairs[some]
+    tied = float((np.where(elsewhere, np.abs(looks - here[:, None]), np.inf).min(1) < TIE).mean()) > 0.5
+    if tied and structure > NO_STRUCTURE:
+        return True
+    # profiles differ for no good reason where one video shows more than the other, and looks alone are few
+    for price in (by_place + looks, looks):
+        price = np.where(elsewhere, price, np.inf)
+        can = np.isfinite(price.min(1))
+        there = looks[np.arange(len(i)), price.argmin(1)]
+        if (
+            can.any()
+            and np.median(there[can]) <= np.median(here[can]) + AS_LIKE
+            and explains(a, b, i, features.others, price, structure)
+        ):
+            return True
+    return False
+
+
+def explains(
+    a: TrackSet,
+    b: TrackSet,
+    i: Int[np.ndarray, " H"],
+    others: Int[np.ndarray, " P"],
+    price: Float[np.ndarray, "H P"],
+    structure: float,
+) -> bool:
+    """Whether distances among the cheapest of ``others`` agree about as well as among the found partners of ``i``."""
+    can = np.isfinite(price.min(1))
     if can.sum() < FEW:
         return False
-    if looks is not None and features.pairs is not None:
-        here, there = features.pairs[some][can], looks[np.arange(len(i)), other][can]
-        tied = (
-            float((np.where(elsewhere, np.abs(looks - features.pairs[some, None]), np.inf).min(1) < TIE).mean()) > 0.5
-        )
-        if tied and structure > NO_STRUCTURE:
-            return True
-        if np.median(there) > np.median(here) + AS_LIKE:
-            return False
-    second = geometry(a, b, i[can], features.others[other[can]])
+    i, there = i[can], others[price.argmin(1)[can]]
+    second = geometry(a, b, i, there)
     return second < SECOND_AGREES and second <= AS_GOOD * structure + SLACK
 
 

@@ -20,7 +20,7 @@ from ..types import Alignment, Matches, Similarity, Status, TrackSet
 
 log = logging.getLogger("otsync")
 
-MADE_BY = 14
+MADE_BY = 15
 """Raised when the same pair gets another answer, or more of one, than before: what was kept is then made anew."""
 
 MANY = 12

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 COSTS = ("tests/otsync/costs",)
 POSITIONS = (*COSTS, "tests/otsync/epipolar/test_epipolar.py")  # costs of place are tested beside those of pixels
 MATCH = ("tests/otsync/match/test_match.py",)
+VOUCH = ("tests/otsync/match/test_vouch.py",)
 UNBALANCED = ("tests/otsync/match/test_unbalanced.py",)
 ANCHORED = ("tests/otsync/match/test_anchored.py",)
 ALIGN = ("tests/otsync/align",)
@@ -773,6 +774,46 @@ BREAKS = (
         "return self._match(cloud_b, cloud_a, len(b), len(a))",
         ANCHORED,
         "videos that were exchanged for the solver are not exchanged back",
+    ),
+    Break(
+        "match-anchored-left-over-not-asked",
+        "otsync/match/anchored/coarse.py",
+        "for side in (0, 1):",
+        "for side in (0,):",
+        ANCHORED,
+        "what is left over in the second video is not asked for a second answer",
+    ),
+    Break(
+        "match-anchored-left-over-stays",
+        "otsync/match/anchored/coarse.py",
+        "at, to = at[moved], to[moved]",
+        "at, to = at[~moved], to[~moved]",
+        ANCHORED,
+        "a second answer is judged by what it leaves where it was",
+    ),
+    Break(
+        "match-anchored-chance-forgotten",
+        "otsync/match/anchored/coarse.py",
+        "max(AS_GOOD * best.price, best.price + CHANCE * chance)",
+        "AS_GOOD * best.price",
+        ANCHORED,
+        "of few pairs, an answer that is dearer by chance is no second one",
+    ),
+    Break(
+        "match-vouch-one-way",
+        "otsync/match/vouch.py",
+        "or one_of_several(b, a, j, i, costs, Likeness.of(costs, b, a, j, i), structure)",
+        "",
+        VOUCH,
+        "a track of b may have several partners, but one of a may not",
+    ),
+    Break(
+        "match-vouch-looks-alone",
+        "otsync/match/vouch.py",
+        "for price in (by_place + looks, looks):",
+        "for price in (by_place + looks,):",
+        VOUCH,
+        "where one video shows more than the other, what is alike is sought by its distances to what only one shows",
     ),
     Break(
         "match-anchored-mirror-rewarded",

@@ -49,6 +49,12 @@ def two_copies() -> tuple[TrackSet, TrackSet]:
     return video(), video()
 
 
+def one_of_two_copies() -> tuple[TrackSet, TrackSet]:
+    """The first video shows both, the second one of them."""
+    a, b = two_copies()
+    return a, b.take(np.arange(60))
+
+
 def gaps(share: float):
     def make() -> tuple[TrackSet, TrackSet]:
         rng = np.random.default_rng(3)
@@ -532,6 +538,13 @@ CASES: tuple[Case, ...] = (
         two_copies,
         (FLAGGED, RIGHT),
         check=lambda m: False,
+    ),
+    Case(
+        "two identical objects, of which the other video shows one",
+        "each of the two explains it as well; nothing is exchanged, so no swap tells",
+        "what is left over is asked for a second answer: ambiguous",
+        one_of_two_copies,
+        (FLAGGED,),
     ),
     Case(
         "two identical objects, labelled",

@@ -14,12 +14,8 @@ from ..slot import StructuralMatcher
 from ..vouch import MIRRORED
 from .cells import k_means
 from .clouds import Cloud, clouds, comes_first
-from .coarse import UNRELATED, Level, Solution, solve
+from .coarse import UNRELATED, WORTHLESS, Level, Solution, solve
 from .signatures import Linear, Scale, distances, shortlist
-
-WORTHLESS = 1.25
-"""Matches of a higher cost are dropped: between related videos nearly all of them are wrong (at N = 2000 precision
-rises from .70 to .87, recall stays)."""
 
 AMBIGUOUS_SHARE = 0.2
 """Share of the better matches that a second answer of the same cost may place elsewhere before it is reported."""
@@ -171,8 +167,8 @@ class AnchoredFGW(StructuralMatcher):
             flags.append(Status.AMBIGUOUS)
         stats = {
             "objective": float(cost.sum() * each),
-            "geometry": found.geometry,
-            "linear": found.linear,
+            "geometry": float(found.geometry.mean()),
+            "linear": float(found.linear.mean()),
             "chirality": found.chirality,
             "elsewhere": elsewhere,
             "starts": float(starts),
