@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -50,6 +50,14 @@ class SynchronousMatching(Matcher):
     @property
     def clock(self) -> Clock:
         return Clock(self.offset, self.rate)
+
+    @property
+    def needs_xyz(self) -> bool:
+        return True
+
+    def at(self, clock: Clock) -> SynchronousMatching:
+        """The same, at another clock."""
+        return replace(self, offset=clock.offset, rate=clock.rate)
 
     def checked_by(self, a: TrackSet, b: TrackSet) -> tuple[Cost, ...]:
         """Features, and places at equal times in a common world frame."""

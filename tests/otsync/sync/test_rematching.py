@@ -10,13 +10,14 @@ import pytest
 from otsync import Matches, synchronize
 from otsync.align.likelihood import LikelihoodScan
 from otsync.bench.trust.worlds import CLASSES
+from otsync.match.synchronous import SynchronousMatching
 from otsync.refine.splines import SplineRefine
 from otsync.simulate import simulate
 from otsync.sync.graph import Graph
 from otsync.sync.pairs import Job, run
-from otsync.sync.rematching import CLEARLY, NOISY, contested, winner
+from otsync.sync.rematching import CLEARLY, NOISY, at_known_times, contested, winner
 from otsync.sync.verdict import Answer, Verdict, judge
-from otsync.types import Alignment, Status
+from otsync.types import Alignment, Clock, Status
 
 FPS = 30.0
 
@@ -100,3 +101,13 @@ def test_without_a_common_frame_nothing_is_contested():
     tracks, _ = simulate("tennis", preset="mid", videos=2, frames=90, tracks=60, offsets=[0, 0.2], seed=3)
     jobs, verdict = first_answers([replace(t, frame=None) for t in tracks])
     assert not contested(jobs, flagged(verdict, Status.AMBIGUOUS), map)
+
+
+def test_the_callers_own_matching_at_equal_times_is_kept_at_other_times():
+    """Its options once were those of another one, made in its place."""
+    given = SynchronousMatching(0.1, costs=(), limit=25)
+    assert at_known_times(given, Clock(0.3, 1.01)) == SynchronousMatching(0.3, 1.01, (), 25)
+    tracks, _ = simulate("tennis", preset="mid", offsets=[0.0, 0.1], tracks=80, seed=3)
+    assert 5 < len(synchronize(tracks, matcher=given).matches[0, 1]) <= 25
+    with pytest.raises(ValueError, match="xyz"):
+        synchronize([replace(t, xyz=None, sigma=None) for t in tracks], matcher=given)
