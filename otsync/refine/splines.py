@@ -157,6 +157,8 @@ class SplineRefine(Refiner):
         long = overlap >= LONG - 1e-9
         unsettled = unsettled_rate(rate_stats, fit.clock.rate, UNSETTLED if long else UNSETTLED_SHORT)
         ends = self._ends(curves, fit, free, shared, unsettled, rate_stats.get("rate_sigma"))
+        bend = seconds.bend(math.sqrt(unseen))
+        ends = math.hypot(ends[0], bend[0]), math.hypot(ends[1], bend[1])
         stats = (
             alignment.stats
             | rate_stats
@@ -175,6 +177,7 @@ class SplineRefine(Refiner):
                 "common_error": common,
                 "tentative": min(1.0, guessed / max(ends) ** 2),
                 "sway": sway,
+                "bend": max(bend),
                 "scatter": math.sqrt(max(float(fit.covariance[0, 0]), 0.0)),
                 "correlation": velocity_correlation(*curves, fit, VELOCITY),
                 "overlap": overlap,

@@ -12,7 +12,7 @@ from otsync import SplineRefine, Status, TrackSet, refine, synchronize
 from otsync.bench.trust.worlds import CLASSES
 from otsync.clocks.splines import TrackSplines
 from otsync.refine.gauss_newton import fit_clock
-from otsync.refine.seconds import LEAST, LENGTH, MOST, STEP, Seconds
+from otsync.refine.seconds import FURTHER, LEAST, LENGTH, MOST, STEP, Seconds
 from otsync.types import Clock
 
 from .test_refine import films, near, smooth
@@ -190,6 +190,40 @@ def test_what_is_beyond_chance_is_the_variance_that_sigmas_leave():
     assert Seconds(at, more * rng.normal(size=4000), sigma, moves).sway(0.4) == pytest.approx(0.8, abs=0.08)
 
 
+def test_a_clock_that_bends_is_unsure_at_its_ends_by_as_much():
+    """An even clock through one that bends by .4 frame is off by two thirds of that at both ends."""
+    _, _, matches = films(n=40)
+    told = {}
+    for size in (0.0, 0.4):
+        a, b = wandering(lambda t, size=size: 0.3 + size / 30 * ((t - 2.5) / 2.5) ** 2)
+        stats = refine(a, b, matches, near(0.3), throw=False).stats
+        told[size] = stats["sigma_begin"] * 30, stats["sigma_end"] * 30
+    assert max(told[0.0]) < 0.03
+    assert all(0.18 < sigma < 0.4 for sigma in told[0.4])
+
+
+def test_a_parabola_is_told_from_chance():
+    rng = np.random.default_rng(5)
+    at, sigma, moves = np.arange(0.5, 10.5), np.full(10, 0.1), np.ones(10)
+    even = [max(Seconds(at, 0.1 * rng.normal(size=10), sigma, moves).bend(0.0)) for _ in range(400)]
+    assert np.mean(np.array(even) == 0) > 0.7 and np.sqrt(np.mean(np.square(even))) < 0.12
+    late = 0.6 * ((at - 5) / 5) ** 2
+    bent = [Seconds(at, late + 0.1 * rng.normal(size=10), sigma, moves).bend(0.0) for _ in range(400)]
+    np.testing.assert_allclose(np.median(bent, 0), 0.57, atol=0.04)
+    unseen = [max(Seconds(at, 0.5 * rng.normal(size=10), sigma, moves).bend(0.5 / FURTHER)) for _ in range(400)]
+    assert np.mean(np.array(unseen) == 0) > 0.7
+    one_end = Seconds(at, 0.06 * (at - 5) + 0.3, sigma, moves).bend(0.0)
+    assert one_end[0] < 0.05 and one_end[1] == pytest.approx(0.57, abs=0.04)  # of a rate, only where it is off
+
+
+def test_parts_that_overlap_say_the_same_twice():
+    rng = np.random.default_rng(6)
+    at, sigma, moves = np.arange(0.5, 10.01, 0.5), np.full(20, 0.1), np.ones(20)
+    halves = 0.1 * rng.normal(size=(400, 21)) / np.sqrt(2)
+    even = [max(Seconds(at, late, sigma, moves).bend(0.0)) for late in halves[:, 1:] + halves[:, :-1]]
+    assert np.mean(np.array(even) == 0) > 0.7
+
+
 def test_one_wild_second_makes_no_answer_unsure():
     at, late, sigma, moves = np.arange(8.0), np.zeros(8), np.full(8, 0.1), np.ones(8)
     late[3] = 50.0
@@ -200,8 +234,9 @@ def test_few_seconds_say_nothing():
     some = np.arange(LEAST - 1.0)
     told = Seconds(some, some + 9, some + 0.01, some + 1)
     assert told.unsteady(0.001) == told.sway(0.001) == 0.0 and told.untold() == 0.0
+    assert told.bend(0.0) == (0.0, 0.0)
     unknown = Seconds(np.arange(6.0), np.full(6, np.nan), np.full(6, np.nan), np.full(6, np.nan))
-    assert unknown.unsteady(0.001) == 0.0 and unknown.untold() == 0.0
+    assert unknown.unsteady(0.001) == 0.0 and unknown.untold() == 0.0 and unknown.bend(0.0) == (0.0, 0.0)
 
 
 def test_an_answer_to_little_common_motion_is_weak():
