@@ -56,8 +56,9 @@ class SynchronousMatching(Matcher):
         return True
 
     def at(self, clock: Clock) -> SynchronousMatching:
-        """The same, at another clock."""
-        return replace(self, offset=clock.offset, rate=clock.rate)
+        """The same, at another clock; costs of known times at it, too."""
+        costs = tuple(c.at(clock) if hasattr(c, "at") else c for c in self.costs)
+        return replace(self, offset=clock.offset, rate=clock.rate, costs=costs)
 
     def checked_by(self, a: TrackSet, b: TrackSet) -> tuple[Cost, ...]:
         """Features, and places at equal times in a common world frame."""
@@ -66,6 +67,8 @@ class SynchronousMatching(Matcher):
         return (*self.costs, SynchronousDistance(self.offset, rate=self.rate))
 
     def __call__(self, a: TrackSet, b: TrackSet) -> Matches:
+        a.check("a")
+        b.check("b")
         own_a, own_b = longest_seen(a, self.limit), longest_seen(b, self.limit)
         cost = self.cost(a.take(own_a), b.take(own_b))
         if not np.isfinite(cost).any():

@@ -98,9 +98,8 @@ def vouch(found: Matches, a: TrackSet, b: TrackSet, costs: tuple[Cost, ...], clo
     elif (
         chirality_of(a, b, i, j) < MIRRORED
         or moves_mirrored(a, b, i, j, clock)
-        or one_of_several(a, b, i, j, costs, features, structure)
-        # the tracks that are matched may themselves be one of several: b shows one of two like objects
-        or one_of_several(b, a, j, i, costs, Likeness.of(costs, b, a, j, i), structure)
+        or one_of_several(a, b, i, j, features, structure)
+        or one_of_several_of_a(a, b, i, j, costs, structure)
     ):
         flags.add(Status.AMBIGUOUS)
     if not flags and forced(a, b, i, j, features):
@@ -150,6 +149,18 @@ class Likeness:
         matched = sum((c.weight * c.pairs(a, b, i, j) for c in costs), start=np.zeros(len(i)))
         return cls(matched / chance, total_cost(costs, a.take(i), taken(b, others)) / chance, others)
 
+    @classmethod
+    def of_a(
+        cls, costs: tuple[Cost, ...], a: TrackSet, b: TrackSet, i: Int[np.ndarray, " H"], j: Int[np.ndarray, " H"]
+    ) -> Likeness:
+        """Of the tracks j of b with others of a, one of them a row."""
+        others = np.union1d(evenly(len(a), RIVALS), i)
+        chance = random_cost(costs, a, b) if costs else None
+        if chance is None:
+            return cls(None, None, others)
+        matched = sum((c.weight * c.pairs(a, b, i, j) for c in costs), start=np.zeros(len(i)))
+        return cls(matched / chance, total_cost(costs, taken(a, others), b.take(j)).T / chance, others)
+
     @property
     def relative(self) -> float:
         """Mean cost of the matches: 1 by chance; nan where costs tell nothing."""
@@ -195,12 +206,30 @@ def unlike(a: TrackSet, b: TrackSet, i: Int[np.ndarray, " H"], j: Int[np.ndarray
     return float(x @ y) <= COMMON * float(np.sqrt((x @ x) * (y @ y)))
 
 
-def one_of_several(
+def one_of_several_of_a(
     a: TrackSet,
     b: TrackSet,
     i: Int[np.ndarray, " H"],
     j: Int[np.ndarray, " H"],
     costs: tuple[Cost, ...],
+    structure: float,
+) -> bool:
+    """:func:`one_of_several` of the tracks of a that are matched: b may show one of two like objects.
+
+    Costs may have a direction, as times have: they are asked from a to b all the same.
+    """
+    if b.xyz is None or a.xyz is None:
+        return False
+    some = np.sort(np.random.default_rng(len(i)).permutation(len(i))[:SAMPLE])
+    i, j = i[some], j[some]
+    return one_of_several(b, a, j, i, Likeness.of_a(costs, a, b, i, j), structure)
+
+
+def one_of_several(
+    a: TrackSet,
+    b: TrackSet,
+    i: Int[np.ndarray, " H"],
+    j: Int[np.ndarray, " H"],
     features: Likeness,
     structure: float,
 ) -> bool:
@@ -230,7 +259,7 @@ def one_of_several(
         return explains(a, b, i, features.others, np.where(elsewhere, by_place, np.inf), structure)
     here = features.pairs[some]
     tied = float((np.where(elsewhere, np.abs(looks - here[:, None]), np.inf).min(1) < TIE).mean()) > 0.5
-    if tied and structure > NO_STRUCTURE:
+    if tied and structure > NO_STRUCTURE and elsewhere.any(1).sum() >= FEW:
         return True
     # profiles differ for no good reason where one video shows more than the other, and looks alone are few
     for price in (by_place + looks, looks):

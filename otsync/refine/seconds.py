@@ -151,8 +151,8 @@ class Seconds:
             shared: seconds by which errors that no residual shows move the answer; :data:`FURTHER` times as far they
                 move one part.
         """
-        known = np.isfinite(self.late) & np.isfinite(self.sigma)
-        if known.sum() < PARABOLA:
+        known = np.isfinite(self.late) & (self.sigma <= LENGTH)
+        if len(np.unique(self.at[known])) < PARABOLA or not math.isfinite(shared):
             return 0.0, 0.0
         begin, end = self.at[0] - LENGTH / 2, self.at[-1] + LENGTH / 2
         u = (self.at[known] - (begin + end) / 2) / ((end - begin) / 2)

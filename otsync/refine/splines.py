@@ -109,7 +109,7 @@ class SplineRefine(Refiner):
     the other windows beyond what the noise of these explains (the largest difference, so its square counts half), and
     what blur predicts: errors of the model that no residual shows. It holds at both ends of the overlap: the
     uncertainty of the rate grows with the distance from the middle. What all seconds are off by beyond chance counts
-    like errors in common, whichever is more.
+    like errors in common, whichever is more; and each end holds what a parabola through the seconds shows there.
 
     Args:
         windows: half windows of detrending in seconds: the answer's, and those that it is compared with.
@@ -158,7 +158,9 @@ class SplineRefine(Refiner):
         unsettled = unsettled_rate(rate_stats, fit.clock.rate, UNSETTLED if long else UNSETTLED_SHORT)
         ends = self._ends(curves, fit, free, shared, unsettled, rate_stats.get("rate_sigma"))
         bend = seconds.bend(math.sqrt(unseen))
-        ends = math.hypot(ends[0], bend[0]), math.hypot(ends[1], bend[1])
+        drift = unsettled * overlap / 2  # which the ends hold already, and a parabola shows as well
+        begin, end = (math.sqrt(max(0.0, bent**2 - drift**2)) for bent in bend)
+        ends = math.hypot(ends[0], begin), math.hypot(ends[1], end)
         stats = (
             alignment.stats
             | rate_stats

@@ -129,7 +129,7 @@ def at_known_times(matcher: Matcher | None, clock: Clock, flat: bool = False) ->
         pixels = EpipolarDistance(clock=clock)
         costs = tuple(pixels if isinstance(c, SynchronousDistance) else c for c in told.costs)
         told = Matcher.of(with_costs(told, costs))
-    if told is not None:
+    if told is not None and not (flat and told.needs_xyz):
         return told
     costs = (Cosine(),) if matcher is None else matcher.costs
     if flat:

@@ -37,6 +37,9 @@ SHARED = 0.35
 videos, mid and hard (37 worlds each, seeds 620-644), 69 to 73 % lie within one sigma with .2, 71 to 75 % with .3, 73 to
 79 % with .4, 75 to 82 % with .5. Recordings share more than simulated tracks: 80 % with .25 (basketball with depth)."""
 
+SAME_RATE = 1e-12
+"""By which the rate of a pair's fit may differ from the one that it is to have."""
+
 ROUNDS = 2
 
 NOTHING_COMMON = frozenset(
@@ -228,7 +231,9 @@ def _rates(
     solution = solve(n, edges, anchor)
     significant = np.abs(solution.x) > trust.rate_sigmas * solution.sigma
     rates[significant] = np.exp(solution.x[significant])
-    tasks = [(a, a.refined.offset, rates[a.pair[1]] / rates[a.pair[0]]) for a in answers if a.finite]
+    wanted = [(a, a.refined.offset, rates[a.pair[1]] / rates[a.pair[0]]) for a in answers if a.finite]
+    # most were fitted at this rate: many pairs cost much, and are judged several times
+    tasks = [(a, offset, rate) for a, offset, rate in wanted if abs(a.refined.rate - rate) > SAME_RATE]
     fresh = {t[0].pair: refitted for t, refitted in zip(tasks, refit(tasks), strict=True)}
     return [replace(a, refined=fresh.get(a.pair, a.refined)) for a in answers], rates
 

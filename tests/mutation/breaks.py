@@ -367,7 +367,7 @@ BREAKS = (
     Break(
         "seconds-bend-left-out",
         "otsync/refine/splines.py",
-        "ends = math.hypot(ends[0], bend[0]), math.hypot(ends[1], bend[1])",
+        "ends = math.hypot(ends[0], begin), math.hypot(ends[1], end)",
         "",
         SECONDS,
         "what a clock that bends is off by at its ends is not said",
@@ -826,10 +826,26 @@ BREAKS = (
     Break(
         "match-vouch-one-way",
         "otsync/match/vouch.py",
-        "or one_of_several(b, a, j, i, costs, Likeness.of(costs, b, a, j, i), structure)",
+        "or one_of_several_of_a(a, b, i, j, costs, structure)",
         "",
         VOUCH,
         "a track of b may have several partners, but one of a may not",
+    ),
+    Break(
+        "match-vouch-direction",
+        "otsync/match/vouch.py",
+        "return one_of_several(b, a, j, i, Likeness.of_a(costs, a, b, i, j), structure)",
+        "return one_of_several(b, a, j, i, Likeness.of(costs, b, a, j, i), structure)",
+        VOUCH,
+        "costs of known times are asked backwards",
+    ),
+    Break(
+        "match-anchored-few-judge",
+        "otsync/match/anchored/coarse.py",
+        "JUDGES, MOST_JUDGES = 6, 256",
+        "JUDGES, MOST_JUDGES = 1, 256",
+        ANCHORED,
+        "of few matches chance makes any second answer as good",
     ),
     Break(
         "match-vouch-looks-alone",

@@ -38,9 +38,13 @@ AS_GOOD = 1.1
 CHANCE = 4.0
 """And one whose price is higher by so many standard errors of the difference."""
 
-EXPLAINED, JUDGED = 0.5, 256
+EXPLAINED = 0.5
 """Share of the better half of the matches that a second answer among what is left over must put elsewhere (whole bodies
-.6 to 1; limbs of one body that look alike .25); and how many of them it is judged by at most."""
+.6 to 1; limbs of one body that look alike .25)."""
+
+JUDGES, MOST_JUDGES = 6, 256
+"""Matches that judge a second answer, at least and at most. Of two or three, chance makes any answer as good: of random
+tracks without features, 16 beside 8 of them, it doubted 15 of 20 right answers."""
 
 SAME_PLACE = 0.3
 """Two partners of a track mean the same place when they are less than this apart (unit: the common median)."""
@@ -158,7 +162,8 @@ class Solution:
         """
         if not self.half:
             return False
-        chance = sum(float(s.doubts.var()) / s.half for s in (self, best)) ** 0.5
+        told = min(self.half, best.half) >= JUDGES
+        chance = sum(float(s.doubts.var()) / s.half for s in (self, best)) ** 0.5 if told else 0.0
         return self.price < max(AS_GOOD * best.price, best.price + CHANCE * chance)
 
 
@@ -166,9 +171,10 @@ def solve(level: Level, options: Options) -> tuple[Solution, float, int]:
     """The best of up to ``options.restarts`` starts, how near a different answer comes, and the number of starts.
 
     The first solution that is no mirror image and not one of unrelated videos ends the starts. Then a challenger
-    is sent: a start that is pushed away from every match found. The returned share says how much of the better half
-    of the matches it places elsewhere at no higher price; 0 when it returns to the same answer or pays more. Should
-    it win, it is the answer.
+    is sent: a start that is pushed away from every match found; and what is left over in either video is asked for an
+    answer (:func:`among_left_over`). The returned share says how much of the better half of the matches one of these
+    places elsewhere, about as well; 0 when they return to the same answer or suit worse. What has the lowest price is
+    the answer. An answer of what is left over counts as a start where it suits.
     """
     starts: list[tuple[Solution, Start]] = []
     for r in range(max(1, options.restarts)):
@@ -212,15 +218,20 @@ def among_left_over(
     good = found.cost <= WORTHLESS
     chosen = [np.sort(k[good]) for k in (found.i, found.j)]
     left = np.setdiff1d(np.arange(len((level.a, level.b)[side])), chosen[side])
-    if len(left) < max(8, LEFT_OVER * len(chosen[side])):
+    if good.sum() < 4 * JUDGES or len(left) < LEFT_OVER * good.sum():
         return None, 0.0
     chosen[side] = left
-    part = level.take(chosen[0], chosen[1])
-    marks, share = seeded(part, np.random.default_rng([options.seed, side])), 0.0
+    part, rng = level.take(chosen[0], chosen[1]), np.random.default_rng([options.seed, side])
+    if level.scale.chance > 0:
+        marks = seeded(part, rng)
+    else:  # nothing but structure
+        draw = Start.draw(part, options, rng)
+        marks = draw.anchor_matches(options)
+    share = 0.0
     for rounds, factor in ((CHALLENGE_ROUNDS, AS_GOOD**2), (options.rounds - CHALLENGE_ROUNDS, AS_GOOD)):
         rival = start.refine(level, options, marks, rounds)
         share = explains(level, rival, found, side, factor)
-        if share < EXPLAINED:
+        if share <= EXPLAINED:
             return None, 0.0
         marks = rival.marks
     return rival, share
@@ -238,11 +249,11 @@ def explains(level: Level, rival: Solution, found: Solution, side: int, factor: 
     cloud = (level.a, level.b)[side]
     moved = apart(cloud.take(here[at]), cloud.take(there[to])) > SAME_PLACE * level.scale.median
     at, to = at[moved], to[moved]
-    if not len(at):
+    if len(at) < 2 * JUDGES:
         return 0.0
-    sure = np.argsort(found.doubts[at] + rival.doubts[to], kind="stable")[: min((len(at) + 1) // 2, JUDGED)]
+    sure = np.argsort(found.doubts[at] + rival.doubts[to], kind="stable")[: min((len(at) + 1) // 2, MOST_JUDGES)]
     first, second = (doubts_among(level, s.i[k], s.j[k]) for s, k in ((found, at[sure]), (rival, to[sure])))
-    chance = float((second - first).std()) / len(sure) ** 0.5
+    chance = float((second - first).std(ddof=1)) / len(sure) ** 0.5
     suits = second.mean() < max(factor * float(first.mean()), float(first.mean()) + CHANCE * chance)
     return len(at) / found.half if suits else 0.0
 
@@ -251,7 +262,8 @@ def doubts_among(level: Level, i: Int[np.ndarray, " M"], j: Int[np.ndarray, " M"
     """:attr:`Solution.doubts` of matches that are each other's landmarks."""
     a, b = level.a.take(i), level.b.take(j)
     off = ((distances(a, a) - distances(b, b)) / (level.scale.median * level.scale.tau)) ** 2
-    geometry = np.minimum(np.where(np.isfinite(off), off, 1.0), 1.0).mean(1)
+    off = np.minimum(np.where(np.isfinite(off), off, 1.0), 1.0)
+    geometry = (off.sum(1) - np.diagonal(off)) / (len(i) - 1)
     return geometry + 2 * level.relative(i, j)
 
 
@@ -328,12 +340,13 @@ def seeded(level: Level, rng: np.random.Generator) -> tuple[Cloud, Cloud]:
     Partial transport between a body and several alike ones mixes them; what is near one pair does not.
     """
     some = np.sort(rng.permutation(len(level.a))[:VOTERS])
-    n, m = len(some), len(level.b)
-    looks = level.linear.cost(np.repeat(some, m), np.tile(np.arange(m), n)).reshape(n, m)
-    partner = np.argsort(looks, axis=1, kind="stable")[:, :LIKEST]
+    n = len(some)
+    partner = np.argsort(level.linear.table(some), axis=1, kind="stable")[:, :LIKEST]
     seeds = np.sort(rng.permutation(n)[:SEEDS])
     a = level.a.take(some)
-    unit = np.nanmedian(distances(a, a))
+    known = distances(a, a)
+    known = known[known > 0]  # nan is not
+    unit = float(np.median(known)) if known.size else level.scale.median
 
     def misfit(i: np.ndarray, j: np.ndarray) -> Float[np.ndarray, "n K L"]:
         """Of every track with each of its partners, seen from the pairs (some[i], j)."""

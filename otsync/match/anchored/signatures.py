@@ -83,6 +83,12 @@ class Linear:
         """M of the pairs."""
         return self.offset - np.einsum("pd,pd->p", self.ua[i], self.ub[j]) + self.rest(i, j)
 
+    def table(self, i: Int[np.ndarray, " P"]) -> Float[np.ndarray, "P Nb"]:
+        """M of some tracks of a with all of b."""
+        n = len(self.ub)
+        compiled = self.offset - self.ua[i].astype(float) @ self.ub.T.astype(float)
+        return compiled + self.rest(np.repeat(i, n), np.tile(np.arange(n), len(i))).reshape(len(i), n)
+
     def rest(self, i: Int[np.ndarray, " P"], j: Int[np.ndarray, " P"]) -> Float[np.ndarray, " P"]:
         """What the compiled part leaves out."""
         a, b, i, j = self.a.source, self.b.source, self.a.index[i], self.b.index[j]

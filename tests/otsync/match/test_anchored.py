@@ -241,6 +241,37 @@ def test_of_few_tracks_chance_does_not_tell_two_alike_bodies_that_both_videos_sh
         assert AnchoredFGW()(video(xyz, f, rng), video(xyz[..., [1, 2, 0]], f, rng)).flags == (Status.AMBIGUOUS,), seed
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize("cost", [(Cosine(weight=10.0),), (Cosine(), Labels(weight=3.0)), ()])
+def test_few_or_dear_matches_leave_nothing_to_ask(cost):
+    """Costs in large units leave no match below the limit; of few matches chance makes any second answer as good."""
+    for seed, n_a, n_b in ((0, 60, 20), (1, 16, 8), (2, 20, 8), (3, 30, 12), (4, 30, 1), (5, 1, 30)):
+        rng = np.random.default_rng(seed)
+        xyz, features = wiggle(rng, n_a, 40), rng.normal(size=(n_a, 16))
+        some = np.arange(min(n_b, n_a))
+        labels = np.where(np.arange(n_a) < 3, 1, -1)
+        a = TrackSet(xyz + 0.02 * rng.normal(size=xyz.shape), features=features, labels=labels, fps=30)
+        b = TrackSet(
+            xyz[some] + 0.02 * rng.normal(size=xyz[some].shape),
+            features=features[some] + 1.5 * rng.normal(size=(len(some), 16)),
+            labels=labels[some],
+            fps=30,
+        )
+        found = AnchoredFGW(costs=cost)(a, b)
+        assert found.stats.get("elsewhere", 0.0) < 0.5, (seed, found)
+
+
+def test_tracks_that_are_hardly_ever_seen_together_ask_nothing_of_nan():
+    rng = np.random.default_rng(7)
+    for n in (5, 20):
+        seen = rng.random((n, 60)) > 0.97
+        seen[:, 0] = True
+        a = TrackSet(wiggle(rng, n, 60), seen, features=rng.normal(size=(n, 8)), fps=30)
+        b = TrackSet(wiggle(rng, 60, 60), features=rng.normal(size=(60, 8)), fps=30)
+        with np.errstate(all="raise"):
+            AnchoredFGW()(a, b)
+
+
 def test_a_body_among_strangers_is_no_other_one():
     for seed in range(884, 888):
         several, one = alike_bodies(seed, 1, 2, 0.2)

@@ -235,6 +235,9 @@ def test_few_seconds_say_nothing():
     told = Seconds(some, some + 9, some + 0.01, some + 1)
     assert told.unsteady(0.001) == told.sway(0.001) == 0.0 and told.untold() == 0.0
     assert told.bend(0.0) == (0.0, 0.0)
+    again = Seconds(np.repeat([1.0, 2.0], 3), np.arange(6.0), np.ones(6), np.ones(6))
+    ten = np.arange(10.0)
+    assert again.bend(0.0) == Seconds(ten, ten, ten / 9, ten).bend(np.inf) == (0.0, 0.0)
     unknown = Seconds(np.arange(6.0), np.full(6, np.nan), np.full(6, np.nan), np.full(6, np.nan))
     assert unknown.unsteady(0.001) == 0.0 and unknown.untold() == 0.0 and unknown.bend(0.0) == (0.0, 0.0)
 
