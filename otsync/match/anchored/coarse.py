@@ -55,9 +55,9 @@ KEPT = 0.4
 CHALLENGE_ROUNDS = 1
 """Rounds of the challenger: enough to see what its answer costs."""
 
-LEFT_OVER = 0.5
-"""Tracks that found no partner, as a share of those that did, from which they are asked for a second answer. Two alike
-bodies of which the other video shows one leave a whole body over; worlds of one scene .43 as a rule."""
+LEFT_OVER = 0.75
+"""Tracks that found no good partner, as a share of those that did, from which they are asked for a second answer. Two
+alike bodies of which the other video shows one leave a whole body over, 1 and more; worlds of one scene .46 to .57."""
 
 VOTERS, LIKEST, SEEDS = 128, 8, 16
 """Of :func:`seeded`: tracks that vote, their partners, and the tracks whose partners are voted on."""
