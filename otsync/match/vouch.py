@@ -99,7 +99,7 @@ def vouch(found: Matches, a: TrackSet, b: TrackSet, costs: tuple[Cost, ...], clo
         chirality_of(a, b, i, j) < MIRRORED
         or moves_mirrored(a, b, i, j, clock)
         or one_of_several(a, b, i, j, features, structure)
-        or one_of_several_of_a(a, b, i, j, costs, structure)
+        or one_of_several_of_a(a, b, i, j, costs, features, structure)
     ):
         flags.add(Status.AMBIGUOUS)
     if not flags and forced(a, b, i, j, features):
@@ -129,12 +129,13 @@ class Likeness:
 
     Args:
         pairs: (H,) of the matches. table: (H,P) of their tracks of a with the tracks ``others`` of b; None for both
-            where the costs do not tell tracks apart.
+            where the costs do not tell tracks apart. chance: what a random pair costs; None there.
     """
 
     pairs: Float[np.ndarray, " H"] | None
     table: Float[np.ndarray, "H P"] | None
     others: Int[np.ndarray, " P"]
+    chance: float | None = None
 
     @classmethod
     def of(
@@ -147,19 +148,26 @@ class Likeness:
         if chance is None:
             return cls(None, None, others)
         matched = sum((c.weight * c.pairs(a, b, i, j) for c in costs), start=np.zeros(len(i)))
-        return cls(matched / chance, total_cost(costs, a.take(i), taken(b, others)) / chance, others)
+        return cls(matched / chance, total_cost(costs, a.take(i), taken(b, others)) / chance, others, chance)
 
-    @classmethod
-    def of_a(
-        cls, costs: tuple[Cost, ...], a: TrackSet, b: TrackSet, i: Int[np.ndarray, " H"], j: Int[np.ndarray, " H"]
+    def exchanged(
+        self,
+        costs: tuple[Cost, ...],
+        a: TrackSet,
+        b: TrackSet,
+        i: Int[np.ndarray, " S"],
+        j: Int[np.ndarray, " S"],
+        some: Int[np.ndarray, " S"],
     ) -> Likeness:
-        """Of the tracks j of b with others of a, one of them a row."""
+        """The same of ``some`` matches (i, j) with the videos exchanged: rows are tracks of b, ``others`` are of a.
+
+        Costs may have a direction, as times have: they are asked from a to b all the same.
+        """
         others = np.union1d(evenly(len(a), RIVALS), i)
-        chance = random_cost(costs, a, b) if costs else None
-        if chance is None:
-            return cls(None, None, others)
-        matched = sum((c.weight * c.pairs(a, b, i, j) for c in costs), start=np.zeros(len(i)))
-        return cls(matched / chance, total_cost(costs, taken(a, others), b.take(j)).T / chance, others)
+        if self.pairs is None or self.chance is None:
+            return Likeness(None, None, others)
+        table = total_cost(costs, taken(a, others), b.take(j)).T / self.chance
+        return Likeness(self.pairs[some], table, others, self.chance)
 
     @property
     def relative(self) -> float:
@@ -212,17 +220,15 @@ def one_of_several_of_a(
     i: Int[np.ndarray, " H"],
     j: Int[np.ndarray, " H"],
     costs: tuple[Cost, ...],
+    features: Likeness,
     structure: float,
 ) -> bool:
-    """:func:`one_of_several` of the tracks of a that are matched: b may show one of two like objects.
-
-    Costs may have a direction, as times have: they are asked from a to b all the same.
-    """
+    """:func:`one_of_several` of the tracks of a that are matched: b may show one of two like objects."""
     if b.xyz is None or a.xyz is None:
         return False
     some = np.sort(np.random.default_rng(len(i)).permutation(len(i))[:SAMPLE])
     i, j = i[some], j[some]
-    return one_of_several(b, a, j, i, Likeness.of_a(costs, a, b, i, j), structure)
+    return one_of_several(b, a, j, i, features.exchanged(costs, a, b, i, j, some), structure)
 
 
 def one_of_several(
@@ -261,7 +267,7 @@ def one_of_several(
     tied = float((np.where(elsewhere, np.abs(looks - here[:, None]), np.inf).min(1) < TIE).mean()) > 0.5
     if tied and structure > NO_STRUCTURE and elsewhere.any(1).sum() >= FEW:
         return True
-    # profiles differ for no good reason where one video shows more than the other, and looks alone are few
+    # where one video shows more than the other, profiles of one track differ as well: then looks alone find its like
     for price in (by_place + looks, looks):
         price = np.where(elsewhere, price, np.inf)
         can = np.isfinite(price.min(1))

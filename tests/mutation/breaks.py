@@ -826,7 +826,7 @@ BREAKS = (
     Break(
         "match-vouch-one-way",
         "otsync/match/vouch.py",
-        "or one_of_several_of_a(a, b, i, j, costs, structure)",
+        "or one_of_several_of_a(a, b, i, j, costs, features, structure)",
         "",
         VOUCH,
         "a track of b may have several partners, but one of a may not",
@@ -834,7 +834,7 @@ BREAKS = (
     Break(
         "match-vouch-direction",
         "otsync/match/vouch.py",
-        "return one_of_several(b, a, j, i, Likeness.of_a(costs, a, b, i, j), structure)",
+        "return one_of_several(b, a, j, i, features.exchanged(costs, a, b, i, j, some), structure)",
         "return one_of_several(b, a, j, i, Likeness.of(costs, b, a, j, i), structure)",
         VOUCH,
         "costs of known times are asked backwards",
