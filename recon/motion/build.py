@@ -15,7 +15,7 @@ from recon.motion.binding import Binding
 from recon.motion.nodes import Grid
 from recon.motion.paths import SPLINES, Path
 from recon.motion.scaffold import Scaffold
-from recon.motion.solve import FRAME, Coupling, Observations, Smoothness, neighbourhood_rotations, solve_curves
+from recon.motion.solve import FRAME, Coupling, Observations, Smoothness, along, neighbourhood_rotations, solve_curves
 from recon.motion.track_curves import WIDEST, knot_spacing
 from recon.motion.warp import BLENDS, LINEAR
 from recon.rotations import continuous, quaternions
@@ -259,4 +259,4 @@ class _PickedTracks:
 
     def on_grid(self, curves: np.ndarray) -> np.ndarray:
         """Curves [P,M,3] at the frames at which tracks are compared: float32 [M,G,3] relative to the centre."""
-        return np.einsum("ta,amk->mtk", self.design, curves - self.grid.centre).astype(np.float32)
+        return along(self.design, (curves - self.grid.centre).transpose(1, 0, 2)).astype(np.float32)

@@ -20,6 +20,7 @@ from typing import ClassVar, Self
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy import sparse
 from scipy.linalg import solve_banded
 from torch import Tensor
 
@@ -126,12 +127,13 @@ class Path(ABC):
         """Values [P,...] of the curve of ``knots`` at the seconds of the knots: what :meth:`through` undoes."""
         return self.at(knots, torch.as_tensor(self.times, device=knots.device))
 
-    def design(self, t: Float[np.ndarray, " S"]) -> Float[np.ndarray, "S P"]:
-        """The weights of all knots at S times, dense."""
+    def design(self, t: Float[np.ndarray, " S"]) -> sparse.csr_array:
+        """The weights [S,P] of all knots at S times: four a row."""
         first, w, _ = self.basis(t)
-        matrix = np.zeros((len(first), self.count))
-        np.put_along_axis(matrix, first[:, None] + np.arange(WINDOW), w, 1)
-        return matrix
+        begins = WINDOW * np.arange(len(first) + 1)
+        return sparse.csr_array(
+            (w.ravel(), (first[:, None] + np.arange(WINDOW)).ravel(), begins), shape=(len(first), self.count)
+        )
 
 
 def _hermite_matrices() -> Float[np.ndarray, "5 4 4"]:

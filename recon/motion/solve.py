@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import sparse
+from scipy.linalg import cho_solve_banded, cholesky_banded
 
-from recon.motion.paths import Path
+from recon.motion.paths import WINDOW, Path
 
 FRAME = 1 / 30  # seconds: the study's frame, in which its weights are given
 TOLERANCE, ROUGH = 1e-7, 1e-4  # of the energy norm, relative to that of the solution; ROUGH between reweightings
@@ -68,6 +70,86 @@ class Coupling:
         return sparse.csr_array(sparse.coo_array(entries, shape=(self.n_nodes, len(e))))
 
 
+@dataclass(frozen=True, eq=False)
+class Bands:
+    """M symmetric banded blocks: `diagonals[d,m,p]` is entry [p + d, p] of block m, 0 beyond its end.
+
+    A knot shares samples with the few beside it only, so that what is kept and done grows with the knots, not with
+    their square.
+    """
+
+    diagonals: Float[np.ndarray, "b M P"]
+
+    @classmethod
+    def of(cls, block: sparse.sparray, width: int) -> Self:
+        """One block [P,P] with so many diagonals beside the main one."""
+        rows = np.zeros((width + 1, 1, block.shape[0]))
+        for d in range(min(width + 1, block.shape[0])):
+            rows[d, 0, : block.shape[0] - d] = block.diagonal(-d)
+        return cls(rows)
+
+    @property
+    def width(self) -> int:
+        return len(self.diagonals) - 1
+
+    def repeated(self, n: int) -> Bands:
+        """So many copies of the one block."""
+        return Bands(np.tile(self.diagonals, (1, n, 1)))
+
+    def matrix(self) -> sparse.csr_array:
+        """The block diagonal matrix [M·P,M·P]."""
+        flat = self.diagonals.reshape(self.width + 1, -1)
+        size = flat.shape[1]
+        below = [(d, row[: size - d]) for d, row in enumerate(flat) if d < size]
+        every = below + [(-d, row) for d, row in below[1:]]
+        return sparse.diags_array([row for _, row in every], offsets=[-d for d, _ in every], format="csr")
+
+    def factor(self) -> Float[np.ndarray, "b N"]:
+        """Cholesky's factor of all blocks behind one another, which is as banded as they are."""
+        return cholesky_banded(self.diagonals.reshape(self.width + 1, -1), lower=True, check_finite=False)
+
+
+def solved(factor: Float[np.ndarray, "b N"], right: Float[np.ndarray, "M P 3"]) -> Float[np.ndarray, "M P 3"]:
+    """What the blocks with this :meth:`Bands.factor` turn into `right`."""
+    found = cho_solve_banded((factor, True), right.reshape(-1, right.shape[-1]), check_finite=False)
+    return np.ascontiguousarray(found).reshape(right.shape)
+
+
+@dataclass(frozen=True, eq=False)
+class Products:
+    """Products of the weights of two knots in every row of a design, as :class:`Bands` has them: [T,(b+1)·P]."""
+
+    rows: sparse.csr_array
+    width: int
+
+    @classmethod
+    def of(cls, design: sparse.csr_array, width: int) -> Self:
+        later = [sparse.csr_array(design[:, d:]) for d in range(width + 1)]
+        products = [design[:, : one.shape[1]] * one for one in later]
+        for one in products:
+            one.resize(design.shape)
+        return cls(sparse.csr_array(sparse.hstack(products)), width)
+
+    def weighted(self, w: Float[np.ndarray, "n T"]) -> Float[np.ndarray, "b n P"]:
+        """The diagonals of Bᵀ diag(w) B for the weights of n nodes."""
+        return (w @ self.rows).reshape(len(w), self.width + 1, -1).transpose(1, 0, 2)
+
+
+def along(B: sparse.sparray, values: Float[np.ndarray, "M P k"]) -> Float[np.ndarray, "M S k"]:
+    """B [S,P] applied to the second axis."""
+    M, _, k = values.shape
+    return np.ascontiguousarray(
+        (sparse.csr_array(sparse.kron(B, sparse.eye_array(k))) @ values.reshape(M, -1).T).T
+    ).reshape(M, -1, k)
+
+
+def differences(n: int, order: int) -> sparse.csr_array:
+    """DᵀD of the differences of this order of n knots."""
+    D = np.diff(np.eye(order + 1), order, axis=0)[0]
+    rows = sparse.diags_array([np.full(n - order, x) for x in D], offsets=list(range(order + 1)), shape=(n - order, n))
+    return sparse.csr_array(rows.T @ rows)
+
+
 def solve_curves(
     path: Path,
     observed: Sequence[Observations],
@@ -96,25 +178,28 @@ def solve_curves(
     present = [np.isfinite(o.xyz[..., 0]) * (_frame_of(o.times) / FRAME) for o in observed]
     step = grid[1] - grid[0] if len(grid) > 1 else FRAME
     place, rate = path.design(grid), (path.design(grid + step / 2) - path.design(grid - step / 2)) * (FRAME / step)
-    first, second = np.diff(np.eye(P), axis=0), np.diff(np.eye(P), 2, axis=0)
-    always = smooth.acceleration * second.T @ second + smooth.still * first.T @ first + RIDGE * np.eye(P)
+    velocity = sparse.csr_array(rate.T @ rate)
+    always = Bands.of(smooth.acceleration * differences(P, 2) + smooth.still * differences(P, 1), _width(velocity))
+    always.diagonals[0] += RIDGE
+    products = [Products.of(B, always.width) for B in designs]
     incidence, pulls = coupling.incidence(), smooth.velocity * (step / FRAME) * coupling.ties
     laplacian = sparse.csr_array(incidence @ sparse.diags_array(pulls) @ incidence.T)
     weights, knots, turning = present, np.zeros((n_nodes, P, 3)), np.zeros((n_nodes, P, 3))
     for k in range(rounds):
-        blocks, right = np.tile(always, (n_nodes, 1, 1)), turning.copy()
-        for o, B, w, x in zip(observed, designs, weights, samples, strict=True):
-            outer = (B[:, :, None] * B[:, None]).reshape(len(B), -1)
-            blocks[o.node] += (w @ outer).reshape(-1, P, P)
-            right[o.node] += B.T @ (w[..., None] * x)
+        blocks, right = always.repeated(n_nodes), turning.copy()
+        for o, B, squares, w, x in zip(observed, designs, products, weights, samples, strict=True):
+            blocks.diagonals[:, o.node] += squares.weighted(w)
+            right[o.node] += along(B.T, w[..., None] * x)
         tolerance = ROUGH if k < rounds - 1 else TOLERANCE
-        knots = _conjugate_gradients(blocks, laplacian, rate.T @ rate, right, knots, tolerance)
+        knots = _conjugate_gradients(blocks, laplacian, velocity, right, knots, tolerance)
         if k < rounds - 1:
             weights = [
-                w / (1 + (np.linalg.norm(B @ knots[o.node] - x, axis=2) / robust) ** 2)
+                w / (1 + (np.linalg.norm(along(B, knots[o.node]) - x, axis=2) / robust) ** 2)
                 for o, B, w, x in zip(observed, designs, present, samples, strict=True)
             ]
-            turning = _turning(coupling, incidence, pulls, place @ knots + centre[:, None], rate @ knots, rate)
+            turning = _turning(
+                coupling, incidence, pulls, along(place, knots) + centre[:, None], along(rate, knots), rate
+            )
     return (knots + centre[:, None]).transpose(1, 0, 2)
 
 
@@ -151,17 +236,17 @@ def _turning(
     pulls: Float[np.ndarray, " E"],
     places: Float[np.ndarray, "M G 3"],
     rates: Float[np.ndarray, "M G 3"],
-    design: Float[np.ndarray, "G P"],
+    design: sparse.csr_array,
 ) -> Float[np.ndarray, "M P 3"]:
     """The right-hand side for velocities of neighbours that differ by ω × (x_i - x_j)."""
     omega = angular_velocities(coupling, places, rates)
     right = np.zeros((len(places), design.shape[1], 3))
-    chunk = max(1, 2**20 // len(design))
+    chunk = max(1, 2**20 // design.shape[0])
     for begin in range(0, len(coupling.edges), chunk):
         part = slice(begin, begin + chunk)
         i, j = coupling.edges[part].T
         apart = np.cross((omega[i] + omega[j]) / 2, places[i] - places[j]) * pulls[part, None, None]
-        asked = (design.T @ apart).reshape(len(i), -1)
+        asked = along(design.T, apart).reshape(len(i), -1)
         right += (incidence[:, part] @ asked).reshape(right.shape)
     return right
 
@@ -170,10 +255,16 @@ def _frame_of(times: np.ndarray) -> float:
     return float(np.median(np.diff(times))) if len(times) > 1 else FRAME
 
 
+def _width(square: sparse.csr_array) -> int:
+    """Diagonals beside the main one that hold `square` and the products of a path's design."""
+    i, j = square.nonzero()
+    return max(WINDOW - 1, int(np.abs(i - j).max(initial=0)))
+
+
 def _conjugate_gradients(
-    blocks: Float[np.ndarray, "M P P"],
+    blocks: Bands,
     laplacian: sparse.csr_array,
-    velocity: Float[np.ndarray, "P P"],
+    velocity: sparse.csr_array,
     right: Float[np.ndarray, "M P 3"],
     x: Float[np.ndarray, "M P 3"],
     tolerance: float,
@@ -183,21 +274,22 @@ def _conjugate_gradients(
     Preconditioned by each node's own block. It takes some forty iterations, where a direct factorisation would fill in:
     600 nodes of 15 knots take .1 s instead of 1.2 s.
     """
-    M, P = blocks.shape[:2]
-    own = sparse.block_diag(list(blocks), format="csr")  # banded: most of a block is zero
-    inverse = np.linalg.inv(blocks + laplacian.diagonal()[:, None, None] * velocity)
+    M, P, k = right.shape
+    own, across = blocks.matrix(), sparse.csr_array(sparse.kron(velocity, sparse.eye_array(k)))
+    moved = Bands.of(velocity, blocks.width).diagonals
+    factor = Bands(blocks.diagonals + laplacian.diagonal()[:, None] * moved).factor()
 
     def system(x: np.ndarray) -> np.ndarray:
-        coupled = velocity @ (laplacian @ x.reshape(M, P * 3)).reshape(M, P, 3)
-        return (own @ x.reshape(M * P, 3)).reshape(M, P, 3) + coupled
+        coupled = (across @ (laplacian @ x.reshape(M, P * k)).T).T
+        return (own @ x.reshape(M * P, k)).reshape(M, P, k) + coupled.reshape(M, P, k)
 
     def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         return np.einsum("mpk,mpk->k", a, b)
 
     residual = right - system(x)
-    towards = step = inverse @ residual
+    towards = step = solved(factor, residual)
     energy = dot(residual, towards)
-    enough = tolerance**2 * dot(right, inverse @ right)
+    enough = tolerance**2 * dot(right, solved(factor, right))
     for _ in range(MAX_ITERATIONS):
         if (energy <= enough).all():
             break
@@ -205,7 +297,7 @@ def _conjugate_gradients(
         length = energy / np.maximum(dot(step, image), 1e-300)  # 0 / 0 where a coordinate is solved
         x = x + length * step
         residual = residual - length * image
-        towards = inverse @ residual
+        towards = solved(factor, residual)
         energy, before = dot(residual, towards), energy
         step = towards + energy / np.maximum(before, 1e-300) * step
     return x

@@ -9,12 +9,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
+from scipy import sparse
 from scipy.spatial import cKDTree
 
 from otsync.types import TrackSet
 from recon.motion.nodes import world_clocks
-from recon.motion.paths import SPLINES, Path
-from recon.motion.solve import FRAME, RIDGE
+from recon.motion.paths import SPLINES, WINDOW, Path
+from recon.motion.solve import FRAME, RIDGE, Bands, Products, along, differences, solved
 
 ROUNDS = 3  # of reweighting
 STILL = (
@@ -66,8 +67,8 @@ class TrackCurves:
         ValueError where no track was ever seen.
         """
         clocks = world_clocks(tracks, offsets, rates)
-        first, second = np.diff(np.eye(path.count), axis=0), np.diff(np.eye(path.count), 2, axis=0)
-        always = acceleration * second.T @ second + STILL * first.T @ first + RIDGE * np.eye(path.count)
+        always = Bands.of(acceleration * differences(path.count, 2) + STILL * differences(path.count, 1), WINDOW - 1)
+        always.diagonals[0] += RIDGE
         knots, seen_from, seen_to = [], [], []
         for times, one in zip(clocks, tracks, strict=True):
             own = one.take(np.flatnonzero(one.seen.any(1)))
@@ -92,7 +93,7 @@ class TrackCurves:
         say, and the one that moves most like the other two is followed: so a track that went astray is not. Where no
         track was seen then, all take part.
         """
-        at = np.einsum("p,pmk->mk", self.path.design(np.array([t]))[0], self.knots)
+        at = along(self.path.design(np.array([t])), self.knots.transpose(1, 0, 2))[:, 0]
         slack = self.path.spacing / 2
         alive = np.flatnonzero((self.first - slack <= t) & (t <= self.last + slack))
         alive = alive if len(alive) else np.arange(len(self))
@@ -141,7 +142,7 @@ def _spacing_of(pieces: Float[np.ndarray, "m L 3"], step: float, spline: str, fo
         return found
     for finer in FINER:
         path = SPLINES[spline].of(0.0, (length - 1) * step, WIDEST / finer)
-        basis, size, _ = np.linalg.svd(path.design(step * np.arange(length)), full_matrices=False)
+        basis, size, _ = np.linalg.svd(path.design(step * np.arange(length)).toarray(), full_matrices=False)
         basis = basis[:, size > 1e-9 * size[0]]
         knots = basis.shape[1]
         if knots > FULL * length:
@@ -169,18 +170,18 @@ def _pieces(xyz: Float[np.ndarray, "n T 3"], length: int) -> Float[np.ndarray, "
 def _solved(
     xyz: Float[np.ndarray, "n T 3"],
     times: Float[np.ndarray, " T"],
-    design: Float[np.ndarray, "T P"],
-    always: Float[np.ndarray, "P P"],
+    design: sparse.csr_array,
+    always: Bands,
     robust: float,
 ) -> Float[np.ndarray, "P n 3"]:
     """Knots of n tracks that were sampled at T world seconds, nan where unseen."""
     frame = float(np.median(np.diff(times))) if len(times) > 1 else FRAME
     centre = np.nanmean(xyz, axis=1, keepdims=True)
     present, samples = np.isfinite(xyz[..., 0]) * (frame / FRAME), np.nan_to_num(xyz - centre)
-    outer, size = (design[:, :, None] * design[:, None]).reshape(len(design), -1), design.shape[1]
-    weights, knots = present, np.zeros((len(xyz), size, 3))
+    products, weights = Products.of(design, always.width), present
     for _ in range(ROUNDS):
-        blocks = always + (weights @ outer).reshape(-1, size, size)
-        knots = np.linalg.solve(blocks, design.T @ (weights[..., None] * samples))
-        weights = present / (1 + (np.linalg.norm(design @ knots - samples, axis=2) / robust) ** 2)
+        blocks = always.repeated(len(xyz))
+        blocks.diagonals[:] += products.weighted(weights)
+        knots = solved(blocks.factor(), along(design.T, weights[..., None] * samples))
+        weights = present / (1 + (np.linalg.norm(along(design, knots) - samples, axis=2) / robust) ** 2)
     return (knots + centre).transpose(1, 0, 2)
