@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -54,7 +55,10 @@ CONTENDERS, BACKGROUND = 32, 64
 median, by common frames, is what they have elsewhere."""
 
 
-READS = ("evidence", "margin", "disagreement", "alias", "overlap", "matches", "motion", "rate_gain")
+RETURNS_FROM, RETURN_SEEN = 0.5, 1.2
+"""Seconds later, at least, at which a video is compared with itself; and seconds of it that must be compared."""
+
+READS = ("evidence", "margin", "returning", "disagreement", "alias", "overlap", "matches", "motion", "rate_gain")
 """The limits of :class:`otsync.Trust` that the scan's flags are raised by."""
 
 
@@ -108,6 +112,10 @@ class LikelihoodScan(Aligner):
         tops = separate_peaks(score, round(APART * pair.fps), self.peaks, prefer=np.abs(lags))
         offset = float(pair.seconds(vertex(lags, score, tops[0])))
         stats = self._stats(pair, lags, curves, tops) | {"matches": float(len(matches))}
+        reach = pair.lags(max(1, round(self.min_overlap * pair.fps)), None)
+        stats["returning"] = returning(pair, reach, int(lags[tops[0]]))
+        stats["likeness"] = float(score[tops[0]] / pair.overlap(lags[tops[:1]])[0])
+        stats["elsewhere"] = float(may_be_another_time(stats, self.trust))
         stats["other_rate"], stats["other_rate_gain"] = other_rate(a, b, pair, matches, scale, self.max_lag)
         flags = self._flags(stats)
         found = find_breaks(pair, lags, score, curves.floor, matches.shares, ambiguous=Status.AMBIGUOUS in flags)
@@ -152,7 +160,7 @@ class LikelihoodScan(Aligner):
         t = self.trust
         found = {
             Status.WEAK: stats["evidence"] < t.evidence,
-            Status.AMBIGUOUS: stats["margin"] < t.margin,
+            Status.AMBIGUOUS: stats["margin"] < t.margin or stats["elsewhere"] > 0,
             Status.DISAGREE: stats["disagreement"] > t.disagreement + 1e-9,
             Status.ALIAS: stats["alias"] > t.alias + 1e-9,
             Status.SHORT_OVERLAP: stats["overlap"] < t.overlap - 1e-9,
@@ -162,6 +170,32 @@ class LikelihoodScan(Aligner):
             Status.RATE_MISMATCH: stats["other_rate_gain"] > t.rate_gain,
         }
         return in_order(flag for flag, raised in found.items() if raised)
+
+
+def may_be_another_time(stats: Mapping[str, float], trust: Trust) -> bool:
+    """Whether an answer may show what a video shows at another time too, for either is nearly as like itself then."""
+    return stats.get("returning", 0.0) > trust.returning * max(stats.get("likeness", np.inf), 0.0)
+
+
+def returning(pair: CommonClock, reach: Int[np.ndarray, " K"], answer: int) -> float:
+    """How like either video is to itself at another time, at most, nats a match and common frame.
+
+    Of times at which the other one would be beyond all lags in ``reach``, which leave enough in common, were this what
+    it shows: no peak is there to say so. A scene that returns tells nothing of a video that began when the other had
+    ended. Of many times few matches are asked, of very many none.
+    """
+    found = 0.0
+    for x in (pair.a, pair.b):
+        later = np.arange(round(RETURNS_FROM * pair.fps), x.shape[1] - round(RETURN_SEEN * pair.fps) + 1, 2)
+        later = later[(answer + later > reach.max()) | (answer - later < reach.min())]
+        work = int((x.shape[1] - later).sum())
+        if not len(later) or work * RATE_MATCHES > DIRECT // 4:
+            continue
+        x = x[evenly(len(x), max(RATE_MATCHES, DIRECT // (4 * work)))]
+        alone = replace(pair, a=x, b=x)
+        told = evidence(alone, later).total / alone.overlap(later)
+        found = max(found, float(np.max(told, where=np.isfinite(told), initial=0.0)))
+    return found
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from ..align.likelihood import LikelihoodScan
+from ..align.likelihood import LikelihoodScan, may_be_another_time
 from ..align.slot import Aligner, AlignerLike
 from ..clocks.common import nominal_fps
 from ..clocks.shutter import at_frame_times
@@ -120,7 +120,7 @@ def synchronize(
 
     rematched = times if matches is None else 0
     with blas_for(max(len(t) for t in tracks)):
-        jobs, verdict, broken = _answered(jobs, tracks, judged, map, rematched)
+        jobs, verdict, broken = _answered(jobs, tracks, judged, map, rematched, aligning)
         if isinstance(aligning, EpipolarScan):
             verdict = _mended_in_pixels(jobs, verdict, tracks, aligning, refining, judged, map, broken)
             verdict = _without_unsteady(verdict, tracks, aligning, judged)
@@ -144,19 +144,34 @@ def _answered(
     judged: Callable[[Sequence[Answer]], Verdict],
     map: MapLike,
     times: int,
+    aligner: Aligner,
 ) -> tuple[list[Job], Verdict, dict[int, tuple[Break, ...]]]:
     """All pairs answered, clocks that break put right (``tracks`` in place), and pairs matched once more at the times
-    that were found, so often.
+    that were found, so often; what the first scans said of motion that returns is heard.
 
     Returns:
         The work on the pairs as it is then, the verdict, and the breaks of each video that was mended.
     """
     broken: dict[int, tuple[Break, ...]] = {}
     verdict = judged(list(map(run, jobs)))
+    first = {a.pair: a.scanned.stats.get("returning", 0.0) for a in verdict.answers}
     jobs, verdict = mend_clocks(jobs, verdict, tracks, judged, map, ByMotion(), broken)
     jobs, verdict = mend_by_cuts(jobs, verdict, tracks, judged, map, broken)
-    if not times:
-        return jobs, verdict, broken
+    if times:
+        jobs, verdict = _at_their_times(jobs, verdict, tracks, judged, map, times, broken)
+    return jobs, _with_returns_heard(verdict, first, aligner, judged), broken
+
+
+def _at_their_times(
+    jobs: list[Job],
+    verdict: Verdict,
+    tracks: list[TrackSet],
+    judged: Callable[[Sequence[Answer]], Verdict],
+    map: MapLike,
+    times: int,
+    broken: dict[int, tuple[Break, ...]],
+) -> tuple[list[Job], Verdict]:
+    """Pairs matched once more at the times that were found, by windows where a clock is doubtful, and then so often."""
     jobs, verdict, timed = mend_by_windows(jobs, verdict, tracks, judged, map, broken)
     settled = contested(jobs, verdict, map)
     if settled:
@@ -167,7 +182,30 @@ def _answered(
             break
         fresh = {answer.pair: answer for answer in map(run, again)}
         verdict = judged([_still_broken(fresh.get(a.pair, a), a) for a in verdict.answers])
-    return jobs, verdict, broken
+    return jobs, verdict
+
+
+def _with_returns_heard(
+    verdict: Verdict,
+    first: Mapping[Pair, float],
+    aligner: Aligner,
+    judged: Callable[[Sequence[Answer]], Verdict],
+) -> Verdict:
+    """The verdict, with pairs ambiguous whose videos are nearly as like themselves at another time.
+
+    Args:
+        first: how like, by the scans of the tracks as they were given. A clock that is mended leaves a scan other
+            times at which nothing can be compared; what was seen of the video there is still true.
+    """
+    if not isinstance(aligner, LikelihoodScan):
+        return verdict
+    heard = {}
+    for a in verdict.answers:
+        stats = dict(a.scanned.stats) | {"returning": max(first[a.pair], a.scanned.stats.get("returning", 0.0))}
+        if may_be_another_time(stats, aligner.trust) and not stats.get("elsewhere"):
+            scanned = dataclasses.replace(a.scanned, stats=stats | {"elsewhere": 1.0})
+            heard[a.pair] = dataclasses.replace(a, scanned=scanned).flagged(Status.AMBIGUOUS)
+    return judged([heard.get(a.pair, a) for a in verdict.answers]) if heard else verdict
 
 
 def _mended_in_pixels(

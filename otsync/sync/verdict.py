@@ -444,7 +444,7 @@ def _trusted(network: Network, solved: Solved, agrees: np.ndarray) -> Bool[np.nd
 
     Trust grows from the reference: a video joins by one agreeing pair that vouches for itself, or by two sound agreeing
     pairs, at least half of all its pairs, with trusted videos, whose summed curves pass the limits for evidence and
-    ambiguity.
+    ambiguity. Pairs whose rival lies where their curves do not reach add nothing to that.
     """
     n, edges, trust = network.n, network.edges, network.trust
     agrees = agrees & np.array([a.sound for a in network.links], bool)
@@ -457,13 +457,14 @@ def _trusted(network: Network, solved: Solved, agrees: np.ndarray) -> Bool[np.nd
         growing = False
         for v in np.flatnonzero(~trusted):
             near = [
-                e
-                for e, ok in zip(edges, agrees, strict=True)
+                (e, bool(a.scanned.stats.get("elsewhere")))
+                for e, a, ok in zip(edges, network.links, agrees, strict=True)
                 if ok and ((e.a == v and trusted[e.b]) or (e.b == v and trusted[e.a]))
             ]
-            joined = any(e.trusted for e in near)
-            if not joined and network.graph.curves and len(near) >= max(2, degree[v] / 2):
-                joined = undoubted(CurveSum(n, near, FRAME), int(v), solved.x, trust, trust.margin)
+            joined = any(e.trusted for e, _ in near)
+            clear = [e for e, out_of_reach in near if not out_of_reach]
+            if not joined and network.graph.curves and len(clear) >= max(2, degree[v] / 2):
+                joined = undoubted(CurveSum(n, clear, FRAME), int(v), solved.x, trust, trust.margin)
             if joined:
                 trusted[v] = growing = True
     return trusted

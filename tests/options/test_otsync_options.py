@@ -98,6 +98,7 @@ ALIGNER_OPTIONS = (
         for name, value in {
             "evidence": "1e9",
             "margin": "10",
+            "returning": "-1",
             "disagreement": "-1",
             "alias": "-1",
             "overlap": "1e9",
@@ -160,6 +161,7 @@ NOT_READ = {
             "parted",
             "overlap",
             "matches",
+            "returning",
             "disagreement",
             "alias",
             "motion",
@@ -185,7 +187,7 @@ NOT_READ = {
             "parted",
         )
     },
-    **{f"{FIT}.trust.{name}": "refiner" for name in ("disagreement", "alias", "motion", "rate_gain")},
+    **{f"{FIT}.trust.{name}": "refiner" for name in ("returning", "disagreement", "alias", "motion", "rate_gain")},
 }
 
 

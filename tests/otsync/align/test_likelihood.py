@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 from otsync import LikelihoodScan, Matches, Refused, Status, TrackSet, align
-from otsync.align.likelihood import Curves, Signal, evidence, noise_floor, statistics, velocity_score
+from otsync.align.likelihood import Curves, Signal, evidence, noise_floor, returning, statistics, velocity_score
 from otsync.align.peaks import separate_peaks, vertex
 from otsync.align.windows import local_curves
+from otsync.bench.hard_cases.graphs import video
 from otsync.clocks.common import common_clock
 from otsync.simulate import simulate
+from otsync.types.trust import Trust
 from tests.conftest import wiggle
 
 ALL = Matches(np.stack([np.arange(12)] * 2, 1))
@@ -269,3 +271,33 @@ def test_a_few_matches_at_a_time_say_what_all_of_them_say(monkeypatch):
     assert np.argmax(long) == np.argmax(whole[0])
     np.testing.assert_allclose(long.max(), whole[0].max(), rtol=1e-6)
     assert parts and set(parts) == {11}
+
+
+def test_an_answer_that_may_be_another_time_is_ambiguous():
+    """The second video begins when the first one has ended, and the scene nearly returns: no lag shows the rival."""
+    first, later = video(12), video(208)
+    same = Matches(np.stack([np.arange(len(first))] * 2, 1))
+    wrong = LikelihoodScan()(first, later, same)
+    assert Status.AMBIGUOUS in wrong.flags and wrong.stats["elsewhere"] == 1
+    assert wrong.stats["margin"] > Trust().margin
+    believed = LikelihoodScan(trust=Trust(returning=1.0))(first, later, same)
+    assert Status.AMBIGUOUS not in believed.flags and believed.stats["elsewhere"] == 0
+    right = LikelihoodScan()(first, video(37), same)
+    assert right.status is Status.OK and 0 < right.stats["returning"] < 0.5 * right.stats["likeness"]
+
+
+def test_what_returns_is_looked_for_out_of_reach_alone():
+    """Against the definition; and alike for exchanged videos."""
+    world = wiggle(np.random.default_rng(4), 12, 200)
+    pair = common_clock(TrackSet(world[:, :100], fps=30), TrackSet(world[:, 40:150], fps=30), ALL)
+    reach = pair.lags(24, None)
+    told = 0.0
+    for x in (pair.a, pair.b):
+        later = np.arange(15, x.shape[1] - 35, 2)
+        alike = evidence(dataclasses.replace(pair, a=x, b=x), later).total / (x.shape[1] - later)
+        told = max(told, *(one for k, one in zip(later, alike, strict=True) if 40 + k > reach[-1] or 40 - k < reach[0]))
+    assert told > 0
+    assert returning(pair, reach, 40) == pytest.approx(told, rel=1e-6)
+    exchanged = dataclasses.replace(pair, a=pair.b, b=pair.a)
+    assert returning(exchanged, -reach[::-1], -40) == pytest.approx(told, rel=1e-6)
+    assert returning(pair, np.arange(-300, 301), 40) == 0.0  # everywhere a peak could say so

@@ -47,7 +47,12 @@ FAST = (
 )
 """Run every time, one or two of every slot; the graph by the rows below, all others in the slow tests."""
 
-FAST_GRAPHS = ("one video unrelated", "two scenes, two videos of each", "the reference unrelated")
+FAST_GRAPHS = (
+    "one video unrelated",
+    "one video without a frame in common",
+    "two scenes, two videos of each",
+    "the reference unrelated",
+)
 
 
 def is_slow(case: Case, name: str) -> bool:
