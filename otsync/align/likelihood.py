@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ..clocks.common import SAMPLES, CommonClock, common_clock, readable, strongest
 from ..clocks.splines import TrackSplines
@@ -55,8 +55,13 @@ CONTENDERS, BACKGROUND = 32, 64
 median, by common frames, is what they have elsewhere."""
 
 
-RETURNS_FROM, RETURN_SEEN = 0.5, 1.2
-"""Seconds later, at least, at which a video is compared with itself; and seconds of it that must be compared."""
+RETURNS_FROM, RETURN_SEEN, RETURN_SHARE = 0.5, 1.2, 0.25
+"""Seconds later, at least, at which a video is compared with itself; seconds of it that must be compared, and which
+share of what both videos share at the answer: ends that are alike say little of all that lies between them."""
+
+AGREEING = 0.5
+"""What a match must have of the upper quartile's correlation at the answer to agree with it. Partners that are wrong
+make two videos less alike; a video is like itself whatever its tracks are matched to."""
 
 READS = ("evidence", "margin", "returning", "disagreement", "alias", "overlap", "matches", "motion", "rate_gain")
 """The limits of :class:`otsync.Trust` that the scan's flags are raised by."""
@@ -102,7 +107,7 @@ class LikelihoodScan(Aligner):
     def __call__(self, a: TrackSet, b: TrackSet, matches: Matches) -> Alignment:
         matches = strongest(matches, readable(self.limit, a, b))
         pair, scale = normalised(common_clock(a, b, matches))
-        lags = pair.lags(max(1, round(self.min_overlap * pair.fps)), self.max_lag)
+        lags = pair.lags(self._least(pair), self.max_lag)
         if len(matches) == 0 or len(lags) == 0:
             return unanswered(pair, matches)
         curves = evidence(pair, lags, matches.shares)
@@ -112,13 +117,11 @@ class LikelihoodScan(Aligner):
         tops = separate_peaks(score, round(APART * pair.fps), self.peaks, prefer=np.abs(lags))
         offset = float(pair.seconds(vertex(lags, score, tops[0])))
         stats = self._stats(pair, lags, curves, tops) | {"matches": float(len(matches))}
-        reach = pair.lags(max(1, round(self.min_overlap * pair.fps)), None)
-        stats["returning"] = returning(pair, reach, int(lags[tops[0]]))
-        stats["likeness"] = float(score[tops[0]] / pair.overlap(lags[tops[:1]])[0])
-        stats["elsewhere"] = float(may_be_another_time(stats, self.trust))
+        stats |= self._another_time(pair, int(lags[tops[0]]), matches.shares)
         stats["other_rate"], stats["other_rate_gain"] = other_rate(a, b, pair, matches, scale, self.max_lag)
         flags = self._flags(stats)
-        found = find_breaks(pair, lags, score, curves.floor, matches.shares, ambiguous=Status.AMBIGUOUS in flags)
+        rivals = stats["margin"] < self.trust.margin
+        found = find_breaks(pair, lags, score, curves.floor, matches.shares, ambiguous=rivals)
         parts, stats["parts_gain"], stats["returns"] = found.parts, found.gain, float(found.returns)
         flags = (*flags, *((Status.BROKEN_CLOCK,) if len(parts) or found.doubtful else ()))
         return Alignment(
@@ -130,6 +133,29 @@ class LikelihoodScan(Aligner):
             stats=stats,
             parts=parts,
         )
+
+    def another_time(self, a: TrackSet, b: TrackSet, matches: Matches, offset: float) -> dict[str, float]:
+        """How like the videos are at an offset (s), and either to itself where no lag could show the rival.
+
+        Returns:
+            likeness, returning: nats a match and common sample, at the offset and at another time (see
+            :func:`returning`). another_time: 1 where the offset may be another time's, by the limit of ``trust``.
+        """
+        matches = strongest(matches, readable(self.limit, a, b))
+        pair, _ = normalised(common_clock(a, b, matches))
+        return self._another_time(pair, round((offset - pair.origin) * pair.fps), matches.shares)
+
+    def _another_time(self, pair: CommonClock, answer: int, weight: Float[np.ndarray, " M"]) -> dict[str, float]:
+        alike, again = returning(pair, answer, self._least(pair), self.max_lag, weight)
+        return {
+            "likeness": alike,
+            "returning": again,
+            "another_time": float(may_be_another_time(again, alike, self.trust)),
+        }
+
+    def _least(self, pair: CommonClock) -> int:
+        """Frames that two videos must share."""
+        return max(1, round(self.min_overlap * pair.fps))
 
     def _stats(
         self, pair: CommonClock, lags: Int[np.ndarray, " K"], curves: Curves, tops: list[int]
@@ -160,7 +186,7 @@ class LikelihoodScan(Aligner):
         t = self.trust
         found = {
             Status.WEAK: stats["evidence"] < t.evidence,
-            Status.AMBIGUOUS: stats["margin"] < t.margin or stats["elsewhere"] > 0,
+            Status.AMBIGUOUS: stats["margin"] < t.margin or stats["another_time"] > 0,
             Status.DISAGREE: stats["disagreement"] > t.disagreement + 1e-9,
             Status.ALIAS: stats["alias"] > t.alias + 1e-9,
             Status.SHORT_OVERLAP: stats["overlap"] < t.overlap - 1e-9,
@@ -172,30 +198,62 @@ class LikelihoodScan(Aligner):
         return in_order(flag for flag, raised in found.items() if raised)
 
 
-def may_be_another_time(stats: Mapping[str, float], trust: Trust) -> bool:
+def may_be_another_time(returning: float, likeness: float, trust: Trust) -> bool:
     """Whether an answer may show what a video shows at another time too, for either is nearly as like itself then."""
-    return stats.get("returning", 0.0) > trust.returning * max(stats.get("likeness", np.inf), 0.0)
+    return returning > trust.returning * likeness
 
 
-def returning(pair: CommonClock, reach: Int[np.ndarray, " K"], answer: int) -> float:
-    """How like either video is to itself at another time, at most, nats a match and common frame.
+def returning(
+    pair: CommonClock, answer: int, least: int, max_lag: float | None, weight: Float[np.ndarray, " M"]
+) -> tuple[float, float]:
+    """How like two videos are at a lag, and either to itself at another time, at most: nats a match and common sample.
 
-    Of times at which the other one would be beyond all lags in ``reach``, which leave enough in common, were this what
-    it shows: no peak is there to say so. A scene that returns tells nothing of a video that began when the other had
-    ended. Of many times few matches are asked, of very many none.
+    Of times only at which the other one, were this what it shows, would leave fewer than ``least`` frames in common: no
+    peak is there to say so. Those beyond ``max_lag`` (s) are ruled out by the caller. A scene that returns tells
+    nothing of a video that began when the other had ended. Both are read from the matches that agree with the answer;
+    of long clips from a few of them.
     """
-    found = 0.0
+    some = np.flatnonzero(agreeing(pair, answer))
+    longest = max(pair.a.shape[1], pair.b.shape[1])
+    some = some[evenly(len(some), max(RATE_MATCHES, DIRECT // (4 * longest**2)))]
+    pair, weight = replace(pair, a=pair.a[some], b=pair.b[some]), weight[some]
+    common = int(pair.overlap(np.array([answer]))[0])
+    if not len(some) or common < 1:
+        return 0.0, 0.0
+    (here,) = by_sample(pair, np.array([answer]), weight)
+    reach, again = pair.lags(least, None), 0.0
+    seen = max(round(RETURN_SEEN * pair.fps), math.ceil(RETURN_SHARE * common))
+
+    def unseen(lags: Int[np.ndarray, " K"]) -> Bool[np.ndarray, " K"]:
+        allowed = True if max_lag is None else np.abs(pair.origin + lags / pair.fps) <= max_lag
+        return allowed & ((lags > reach[-1]) | (lags < reach[0]))
+
     for x in (pair.a, pair.b):
-        later = np.arange(round(RETURNS_FROM * pair.fps), x.shape[1] - round(RETURN_SEEN * pair.fps) + 1, 2)
-        later = later[(answer + later > reach.max()) | (answer - later < reach.min())]
-        work = int((x.shape[1] - later).sum())
-        if not len(later) or work * RATE_MATCHES > DIRECT // 4:
-            continue
-        x = x[evenly(len(x), max(RATE_MATCHES, DIRECT // (4 * work)))]
-        alone = replace(pair, a=x, b=x)
-        told = evidence(alone, later).total / alone.overlap(later)
-        found = max(found, float(np.max(told, where=np.isfinite(told), initial=0.0)))
-    return found
+        later = np.arange(round(RETURNS_FROM * pair.fps), x.shape[1] - seen + 1)
+        later = later[unseen(answer + later) | unseen(answer - later)] if len(reach) else later[:0]
+        if len(later):
+            again = max(again, float(by_sample(replace(pair, a=x, b=x), later, weight).max()))
+    return float(here), again
+
+
+def agreeing(pair: CommonClock, answer: int) -> Bool[np.ndarray, " M"]:
+    """The matches whose slow velocities correlate at a lag as those of matches that are right do."""
+    half, least = max(1, round(SLOW * pair.fps)), max(1, round(MIN_FRAMES * pair.fps))
+    count, power, residual = (x[:, 0] for x in statistics_by_part(pair, np.array([answer]), least, half))
+    known = (count > 0) & (power > 0)
+    if not known.any():
+        return known
+    correlation = np.where(known, 1 - residual / np.where(known, power, 1.0), -np.inf)
+    return correlation >= AGREEING * max(float(np.quantile(correlation[known], 0.75)), 0.0)
+
+
+def by_sample(
+    pair: CommonClock, lags: Int[np.ndarray, " K"], weight: Float[np.ndarray, " M"]
+) -> Float[np.ndarray, " K"]:
+    """The scan's score at every lag by what a match is seen of there; 0 where none is."""
+    curves = evidence(pair, lags, weight / max(float(weight.mean()), 1e-12))
+    told = np.isfinite(curves.total) & (curves.samples > 0)
+    return np.where(told, curves.total, 0.0) / np.where(told, curves.samples, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,7 +262,7 @@ class Curves:
 
     Args:
         total: what is maximised. slow: of ±5-frame velocities. windows: of windowed positions.
-        observed: matches seen long enough at each lag.
+        observed: matches seen long enough at each lag. samples: common ones of a match there, on average.
         motion: at each lag, the rms motion that both videos share, relative to the rms extent of the scene.
         floor: e² of the positions.
     """
@@ -213,6 +271,7 @@ class Curves:
     slow: Float[np.ndarray, " K"]
     windows: Float[np.ndarray, " K"]
     observed: Float[np.ndarray, " K"]
+    samples: Float[np.ndarray, " K"]
     motion: Float[np.ndarray, " K"]
     floor: float = 0.0
 
@@ -230,6 +289,7 @@ def evidence(pair: CommonClock, lags: Int[np.ndarray, " K"], weight: Float[np.nd
     observed = (count > 0).sum(0).astype(float)
     power -= residual
     power *= count
+    samples = count.sum(0) / len(count)
     shared = 0.5 * power.sum(0) / np.maximum(count.sum(0), 1)
     del count, power, residual  # of long clips, hundreds of megabytes
     fast, slow = (velocity_score(pair, lags, frames(half), least, weight) for half in (FAST, SLOW))
@@ -239,6 +299,7 @@ def evidence(pair: CommonClock, lags: Int[np.ndarray, " K"], weight: Float[np.nd
         slow=slow,
         windows=windows,
         observed=observed,
+        samples=samples,
         motion=np.sqrt(np.maximum(shared, 0)) / extent if extent > 0 else np.zeros(len(lags)),
         floor=floor,
     )

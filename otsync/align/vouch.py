@@ -44,6 +44,9 @@ CORRELATED, RATHER_LITTLE = 0.19, 0.45
 drift is shared: static scenes with drifts of .2 m have .12 to .17 and at most .36; what moves by as little .5 and more
 (mid), .25 (hard), .19 (brutal; 20 pairs each)."""
 
+ANOTHER_TIME = ("likeness", "returning", "another_time")
+"""What the scan says of times that no lag shows, in its stats: pairs that may be another time's vouch for no other."""
+
 BEST_TENTH, LEAST_MOMENTS = 0.9, 40
 
 
@@ -62,6 +65,8 @@ def vouch(alignment: Alignment, a: TrackSet, b: TrackSet, matches: Matches, alig
         same = {name: getattr(aligner, name) for name in ("max_lag", "min_overlap") if hasattr(aligner, name)}
         scan = LikelihoodScan(**same)(a, b, matches)
         flags += scan.flags
+        told = {name: value for name, value in scan.stats.items() if name in ANOTHER_TIME}
+        alignment = replace(alignment, stats=alignment.stats | told)
         if not abs(scan.offset - alignment.offset) <= AGREES + 1e-9:
             flags.append(Status.DISAGREE)
     few_a, few_b = thinned(a), thinned(b)

@@ -16,6 +16,9 @@ import numpy as np
 MAX_BYTES = 8 * 2**30
 """Largest total size of the arrays of one file that is read without being asked (8 GiB)."""
 
+AGAIN = 3
+"""How often a file is read once more whose headers could not be parsed because other threads parsed some, too."""
+
 
 @contextmanager
 def atomic_write(path: str | os.PathLike[str], mode: str = "wb") -> Iterator[IO[Any]]:
@@ -113,12 +116,12 @@ def read_npz(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> dic
     """
     path = existing(path)
     try:
-        with zipfile.ZipFile(path) as archive:
-            total = sum(_declared_bytes(archive, info) for info in archive.infolist())
-        if total > max_bytes:
-            raise ValueError(f"arrays of {total} bytes, more than the {max_bytes} allowed; pass a larger max_bytes")
-        with np.load(path, allow_pickle=False) as data:
-            return {name: data[name] for name in data.files}
+        for _ in range(AGAIN):
+            try:
+                return _arrays(path, max_bytes)
+            except SystemError:  # of threads that parse headers at once: CPython 3.11, issue 106905
+                continue
+        return _arrays(path, max_bytes)
     except MemoryError:
         raise MemoryError(
             f"{path}: expected arrays that fit into memory; they do not. Use fewer or smaller ones."
@@ -137,6 +140,15 @@ def read_npz(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> dic
         raise ValueError(
             f"{path}: expected a readable .npz of plain arrays; {type(error).__name__}: {error}."
         ) from None
+
+
+def _arrays(path: Path, max_bytes: int) -> dict[str, np.ndarray]:
+    with zipfile.ZipFile(path) as archive:
+        total = sum(_declared_bytes(archive, info) for info in archive.infolist())
+    if total > max_bytes:
+        raise ValueError(f"arrays of {total} bytes, more than the {max_bytes} allowed; pass a larger max_bytes")
+    with np.load(path, allow_pickle=False) as data:
+        return {name: data[name] for name in data.files}
 
 
 _HEADERS: dict[tuple[int, int], Callable[..., tuple[tuple[int, ...], bool, np.dtype]]] = {

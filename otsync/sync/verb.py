@@ -154,12 +154,12 @@ def _answered(
     """
     broken: dict[int, tuple[Break, ...]] = {}
     verdict = judged(list(map(run, jobs)))
-    first = {a.pair: a.scanned.stats.get("returning", 0.0) for a in verdict.answers}
+    filmed = list(tracks)
     jobs, verdict = mend_clocks(jobs, verdict, tracks, judged, map, ByMotion(), broken)
     jobs, verdict = mend_by_cuts(jobs, verdict, tracks, judged, map, broken)
     if times:
         jobs, verdict = _at_their_times(jobs, verdict, tracks, judged, map, times, broken)
-    return jobs, _with_returns_heard(verdict, first, aligner, judged), broken
+    return jobs, _with_returns_heard(verdict, filmed, broken, aligner, judged), broken
 
 
 def _at_their_times(
@@ -171,7 +171,7 @@ def _at_their_times(
     times: int,
     broken: dict[int, tuple[Break, ...]],
 ) -> tuple[list[Job], Verdict]:
-    """Pairs matched once more at the times that were found, by windows where a clock is doubtful, and then so often."""
+    """Pairs matched at the times that were found: by windows where a clock is doubtful, then ``times`` times more."""
     jobs, verdict, timed = mend_by_windows(jobs, verdict, tracks, judged, map, broken)
     settled = contested(jobs, verdict, map)
     if settled:
@@ -187,24 +187,25 @@ def _at_their_times(
 
 def _with_returns_heard(
     verdict: Verdict,
-    first: Mapping[Pair, float],
+    filmed: Sequence[TrackSet],
+    broken: Mapping[int, tuple[Break, ...]],
     aligner: Aligner,
     judged: Callable[[Sequence[Answer]], Verdict],
 ) -> Verdict:
-    """The verdict, with pairs ambiguous whose videos are nearly as like themselves at another time.
+    """The verdict, with pairs of mended videos ambiguous that may be another time's by what the videos show as filmed.
 
-    Args:
-        first: how like, by the scans of the tracks as they were given. A clock that is mended leaves a scan other
-            times at which nothing can be compared; what was seen of the video there is still true.
+    A clock that is mended, or cut, leaves the scan less to compare a video with itself by; what was seen of it is still
+    true.
     """
-    if not isinstance(aligner, LikelihoodScan):
-        return verdict
+    scan = aligner if isinstance(aligner, LikelihoodScan) else LikelihoodScan()
     heard = {}
     for a in verdict.answers:
-        stats = dict(a.scanned.stats) | {"returning": max(first[a.pair], a.scanned.stats.get("returning", 0.0))}
-        if may_be_another_time(stats, aligner.trust) and not stats.get("elsewhere"):
-            scanned = dataclasses.replace(a.scanned, stats=stats | {"elsewhere": 1.0})
-            heard[a.pair] = dataclasses.replace(a, scanned=scanned).flagged(Status.AMBIGUOUS)
+        stats = a.scanned.stats
+        if not broken.keys() & set(a.pair) or not a.finite or stats.get("another_time", 1.0) > 0:
+            continue
+        found = scan.another_time(filmed[a.pair[0]], filmed[a.pair[1]], a.matches, a.refined.offset)
+        if may_be_another_time(found["returning"], max(found["likeness"], stats["likeness"]), scan.trust):
+            heard[a.pair] = a.that_may_be_another_time()
     return judged([heard.get(a.pair, a) for a in verdict.answers]) if heard else verdict
 
 

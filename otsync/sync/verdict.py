@@ -92,6 +92,15 @@ class Answer:
         """The answer with one more flag."""
         return replace(self, refined=replace(self.refined, flags=in_order((*self.refined.flags, flag))))
 
+    def that_may_be_another_time(self) -> Answer:
+        """The answer with the scan's doubt whether it is of another time, also where it is fitted anew."""
+
+        def told(alignment: Alignment) -> Alignment:
+            flags = in_order((*alignment.flags, Status.AMBIGUOUS))
+            return replace(alignment, flags=flags, stats=alignment.stats | {"another_time": 1.0})
+
+        return replace(self, scanned=told(self.scanned), refined=told(self.refined))
+
 
 Refit = Callable[[list[tuple[Answer, float, float]]], list[Alignment]]
 """Fit answers anew, each from an offset (s of a's clock) and at a rate."""
@@ -457,14 +466,14 @@ def _trusted(network: Network, solved: Solved, agrees: np.ndarray) -> Bool[np.nd
         growing = False
         for v in np.flatnonzero(~trusted):
             near = [
-                (e, bool(a.scanned.stats.get("elsewhere")))
+                (e, bool(a.scanned.stats.get("another_time")))
                 for e, a, ok in zip(edges, network.links, agrees, strict=True)
                 if ok and ((e.a == v and trusted[e.b]) or (e.b == v and trusted[e.a]))
             ]
             joined = any(e.trusted for e, _ in near)
-            clear = [e for e, out_of_reach in near if not out_of_reach]
-            if not joined and network.graph.curves and len(clear) >= max(2, degree[v] / 2):
-                joined = undoubted(CurveSum(n, clear, FRAME), int(v), solved.x, trust, trust.margin)
+            within_reach = [e for e, another_time in near if not another_time]
+            if not joined and network.graph.curves and len(within_reach) >= max(2, degree[v] / 2):
+                joined = undoubted(CurveSum(n, within_reach, FRAME), int(v), solved.x, trust, trust.margin)
             if joined:
                 trusted[v] = growing = True
     return trusted

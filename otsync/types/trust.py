@@ -21,10 +21,10 @@ class Trust:
             flag refuses have 13 and more (260 pairs, hard and brutal, seeds 500-699).
         margin: AMBIGUOUS when another peak comes this close to the first, as a share of the first's rise, altogether
             or per common frame.
-        returning: AMBIGUOUS when a video is, per common frame, this much like itself at another time, as a share of how
-            like the other one it is at the answer; of times only at which the scan had nothing to compare, where no
-            peak could say so. Right answers have .51 at most (60 worlds: hard, strides, like people, few tracks and
-            short clips, seeds 81040-81051), those to a video without a frame in common .86 and more.
+        returning: AMBIGUOUS when a video is, by what is seen of it, this much like itself at another time, as a share
+            of how like the other one it is at the answer; of times only at which the scan had nothing to compare, where
+            no peak could say so. Of pairs with a video that has no frame in common the share is about 1 (ten such
+            videos of one scene), of the right pairs beside them .35.
         disagreement: DISAGREE when slow velocities or windowed positions peak further away than this, s.
         alias: ALIAS when the score divided by the overlap peaks further away than this, s.
         overlap: SHORT_OVERLAP below this many seconds in common.

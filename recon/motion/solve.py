@@ -132,15 +132,21 @@ class Products:
 
     def weighted(self, w: Float[np.ndarray, "n T"]) -> Float[np.ndarray, "b n P"]:
         """The diagonals of Bᵀ diag(w) B for the weights of n nodes."""
-        return (w @ self.rows).reshape(len(w), self.width + 1, -1).transpose(1, 0, 2)
+        return (
+            (w @ self.rows).reshape(len(w), self.width + 1, self.rows.shape[1] // (self.width + 1)).transpose(1, 0, 2)
+        )
 
 
 def along(B: sparse.sparray, values: Float[np.ndarray, "M P k"]) -> Float[np.ndarray, "M S k"]:
     """B [S,P] applied to the second axis."""
-    M, _, k = values.shape
-    return np.ascontiguousarray(
-        (sparse.csr_array(sparse.kron(B, sparse.eye_array(k))) @ values.reshape(M, -1).T).T
-    ).reshape(M, -1, k)
+    M, P, k = values.shape
+    moved = B @ values.transpose(1, 0, 2).reshape(P, M * k)
+    return moved.reshape(B.shape[0], M, k).transpose(1, 0, 2)
+
+
+def ridge(always: Bands) -> float:
+    """What is added to the main diagonal: :data:`RIDGE`, or what rounding asks for beside very large weights."""
+    return RIDGE * max(1.0, float(always.diagonals.max()))
 
 
 def differences(n: int, order: int) -> sparse.csr_array:
@@ -179,8 +185,8 @@ def solve_curves(
     step = grid[1] - grid[0] if len(grid) > 1 else FRAME
     place, rate = path.design(grid), (path.design(grid + step / 2) - path.design(grid - step / 2)) * (FRAME / step)
     velocity = sparse.csr_array(rate.T @ rate)
-    always = Bands.of(smooth.acceleration * differences(P, 2) + smooth.still * differences(P, 1), _width(velocity))
-    always.diagonals[0] += RIDGE
+    always = Bands.of(smooth.acceleration * differences(P, 2) + smooth.still * differences(P, 1), WINDOW - 1)
+    always.diagonals[0] += ridge(always)
     products = [Products.of(B, always.width) for B in designs]
     incidence, pulls = coupling.incidence(), smooth.velocity * (step / FRAME) * coupling.ties
     laplacian = sparse.csr_array(incidence @ sparse.diags_array(pulls) @ incidence.T)
@@ -256,7 +262,7 @@ def _frame_of(times: np.ndarray) -> float:
 
 
 def _width(square: sparse.csr_array) -> int:
-    """Diagonals beside the main one that hold `square` and the products of a path's design."""
+    """Diagonals beside the main one that hold `square`, and at least the products of a path's design."""
     i, j = square.nonzero()
     return max(WINDOW - 1, int(np.abs(i - j).max(initial=0)))
 
@@ -276,8 +282,9 @@ def _conjugate_gradients(
     """
     M, P, k = right.shape
     own, across = blocks.matrix(), sparse.csr_array(sparse.kron(velocity, sparse.eye_array(k)))
-    moved = Bands.of(velocity, blocks.width).diagonals
-    factor = Bands(blocks.diagonals + laplacian.diagonal()[:, None] * moved).factor()
+    whole = laplacian.diagonal()[:, None] * Bands.of(velocity, _width(velocity)).diagonals
+    whole[: blocks.width + 1] += blocks.diagonals
+    factor = Bands(whole).factor()
 
     def system(x: np.ndarray) -> np.ndarray:
         coupled = (across @ (laplacian @ x.reshape(M, P * k)).T).T

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from otsync.types import TrackSet
 from recon.motion.nodes import world_clocks
 from recon.motion.paths import SPLINES, WINDOW, Path
-from recon.motion.solve import FRAME, RIDGE, Bands, Products, along, differences, solved
+from recon.motion.solve import FRAME, Bands, Products, along, differences, ridge, solved
 
 ROUNDS = 3  # of reweighting
 STILL = (
@@ -68,7 +68,7 @@ class TrackCurves:
         """
         clocks = world_clocks(tracks, offsets, rates)
         always = Bands.of(acceleration * differences(path.count, 2) + STILL * differences(path.count, 1), WINDOW - 1)
-        always.diagonals[0] += RIDGE
+        always.diagonals[0] += ridge(always)
         knots, seen_from, seen_to = [], [], []
         for times, one in zip(clocks, tracks, strict=True):
             own = one.take(np.flatnonzero(one.seen.any(1)))
@@ -93,7 +93,8 @@ class TrackCurves:
         say, and the one that moves most like the other two is followed: so a track that went astray is not. Where no
         track was seen then, all take part.
         """
-        at = along(self.path.design(np.array([t])), self.knots.transpose(1, 0, 2))[:, 0]
+        first, weights, _ = self.path.basis(t)
+        at = np.tensordot(weights, self.knots[int(first) : int(first) + WINDOW], 1)
         slack = self.path.spacing / 2
         alive = np.flatnonzero((self.first - slack <= t) & (t <= self.last + slack))
         alive = alive if len(alive) else np.arange(len(self))
@@ -180,8 +181,7 @@ def _solved(
     present, samples = np.isfinite(xyz[..., 0]) * (frame / FRAME), np.nan_to_num(xyz - centre)
     products, weights = Products.of(design, always.width), present
     for _ in range(ROUNDS):
-        blocks = always.repeated(len(xyz))
-        blocks.diagonals[:] += products.weighted(weights)
+        blocks = Bands(always.diagonals + products.weighted(weights))
         knots = solved(blocks.factor(), along(design.T, weights[..., None] * samples))
         weights = present / (1 + (np.linalg.norm(along(design, knots) - samples, axis=2) / robust) ** 2)
     return (knots + centre).transpose(1, 0, 2)

@@ -2120,7 +2120,7 @@ BREAKS = (
     Break(
         "returning-within-reach",
         "otsync/align/likelihood.py",
-        "later = later[(answer + later > reach.max()) | (answer - later < reach.min())]",
+        "later = later[unseen(answer + later) | unseen(answer - later)] if len(reach) else later[:0]",
         "later = later[later > 0]",
         ("tests/otsync/align/test_likelihood.py",),
         "motion that returns within reach, where a peak says so, makes answers ambiguous",
@@ -2128,7 +2128,7 @@ BREAKS = (
     Break(
         "returns-forgotten",
         "otsync/sync/verb.py",
-        'if may_be_another_time(stats, aligner.trust) and not stats.get("elsewhere"):',
+        'if may_be_another_time(found["returning"], max(found["likeness"], stats["likeness"]), scan.trust):',
         "if False:",
         ("tests/otsync/bench/test_hard_cases.py",),
         "pieces of a mended clock lift the doubt that the whole one had",
@@ -2136,8 +2136,8 @@ BREAKS = (
     Break(
         "returns-outvoted",
         "otsync/sync/verdict.py",
-        "clear = [e for e, out_of_reach in near if not out_of_reach]",
-        "clear = [e for e, _ in near]",
+        "within_reach = [e for e, another_time in near if not another_time]",
+        "within_reach = [e for e, _ in near]",
         ("tests/otsync/bench/test_hard_cases.py",),
         "pairs that all may be another time vouch for one another",
     ),

@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from otsync import LikelihoodScan, Matches, Refused, Status, TrackSet, align
+from otsync import DTW, LikelihoodScan, Matches, Refused, Status, TrackSet, align
 from otsync.align.likelihood import Curves, Signal, evidence, noise_floor, returning, statistics, velocity_score
 from otsync.align.peaks import separate_peaks, vertex
 from otsync.align.windows import local_curves
@@ -233,7 +233,7 @@ def test_as_much_evidence_per_frame_over_fewer_frames_is_a_full_rival():
     top, later = (int(np.flatnonzero(lags == k)[0]) for k in (0, 30))
     total = np.zeros(len(lags))
     total[top], total[later] = 90.0, 90.0 * overlap[later] / overlap[top]
-    curves = Curves(total, total, total, np.full(len(lags), 12.0), np.ones(len(lags)))
+    curves = Curves(total, total, total, np.full(len(lags), 12.0), np.ones(len(lags)), np.ones(len(lags)))
     assert LikelihoodScan()._stats(pair, lags, curves, [top, later])["margin"] == pytest.approx(0)
 
 
@@ -278,26 +278,60 @@ def test_an_answer_that_may_be_another_time_is_ambiguous():
     first, later = video(12), video(208)
     same = Matches(np.stack([np.arange(len(first))] * 2, 1))
     wrong = LikelihoodScan()(first, later, same)
-    assert Status.AMBIGUOUS in wrong.flags and wrong.stats["elsewhere"] == 1
+    assert Status.AMBIGUOUS in wrong.flags and wrong.stats["another_time"] == 1
     assert wrong.stats["margin"] > Trust().margin
-    believed = LikelihoodScan(trust=Trust(returning=1.0))(first, later, same)
-    assert Status.AMBIGUOUS not in believed.flags and believed.stats["elsewhere"] == 0
+    believed = LikelihoodScan(trust=Trust(returning=1.2))(first, later, same)
+    assert Status.AMBIGUOUS not in believed.flags and believed.stats["another_time"] == 0
     right = LikelihoodScan()(first, video(37), same)
     assert right.status is Status.OK and 0 < right.stats["returning"] < 0.5 * right.stats["likeness"]
 
 
-def test_what_returns_is_looked_for_out_of_reach_alone():
-    """Against the definition; and alike for exchanged videos."""
+def test_another_time_is_told_for_aligners_that_raise_no_flags():
+    first, later = video(12), video(208)
+    same = Matches(np.stack([np.arange(len(first))] * 2, 1))
+    found = align(first, later, same, aligner=DTW(), throw=False)
+    assert Status.AMBIGUOUS in found.flags and found.stats["another_time"] == 1
+
+
+@pytest.mark.parametrize("wrong", [0.5, 0.6])
+def test_wrong_matches_do_not_make_a_right_answer_another_time(wrong):
+    """They make two videos less alike; a video is like itself whatever it is matched to."""
+    first, later = video(0), video(60)
+    rng = np.random.default_rng(1)
+    partner = np.arange(len(first))
+    astray = rng.random(len(first)) < wrong
+    partner[astray] = np.roll(partner[astray], 3)
+    found = LikelihoodScan()(first, later, Matches(np.stack([np.arange(len(first)), partner], 1)))
+    assert found.frames == pytest.approx(60, abs=0.2) and found.stats["another_time"] == 0
+
+
+def test_ends_that_are_alike_tell_nothing_of_what_lies_between():
+    rng = np.random.default_rng(7)
+    steps = rng.normal(size=(12, 940, 3))
+    world = np.apply_along_axis(np.convolve, 1, steps, np.hanning(41), "valid")  # never twice alike
+    ease = np.clip(np.minimum(np.arange(900) - 840, 10) / 10, 0, 1)[:, None]
+    world = world * (1 - ease) + ease * np.concatenate([world[:, :850], world[:, :50]], 1)  # the first 50 once more
+    first, later = TrackSet(world, fps=30), TrackSet(world[:, 250:600], fps=30)
+    found = LikelihoodScan()(first, later, ALL)
+    assert found.status is Status.OK and found.frames == pytest.approx(250, abs=0.1)
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_what_returns_is_looked_for_out_of_reach_alone(weighted):
+    """Against the definition; alike for exchanged videos, and by what is seen, not by frames."""
     world = wiggle(np.random.default_rng(4), 12, 200)
-    pair = common_clock(TrackSet(world[:, :100], fps=30), TrackSet(world[:, 40:150], fps=30), ALL)
-    reach = pair.lags(24, None)
-    told = 0.0
+    a, b = TrackSet(world[:, :100], fps=30), TrackSet(world[:, 40:150], fps=30)
+    weight = np.random.default_rng(5).uniform(0.5, 1.5, 12) if weighted else np.ones(12)
+    weight /= weight.mean()
+    pair = common_clock(a, b, ALL)
+    reach, told = pair.lags(24, None), 0.0
     for x in (pair.a, pair.b):
-        later = np.arange(15, x.shape[1] - 35, 2)
-        alike = evidence(dataclasses.replace(pair, a=x, b=x), later).total / (x.shape[1] - later)
+        later = np.arange(15, x.shape[1] - 35)
+        alike = evidence(dataclasses.replace(pair, a=x, b=x), later, weight).total / (x.shape[1] - later)
         told = max(told, *(one for k, one in zip(later, alike, strict=True) if 40 + k > reach[-1] or 40 - k < reach[0]))
-    assert told > 0
-    assert returning(pair, reach, 40) == pytest.approx(told, rel=1e-6)
+    here, again = returning(pair, 40, 24, None, weight)
+    assert told > 0 and again == pytest.approx(told, rel=1e-6)
+    assert here == pytest.approx(float(evidence(pair, np.array([40]), weight).total[0]) / 60, rel=1e-6)
     exchanged = dataclasses.replace(pair, a=pair.b, b=pair.a)
-    assert returning(exchanged, -reach[::-1], -40) == pytest.approx(told, rel=1e-6)
-    assert returning(pair, np.arange(-300, 301), 40) == 0.0  # everywhere a peak could say so
+    assert returning(exchanged, -40, 24, None, weight) == pytest.approx((here, again), rel=1e-6)
+    assert returning(pair, 40, 24, 1.4, weight)[1] == 0.0  # the caller rules out what no lag shows
