@@ -12,7 +12,7 @@ from ..clocks.common import SAMPLES, CommonClock, common_clock, readable, strong
 from ..clocks.splines import TrackSplines
 from ..compute.indices import blocks, evenly
 from ..costs.linear import binary_scale, velocity
-from ..types import Alignment, Matches, Status, TrackSet, in_order
+from ..types import Alignment, Clock, Matches, Status, TrackSet, in_order
 from ..types.checks import positive
 from ..types.trust import Trust
 from .breaks import find_breaks
@@ -57,7 +57,8 @@ median, by common frames, is what they have elsewhere."""
 
 RETURNS_FROM, RETURN_SEEN, RETURN_SHARE = 0.5, 1.2, 0.25
 """Seconds later, at least, at which a video is compared with itself; seconds of it that must be compared, and which
-share of what both videos share at the answer: ends that are alike say little of all that lies between them."""
+share of the frames and of the samples that both videos share at the answer: ends that are alike, or a few tracks that
+are seen again, say little of all the others."""
 
 AGREEING = 0.5
 """What a match must have of the upper quartile's correlation at the answer to agree with it. Partners that are wrong
@@ -134,16 +135,19 @@ class LikelihoodScan(Aligner):
             parts=parts,
         )
 
-    def another_time(self, a: TrackSet, b: TrackSet, matches: Matches, offset: float) -> dict[str, float]:
-        """How like the videos are at an offset (s), and either to itself where no lag could show the rival.
+    def another_time(self, a: TrackSet, b: TrackSet, matches: Matches, clock: Clock) -> dict[str, float]:
+        """How like the videos are at an answer, and either to itself where no lag could show the rival.
 
         Returns:
-            likeness, returning: nats a match and common sample, at the offset and at another time (see
-            :func:`returning`). another_time: 1 where the offset may be another time's, by the limit of ``trust``.
+            likeness, returning: nats a match and common sample, at the answer and at another time (see
+            :func:`returning`). another_time: 1 where it may be another time's, by the limit of ``trust``.
         """
         matches = strongest(matches, readable(self.limit, a, b))
         pair, _ = normalised(common_clock(a, b, matches))
-        return self._another_time(pair, round((offset - pair.origin) * pair.fps), matches.shares)
+        begin, end = clock.world(b.times[[0, -1]])
+        middle = (max(float(a.times[0]), float(begin)) + min(float(a.times[-1]), float(end))) / 2
+        late = middle - (middle - clock.offset) / clock.rate  # of b there, by which a lag is counted
+        return self._another_time(pair, round((late - pair.origin) * pair.fps), matches.shares)
 
     def _another_time(self, pair: CommonClock, answer: int, weight: Float[np.ndarray, " M"]) -> dict[str, float]:
         alike, again = returning(pair, answer, self._least(pair), self.max_lag, weight)
@@ -200,7 +204,7 @@ class LikelihoodScan(Aligner):
 
 def may_be_another_time(returning: float, likeness: float, trust: Trust) -> bool:
     """Whether an answer may show what a video shows at another time too, for either is nearly as like itself then."""
-    return returning > trust.returning * likeness
+    return returning > trust.returning * max(likeness, 0.0)
 
 
 def returning(
@@ -220,19 +224,20 @@ def returning(
     common = int(pair.overlap(np.array([answer]))[0])
     if not len(some) or common < 1:
         return 0.0, 0.0
-    (here,) = by_sample(pair, np.array([answer]), weight)
+    here, told = (x[0] for x in by_sample(pair, np.array([answer]), weight))
     reach, again = pair.lags(least, None), 0.0
     seen = max(round(RETURN_SEEN * pair.fps), math.ceil(RETURN_SHARE * common))
 
     def unseen(lags: Int[np.ndarray, " K"]) -> Bool[np.ndarray, " K"]:
-        allowed = True if max_lag is None else np.abs(pair.origin + lags / pair.fps) <= max_lag
+        allowed = True if max_lag is None else np.abs(pair.origin + lags / pair.fps) <= max_lag + 1e-9
         return allowed & ((lags > reach[-1]) | (lags < reach[0]))
 
     for x in (pair.a, pair.b):
         later = np.arange(round(RETURNS_FROM * pair.fps), x.shape[1] - seen + 1)
         later = later[unseen(answer + later) | unseen(answer - later)] if len(reach) else later[:0]
         if len(later):
-            again = max(again, float(by_sample(replace(pair, a=x, b=x), later, weight).max()))
+            alike, samples = by_sample(replace(pair, a=x, b=x), later, weight)
+            again = max(again, float(np.max(alike, where=samples >= RETURN_SHARE * told, initial=0.0)))
     return float(here), again
 
 
@@ -249,11 +254,11 @@ def agreeing(pair: CommonClock, answer: int) -> Bool[np.ndarray, " M"]:
 
 def by_sample(
     pair: CommonClock, lags: Int[np.ndarray, " K"], weight: Float[np.ndarray, " M"]
-) -> Float[np.ndarray, " K"]:
-    """The scan's score at every lag by what a match is seen of there; 0 where none is."""
+) -> tuple[Float[np.ndarray, " K"], Float[np.ndarray, " K"]]:
+    """The scan's score at every lag by what a match is seen of there, 0 where none is; and what it is seen of."""
     curves = evidence(pair, lags, weight / max(float(weight.mean()), 1e-12))
     told = np.isfinite(curves.total) & (curves.samples > 0)
-    return np.where(told, curves.total, 0.0) / np.where(told, curves.samples, 1.0)
+    return np.where(told, curves.total, 0.0) / np.where(told, curves.samples, 1.0), curves.samples
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,7 +267,7 @@ class Curves:
 
     Args:
         total: what is maximised. slow: of ±5-frame velocities. windows: of windowed positions.
-        observed: matches seen long enough at each lag. samples: common ones of a match there, on average.
+        observed: matches seen long enough at each lag. samples: common ones of a match there, on average by weight.
         motion: at each lag, the rms motion that both videos share, relative to the rms extent of the scene.
         floor: e² of the positions.
     """
@@ -289,7 +294,7 @@ def evidence(pair: CommonClock, lags: Int[np.ndarray, " K"], weight: Float[np.nd
     observed = (count > 0).sum(0).astype(float)
     power -= residual
     power *= count
-    samples = count.sum(0) / len(count)
+    samples = weight @ count / len(count)
     shared = 0.5 * power.sum(0) / np.maximum(count.sum(0), 1)
     del count, power, residual  # of long clips, hundreds of megabytes
     fast, slow = (velocity_score(pair, lags, frames(half), least, weight) for half in (FAST, SLOW))
@@ -334,6 +339,8 @@ def window_score(
     some, common = evenly(len(lags), BACKGROUND), pair.overlap(lags)
     score = common * float(np.median(at(lags[some]) / common[some]))
     tops = separate_peaks(motion, frames(APART), CONTENDERS)
+    if not tops:  # no match is seen in both videos at any lag
+        return score
     near = np.add.outer(tops, np.arange(-frames(APART), frames(APART) + 1)).ravel()
     some = np.unique(np.clip(near, 0, len(lags) - 1))
     score[some] = at(lags[some])

@@ -62,8 +62,7 @@ def vouch(alignment: Alignment, a: TrackSet, b: TrackSet, matches: Matches, alig
         return alignment
     flags = list(alignment.flags)
     if not aligner.flags_itself:
-        same = {name: getattr(aligner, name) for name in ("max_lag", "min_overlap") if hasattr(aligner, name)}
-        scan = LikelihoodScan(**same)(a, b, matches)
+        scan = scan_of(aligner)(a, b, matches)
         flags += scan.flags
         told = {name: value for name, value in scan.stats.items() if name in ANOTHER_TIME}
         alignment = replace(alignment, stats=alignment.stats | told)
@@ -86,6 +85,14 @@ def vouch(alignment: Alignment, a: TrackSet, b: TrackSet, matches: Matches, alig
                 flags.append(Status.AMBIGUOUS)
         alignment = replace(alignment, stats=alignment.stats | told)
     return replace(alignment, flags=in_order(flags))
+
+
+def scan_of(aligner: Aligner) -> LikelihoodScan:
+    """The likelihood scan over the shifts that an aligner looks at: itself, if it is one."""
+    if isinstance(aligner, LikelihoodScan):
+        return aligner
+    same = {name: getattr(aligner, name) for name in ("max_lag", "min_overlap") if hasattr(aligner, name)}
+    return LikelihoodScan(**same)
 
 
 def drifts(tracks: TrackSet, index: Int[np.ndarray, " M"]) -> bool:

@@ -9,7 +9,7 @@ import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, TypeVar
 
 import numpy as np
 
@@ -17,7 +17,9 @@ MAX_BYTES = 8 * 2**30
 """Largest total size of the arrays of one file that is read without being asked (8 GiB)."""
 
 AGAIN = 3
-"""How often a file is read once more whose headers could not be parsed because other threads parsed some, too."""
+"""How often a file is read once more, see :func:`beside_threads`."""
+
+T = TypeVar("T")
 
 
 @contextmanager
@@ -116,12 +118,7 @@ def read_npz(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> dic
     """
     path = existing(path)
     try:
-        for _ in range(AGAIN):
-            try:
-                return _arrays(path, max_bytes)
-            except SystemError:  # of threads that parse headers at once: CPython 3.11, issue 106905
-                continue
-        return _arrays(path, max_bytes)
+        return beside_threads(lambda: _arrays(path, max_bytes))
     except MemoryError:
         raise MemoryError(
             f"{path}: expected arrays that fit into memory; they do not. Use fewer or smaller ones."
@@ -140,6 +137,17 @@ def read_npz(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> dic
         raise ValueError(
             f"{path}: expected a readable .npz of plain arrays; {type(error).__name__}: {error}."
         ) from None
+
+
+def beside_threads(read: Callable[[], T]) -> T:
+    """What ``read`` returns; called again where headers could not be parsed because other threads parsed some, too.
+
+    CPython 3.11 raises SystemError then (its issue 106905).
+    """
+    for _ in range(AGAIN):
+        with suppress(SystemError):
+            return read()
+    return read()
 
 
 def _arrays(path: Path, max_bytes: int) -> dict[str, np.ndarray]:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from ..files.arrays import check_declared, existing, read_npz
+from ..files.arrays import beside_threads, check_declared, existing, read_npz
 
 MAX_PIXELS = 64 * 2**20
 """Largest image that is decoded (64 megapixels, 8K x 8K)."""
@@ -111,10 +111,14 @@ def _array(path: str | os.PathLike[str], name: str) -> np.ndarray:
 def read_npy(path: str | os.PathLike[str], *, memmap: bool = False) -> np.ndarray:
     """A plain ``.npy`` array without pickle, its declared size checked against the file's."""
     path = existing(path)
-    try:
+
+    def read() -> np.ndarray:
         with open(path, "rb") as stream:
             check_declared(stream, path.stat().st_size, "it")
         return np.load(path, mmap_mode="r" if memmap or path.stat().st_size > 2**20 else None, allow_pickle=False)
+
+    try:
+        return beside_threads(read)
     except MemoryError:
         raise MemoryError(f"{path}: expected an array that fits into memory; it does not. Use a smaller one.") from None
     except Exception as error:  # tokenize.TokenError and the like: whatever a damaged header raises

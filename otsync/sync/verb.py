@@ -11,6 +11,7 @@ import numpy as np
 
 from ..align.likelihood import LikelihoodScan, may_be_another_time
 from ..align.slot import Aligner, AlignerLike
+from ..align.vouch import scan_of
 from ..clocks.common import nominal_fps
 from ..clocks.shutter import at_frame_times
 from ..compute.threads import MapLike, blas_for
@@ -22,7 +23,7 @@ from ..frames import OwnFrames
 from ..match.slot import Matcher, MatcherLike
 from ..refine.slot import Rate, Refiner, RefinerLike
 from ..refine.splines import SplineRefine
-from ..types import Alignment, Break, Matches, Offsets, Status, TrackSet
+from ..types import Alignment, Break, Clock, Matches, Offsets, Status, TrackSet
 from ..types.checks import check_whole
 from ..types.trust import Trust
 from .breaks import MOST, SAME_MOMENT, mended
@@ -147,7 +148,7 @@ def _answered(
     aligner: Aligner,
 ) -> tuple[list[Job], Verdict, dict[int, tuple[Break, ...]]]:
     """All pairs answered, clocks that break put right (``tracks`` in place), and pairs matched once more at the times
-    that were found, so often; what the first scans said of motion that returns is heard.
+    that were found, so often; mended ones are asked as they were filmed whether they may be of another time.
 
     Returns:
         The work on the pairs as it is then, the verdict, and the breaks of each video that was mended.
@@ -197,13 +198,15 @@ def _with_returns_heard(
     A clock that is mended, or cut, leaves the scan less to compare a video with itself by; what was seen of it is still
     true.
     """
-    scan = aligner if isinstance(aligner, LikelihoodScan) else LikelihoodScan()
+    scan = scan_of(aligner)
     heard = {}
     for a in verdict.answers:
         stats = a.scanned.stats
         if not broken.keys() & set(a.pair) or not a.finite or stats.get("another_time", 1.0) > 0:
             continue
-        found = scan.another_time(filmed[a.pair[0]], filmed[a.pair[1]], a.matches, a.refined.offset)
+        found = scan.another_time(
+            filmed[a.pair[0]], filmed[a.pair[1]], a.matches, Clock(a.refined.offset, a.refined.rate)
+        )
         if may_be_another_time(found["returning"], max(found["likeness"], stats["likeness"]), scan.trust):
             heard[a.pair] = a.that_may_be_another_time()
     return judged([heard.get(a.pair, a) for a in verdict.answers]) if heard else verdict

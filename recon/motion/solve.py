@@ -18,6 +18,7 @@ TOLERANCE, ROUGH = 1e-7, 1e-4  # of the energy norm, relative to that of the sol
 MAX_ITERATIONS = 2000
 LEAST_INERTIA = 0.05  # squared units: with less, a neighbourhood hardly tells how it turns
 RIDGE = 1e-9  # towards the mean of a node's samples: decides nothing, but keeps blocks invertible
+ROUNDING = 1e-12  # of the largest weight, at least
 STEADY = 1e-3  # weight, in squared units, with which a rotation is drawn to the one before
 
 
@@ -146,7 +147,7 @@ def along(B: sparse.sparray, values: Float[np.ndarray, "M P k"]) -> Float[np.nda
 
 def ridge(always: Bands) -> float:
     """What is added to the main diagonal: :data:`RIDGE`, or what rounding asks for beside very large weights."""
-    return RIDGE * max(1.0, float(always.diagonals.max()))
+    return max(RIDGE, ROUNDING * float(always.diagonals.max()))
 
 
 def differences(n: int, order: int) -> sparse.csr_array:

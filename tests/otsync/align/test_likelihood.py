@@ -9,7 +9,16 @@ import numpy as np
 import pytest
 
 from otsync import DTW, LikelihoodScan, Matches, Refused, Status, TrackSet, align
-from otsync.align.likelihood import Curves, Signal, evidence, noise_floor, returning, statistics, velocity_score
+from otsync.align.likelihood import (
+    Curves,
+    Signal,
+    by_sample,
+    evidence,
+    noise_floor,
+    returning,
+    statistics,
+    velocity_score,
+)
 from otsync.align.peaks import separate_peaks, vertex
 from otsync.align.windows import local_curves
 from otsync.bench.hard_cases.graphs import video
@@ -335,3 +344,45 @@ def test_what_returns_is_looked_for_out_of_reach_alone(weighted):
     exchanged = dataclasses.replace(pair, a=pair.b, b=pair.a)
     assert returning(exchanged, -40, 24, None, weight) == pytest.approx((here, again), rel=1e-6)
     assert returning(pair, 40, 24, 1.4, weight)[1] == 0.0  # the caller rules out what no lag shows
+
+
+def test_a_few_tracks_that_are_seen_again_tell_nothing_of_the_others():
+    """Tracks live for 2 of 10 s, every fifth is seen once more for 1 s: by chance one of them is like itself then."""
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        steps = rng.normal(size=(40, 440, 3))
+        world = np.apply_along_axis(np.convolve, 1, steps, np.hanning(41), "valid") / 4
+        seen = np.zeros((40, 400), bool)
+        for k, begin in enumerate(rng.integers(100, 240, 40)):
+            seen[k, begin : begin + 60] = True
+            if k % 5 == 0:
+                seen[k, :30] = True
+        a, b = (
+            TrackSet(world[:, s : s + 300] + 0.2 * rng.normal(size=(40, 300, 3)), visible=seen[:, s : s + 300], fps=30)
+            for s in (0, 100)
+        )
+        found = LikelihoodScan()(a, b, Matches(np.stack([np.arange(40)] * 2, 1)))
+        assert found.stats["another_time"] == 0, found.stats
+
+
+def test_tracks_of_a_long_clip_that_are_never_seen_again(monkeypatch):
+    """By spectra no lag shows a match in both then: nothing returns, and nothing fails."""
+    monkeypatch.setattr(sys.modules["otsync.align.likelihood"], "DIRECT", 0)
+    world = wiggle(np.random.default_rng(0), 12, 600)
+    seen = np.zeros((12, 600), bool)
+    seen[:, 280:340] = True
+    pair = common_clock(*(TrackSet(world[:, s : s + 400], visible=seen[:, s : s + 400], fps=30) for s in (0, 200)), ALL)
+    here, again = returning(pair, 200, 24, None, np.ones(12))
+    assert here > 0 and again == 0
+
+
+def test_what_returns_heeds_weights_of_tracks_that_are_seen_in_turn():
+    """A match of no weight adds nothing, neither to the score nor to what is seen."""
+    a, b = moving_pair(20)
+    gone = with_gaps(b, 3)
+    pair, alone = common_clock(a, gone, ALL), common_clock(a, gone, Matches(ALL.pairs[:6]))
+    weight = np.repeat([2.0, 0.0], 6)
+    for one, other in zip(
+        by_sample(pair, np.array([20]), weight), by_sample(alone, np.array([20]), np.ones(6)), strict=True
+    ):
+        assert one == pytest.approx(other, rel=0.02)
