@@ -18,7 +18,7 @@ TOLERANCE, ROUGH = 1e-7, 1e-4  # of the energy norm, relative to that of the sol
 MAX_ITERATIONS = 2000
 LEAST_INERTIA = 0.05  # squared units: with less, a neighbourhood hardly tells how it turns
 RIDGE = 1e-9  # towards the mean of a node's samples: decides nothing, but keeps blocks invertible
-ROUNDING = 1e-12  # of the largest weight, at least
+ROUNDING = 1e-12  # of the largest weight: a smaller ridge would be lost in it
 STEADY = 1e-3  # weight, in squared units, with which a rotation is drawn to the one before
 
 
@@ -133,9 +133,8 @@ class Products:
 
     def weighted(self, w: Float[np.ndarray, "n T"]) -> Float[np.ndarray, "b n P"]:
         """The diagonals of Bᵀ diag(w) B for the weights of n nodes."""
-        return (
-            (w @ self.rows).reshape(len(w), self.width + 1, self.rows.shape[1] // (self.width + 1)).transpose(1, 0, 2)
-        )
+        diagonals = self.width + 1
+        return (w @ self.rows).reshape(len(w), diagonals, self.rows.shape[1] // diagonals).transpose(1, 0, 2)
 
 
 def along(B: sparse.sparray, values: Float[np.ndarray, "M P k"]) -> Float[np.ndarray, "M S k"]:
@@ -145,9 +144,12 @@ def along(B: sparse.sparray, values: Float[np.ndarray, "M P k"]) -> Float[np.nda
     return moved.reshape(B.shape[0], M, k).transpose(1, 0, 2)
 
 
-def ridge(always: Bands) -> float:
-    """What is added to the main diagonal: :data:`RIDGE`, or what rounding asks for beside very large weights."""
-    return max(RIDGE, ROUNDING * float(always.diagonals.max()))
+def smoothness(n: int, acceleration: float, still: float) -> Bands:
+    """What n knots pay whatever is seen: for second and first differences, and :data:`RIDGE` for the knots themselves,
+    or what rounding asks for beside very large weights."""
+    weights = acceleration * differences(n, 2) + still * differences(n, 1)
+    ridge = max(RIDGE, ROUNDING * float(weights.diagonal().max()))
+    return Bands.of(sparse.csr_array(weights + ridge * sparse.eye_array(n)), WINDOW - 1)
 
 
 def differences(n: int, order: int) -> sparse.csr_array:
@@ -186,8 +188,7 @@ def solve_curves(
     step = grid[1] - grid[0] if len(grid) > 1 else FRAME
     place, rate = path.design(grid), (path.design(grid + step / 2) - path.design(grid - step / 2)) * (FRAME / step)
     velocity = sparse.csr_array(rate.T @ rate)
-    always = Bands.of(smooth.acceleration * differences(P, 2) + smooth.still * differences(P, 1), WINDOW - 1)
-    always.diagonals[0] += ridge(always)
+    always = smoothness(P, smooth.acceleration, smooth.still)
     products = [Products.of(B, always.width) for B in designs]
     incidence, pulls = coupling.incidence(), smooth.velocity * (step / FRAME) * coupling.ties
     laplacian = sparse.csr_array(incidence @ sparse.diags_array(pulls) @ incidence.T)

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from otsync.types import TrackSet
 from recon.motion.nodes import world_clocks
 from recon.motion.paths import SPLINES, WINDOW, Path
-from recon.motion.solve import FRAME, Bands, Products, along, differences, ridge, solved
+from recon.motion.solve import FRAME, Bands, Products, along, smoothness, solved
 
 ROUNDS = 3  # of reweighting
 STILL = (
@@ -67,8 +67,7 @@ class TrackCurves:
         ValueError where no track was ever seen.
         """
         clocks = world_clocks(tracks, offsets, rates)
-        always = Bands.of(acceleration * differences(path.count, 2) + STILL * differences(path.count, 1), WINDOW - 1)
-        always.diagonals[0] += ridge(always)
+        always = smoothness(path.count, acceleration, STILL)
         knots, seen_from, seen_to = [], [], []
         for times, one in zip(clocks, tracks, strict=True):
             own = one.take(np.flatnonzero(one.seen.any(1)))

@@ -27,6 +27,7 @@ SECONDS = ("tests/otsync/refine/test_seconds.py",)
 TIMING = ("tests/otsync/simulate/test_timing.py",)
 FRAMES = ("tests/otsync/frames/test_fit.py", "tests/otsync/frames/test_noise.py")
 POSES = ("tests/otsync/frames/test_solver.py",)
+VERDICT = ("tests/otsync/sync/test_verdict.py",)
 GRAPH = ("tests/otsync/sync/test_graph.py",)
 SYNC = (*GRAPH, "tests/otsync/sync/test_verdict.py", "tests/otsync/sync/test_sync.py")
 FIT = ("tests/recon/fit/test_fit.py",)
@@ -2130,7 +2131,7 @@ BREAKS = (
         "otsync/sync/verb.py",
         'if may_be_another_time(found["returning"], max(found["likeness"], stats["likeness"]), scan.trust):',
         "if False:",
-        ("tests/otsync/bench/test_hard_cases.py",),
+        VERDICT,
         "pieces of a mended clock lift the doubt that the whole one had",
     ),
     Break(
@@ -2138,7 +2139,7 @@ BREAKS = (
         "otsync/sync/verdict.py",
         "within_reach = [e for e, another_time in near if not another_time]",
         "within_reach = [e for e, _ in near]",
-        ("tests/otsync/bench/test_hard_cases.py",),
+        VERDICT,
         "pairs that all may be another time vouch for one another",
     ),
     Break(

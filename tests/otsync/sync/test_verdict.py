@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from otsync import Graph, LikelihoodScan, Matches, SplineRefine, Status, TrackSet
+from otsync import Graph, LikelihoodScan, Matches, SplineRefine, Status, TrackSet, synchronize
+from otsync.bench.hard_cases.graphs import LATE, given, video, videos
 from otsync.sync.graph import FLAGGED
 from otsync.sync.pairs import Job, run
 from otsync.sync.verdict import Answer, Network, Verdict, judge, off_rates
@@ -205,3 +206,13 @@ def test_pairs_that_contradict_each_other_or_are_lost_tell_no_rate():
     assert off_rates(rated(lost), 0, Trust()) == []
     doubtful = {p: 1.04 if 3 in p else 1.0 for p in EVERY}
     assert off_rates(rated(doubtful, 0.008, (0, 3), (1, 3), (2, 3)), 0, Trust()) == []
+
+
+@pytest.mark.parametrize("late", [160, 184])
+def test_a_video_without_a_frame_in_common_is_not_placed_by_motion_that_returns(late):
+    """Its pairs agree, for the others are right among themselves; and of one, cut, no piece reaches far enough."""
+    tracks, matches = given([*videos(LATE[:3]), video(late)])
+    found = synchronize(tracks, matches=matches)
+    assert [status is Status.OK for status in found.status] == [True, True, True, False]
+    assert Status.AMBIGUOUS in found.flags[3]
+    assert np.allclose(found.frames[:3], LATE[:3], atol=0.1)
