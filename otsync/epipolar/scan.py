@@ -12,7 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..align.likelihood import APART, MIN_OVERLAP
+from ..align.evidence import APART
+from ..align.likelihood import MIN_OVERLAP
 from ..align.peaks import peak, separate_peaks
 from ..align.slot import Aligner
 from ..clocks.common import nominal_fps, on_clock

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 
 from ..clocks.common import readable
 from ..compute.indices import evenly
+from ..compute.medians import known_quantiles
 from ..costs.linear import Cosine, Cost, binary_scale, total_cost, track_distance
 from ..types import Clock, Matches, Status, TrackSet
 
@@ -305,11 +306,7 @@ def profiles(tracks: TrackSet, index: Int[np.ndarray, " n"]) -> Float[np.ndarray
     own = taken(tracks, index)
     assert own.xyz is not None and pool.xyz is not None
     D = track_distance(own.xyz, own.seen, pool.xyz, pool.seen).astype(float)
-    known = np.isfinite(D)
-    out = np.full((len(index), len(QUANTILES)), np.nan)
-    if known.any(1).any():
-        out[known.any(1)] = np.nanquantile(D[known.any(1)], QUANTILES, axis=1).T
-    return out
+    return known_quantiles(D, QUANTILES, 1).T
 
 
 def forced(a: TrackSet, b: TrackSet, i: Int[np.ndarray, " H"], j: Int[np.ndarray, " H"], features: Likeness) -> bool:
@@ -423,9 +420,10 @@ def chirality(a: Float[np.ndarray, "M F 3"], b: Float[np.ndarray, "M G 3"]) -> f
 
 def side(points: Float[np.ndarray, "M F 3"], quads: Int[np.ndarray, "Q 4"]) -> Int[np.ndarray, " Q"]:
     """+1 or -1 where the triple product of a quad's edges keeps its sign over the frames, 0 where it does not."""
-    first, *others = (points[quads[:, k]].astype(float).transpose(2, 0, 1) for k in range(4))
+    points = points.astype(float) / binary_scale(points)  # squares neither overflow nor vanish
+    first, *others = (points[quads[:, k]].transpose(2, 0, 1) for k in range(4))
     edges = [other - first for other in others]
-    u, v, w = (e / np.maximum(np.hypot(np.hypot(e[0], e[1]), e[2]), np.finfo(float).tiny) for e in edges)
+    u, v, w = (e / np.maximum(np.sqrt(e[0] ** 2 + e[1] ** 2 + e[2] ** 2), np.finfo(float).tiny) for e in edges)
     across = (v[1] * w[2] - v[2] * w[1], v[2] * w[0] - v[0] * w[2], v[0] * w[1] - v[1] * w[0])
     volume = u[0] * across[0] + u[1] * across[1] + u[2] * across[2]
     return (volume > FLAT).all(1).astype(int) - (volume < -FLAT).all(1).astype(int)

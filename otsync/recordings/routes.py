@@ -37,8 +37,8 @@ from ..priors.slots import cache_key
 from ..priors.stereo import EmptyHull, Rig
 from ..priors.working import WIDTH
 from ..progress import Deadline, Progress, Tell
-from ..sync.breaks import mended
-from ..sync.mending import on_own_clock
+from ..sync.hearing import on_own_clock
+from ..sync.mend.breaks import mended
 from ..sync.method import Method
 from ..sync.verb import jump_sigma, synchronize
 from ..types import Offsets, Status, TrackSet, Video

@@ -18,8 +18,8 @@ from jaxtyping import Float
 from ..clocks.common import readable, strongest
 from ..types import Clock, TrackSet
 from .alike import LEAST_BESIDE, LIMIT, MARGIN, Raw, Usual
-from .breaks import OFF, OTHERS, Seen
 from .graph import Pair
+from .mend.breaks import OFF, OTHERS, Seen
 from .verdict import Answer
 
 LENGTHS = (10 / 30, 16 / 30)

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from ..align.likelihood import APART
+from ..align.evidence import APART
 from ..compute.threads import MapLike
 from ..costs.epipolar import EpipolarDistance
 from ..costs.linear import Cosine
@@ -42,7 +42,7 @@ CLEARLY = 0.3
 """Share of its evidence by which the time that wins must be ahead of every other."""
 
 
-def contested(jobs: list[Job], verdict: Verdict, map: MapLike) -> dict[Pair, Answer]:
+def contested(jobs: Sequence[Job], verdict: Verdict, map: MapLike) -> dict[Pair, Answer]:
     """The pairs of doubtful videos whose doubts are :data:`NOISY`, decided by matches made at each time that competes.
 
     Every peak of a pair's scan gets matches of its own, an answer from these, and their evidence (nats a match times
@@ -56,7 +56,7 @@ def contested(jobs: list[Job], verdict: Verdict, map: MapLike) -> dict[Pair, Ans
     return {pair: best for pair, best in winners.items() if best is not None}
 
 
-def at_peaks(jobs: list[Job], answers: Mapping[Pair, Answer], map: MapLike) -> dict[Pair, list[Answer]]:
+def at_peaks(jobs: Sequence[Job], answers: Mapping[Pair, Answer], map: MapLike) -> dict[Pair, list[Answer]]:
     """The answers of pairs at each peak of their scans, by matches that are made there; without those that fail."""
     tasks = [again for job in jobs for again in at_each(job, answers[job.pair].scanned.hypotheses[:, 0])]
     found: dict[Pair, list[Answer]] = {}
@@ -103,7 +103,7 @@ def at_each(job: Job, times: Iterable[float]) -> list[Job]:
     return [dataclasses.replace(job, matcher=at_known_times(job.matcher, Clock(float(t), 1.0))) for t in times]
 
 
-def rematching(jobs: list[Job], verdict: Verdict) -> list[Job]:
+def rematching(jobs: Sequence[Job], verdict: Verdict) -> list[Job]:
     """The pairs between trusted videos of one component, to be matched at their synchronised times."""
     again = []
     for job in jobs:

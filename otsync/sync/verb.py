@@ -4,21 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import numpy as np
 
-from ..align.likelihood import LikelihoodScan, may_be_another_time
+from ..align.another_time import may_be_another_time
+from ..align.likelihood import LikelihoodScan
 from ..align.slot import Aligner, AlignerLike
 from ..align.vouch import scan_of
 from ..clocks.common import nominal_fps
 from ..clocks.shutter import at_frame_times
 from ..compute.threads import MapLike, blas_for
-from ..epipolar.breaks import find_breaks
-from ..epipolar.refine import EpipolarRefine
 from ..epipolar.scan import EpipolarScan
-from ..epipolar.steady import unsteady
 from ..frames import OwnFrames
 from ..match.slot import Matcher, MatcherLike
 from ..refine.slot import Rate, Refiner, RefinerLike
@@ -26,10 +24,13 @@ from ..refine.splines import SplineRefine
 from ..types import Alignment, Break, Clock, Matches, Offsets, Status, TrackSet
 from ..types.checks import check_whole
 from ..types.trust import Trust
-from .breaks import MOST, SAME_MOMENT, mended
 from .graph import Graph, Pair
+from .hearing import Hearing
 from .lags import Lag, lag_of, lagging, with_lags
-from .mending import ByMotion, cut_where_it_holds, doubted, mend_by_cuts, mend_by_windows, mend_clocks, on_own_clock
+from .mend.pixels import mended_in_pixels, without_unsteady
+from .mend.proofs import cut_where_it_holds
+from .mend.verb import mend_by_cuts, mend_by_windows, mend_clocks
+from .mend.ways import ByMotion
 from .method import Method
 from .own_frames import Frames, refuse_common, solver_from, synchronize_own
 from .pairs import Job, Refit, run, run_refit, with_rate
@@ -104,7 +105,6 @@ def synchronize(
             t.check(f"tracks[{v}]", xyz=False, features=True)
     started = time.perf_counter()
     tracks = [at_frame_times(t) for t in tracks]
-    original = list(tracks)
     graph = chosen_method.graph or Graph()
     centre = most_seen(tracks) if chosen is None else chosen
     pairs = given_pairs(matches, tracks) if matches is not None else graph.pairs(len(tracks), centre)
@@ -113,216 +113,108 @@ def synchronize(
         for pair in pairs
     ]
 
-    def refit(tasks: list[tuple[Answer, float, float]]) -> list[Alignment]:
-        return list(map(run_refit, [Refit.of(*task, tracks, refining) for task in tasks])) if tasks else []
+    def judged(answers: Sequence[Answer], mended: Sequence[TrackSet]) -> Verdict:
+        def refit(tasks: list[tuple[Answer, float, float]]) -> list[Alignment]:
+            return list(map(run_refit, [Refit.of(*task, mended, refining) for task in tasks])) if tasks else []
 
-    def judged(answers: Sequence[Answer]) -> Verdict:
-        return judge(len(tracks), answers, chosen, centre, graph, refining.trust, refit)
+        return judge(len(mended), answers, chosen, centre, graph, refining.trust, refit)
 
     rematched = times if matches is None else 0
     with blas_for(max(len(t) for t in tracks)):
-        jobs, verdict, broken = _answered(jobs, tracks, judged, map, rematched, aligning)
+        hearing = _with_clocks_mended(Hearing.begun(jobs, tracks, judged, map), rematched)
+        hearing = _with_returns_heard(hearing, tracks, aligning)
         if isinstance(aligning, EpipolarScan):
-            verdict = _mended_in_pixels(jobs, verdict, tracks, aligning, refining, judged, map, broken)
-            verdict = _without_unsteady(verdict, tracks, aligning, judged)
-            verdict = _with_off_rates_told(verdict, refining.trust, judged)
+            hearing = mended_in_pixels(hearing, aligning, refining)
+            hearing = without_unsteady(hearing, aligning)
+            hearing = _with_off_rates_told(hearing, refining.trust)
         else:
-            verdict = with_parts_checked(verdict, tracks, judged)
-            verdict = with_witnesses_heard(verdict, jobs, broken, rematched > 0, refining.trust.parted, judged, map)
-        cut = cut_where_it_holds(verdict.answers, original, tracks, broken)
-        if cut:
-            verdict = judged([doubted(a) if a.pair in cut else a for a in verdict.answers])
-        lags = list(map(lag_of, tracks))
-        lagged = with_lags(verdict.answers, lags, refining.trust.lag)
+            hearing = with_parts_checked(hearing)
+            hearing = with_witnesses_heard(hearing, rematched > 0, refining.trust.parted)
+        hearing = hearing.doubted(cut_where_it_holds(hearing.answers, tracks, hearing.tracks, hearing.broken))
+        lags = list(map(lag_of, hearing.tracks))
+        lagged = with_lags(hearing.answers, lags, refining.trust.lag)
         if lagged is not None:
-            verdict = judged(lagged)
-        return to_offsets(original, verdict, time.perf_counter() - started, broken, lags)
+            hearing = hearing.judged(lagged)
+        return to_offsets(tracks, hearing.verdict, time.perf_counter() - started, hearing.broken, lags)
 
 
-def _answered(
-    jobs: list[Job],
-    tracks: list[TrackSet],
-    judged: Callable[[Sequence[Answer]], Verdict],
-    map: MapLike,
-    times: int,
-    aligner: Aligner,
-) -> tuple[list[Job], Verdict, dict[int, tuple[Break, ...]]]:
-    """All pairs answered, clocks that break put right (``tracks`` in place), and pairs matched once more at the times
-    that were found, so often; mended ones are asked as they were filmed whether they may be of another time.
-
-    Returns:
-        The work on the pairs as it is then, the verdict, and the breaks of each video that was mended.
+def _with_clocks_mended(hearing: Hearing, times: int) -> Hearing:
+    """Clocks that break put right, by motion, by pieces, and by matches that are made at the times that were found:
+    windows where a clock is doubtful; then all pairs are matched ``times`` times more.
     """
-    broken: dict[int, tuple[Break, ...]] = {}
-    verdict = judged(list(map(run, jobs)))
-    filmed = list(tracks)
-    jobs, verdict = mend_clocks(jobs, verdict, tracks, judged, map, ByMotion(), broken)
-    jobs, verdict = mend_by_cuts(jobs, verdict, tracks, judged, map, broken)
-    if times:
-        jobs, verdict = _at_their_times(jobs, verdict, tracks, judged, map, times, broken)
-    return jobs, _with_returns_heard(verdict, filmed, broken, aligner, judged), broken
-
-
-def _at_their_times(
-    jobs: list[Job],
-    verdict: Verdict,
-    tracks: list[TrackSet],
-    judged: Callable[[Sequence[Answer]], Verdict],
-    map: MapLike,
-    times: int,
-    broken: dict[int, tuple[Break, ...]],
-) -> tuple[list[Job], Verdict]:
-    """Pairs matched at the times that were found: by windows where a clock is doubtful, then ``times`` times more."""
-    jobs, verdict, timed = mend_by_windows(jobs, verdict, tracks, judged, map, broken)
-    settled = contested(jobs, verdict, map)
-    if settled:
-        verdict = judged([settled.get(a.pair, a) for a in verdict.answers])
+    hearing = mend_by_cuts(mend_clocks(hearing, ByMotion()))
+    if not times:
+        return hearing
+    hearing, timed = mend_by_windows(hearing)
+    hearing = hearing.told(contested(hearing.jobs, hearing.verdict, hearing.map))
     for _ in range(times):
-        again = [job for job in rematching(jobs, verdict) if job.pair not in timed]
+        again = [job for job in rematching(hearing.jobs, hearing.verdict) if job.pair not in timed]
         if not again:
             break
-        fresh = {answer.pair: answer for answer in map(run, again)}
-        verdict = judged([_still_broken(fresh.get(a.pair, a), a) for a in verdict.answers])
-    return jobs, verdict
+        first = {a.pair: a for a in hearing.answers}
+        fresh = {answer.pair: answer for answer in hearing.map(run, again)}
+        hearing = hearing.told({pair: _still_broken(answer, first[pair]) for pair, answer in fresh.items()})
+    return hearing
 
 
-def _with_returns_heard(
-    verdict: Verdict,
-    filmed: Sequence[TrackSet],
-    broken: Mapping[int, tuple[Break, ...]],
-    aligner: Aligner,
-    judged: Callable[[Sequence[Answer]], Verdict],
-) -> Verdict:
-    """The verdict, with pairs of mended videos ambiguous that may be another time's by what the videos show as filmed.
+def _with_returns_heard(hearing: Hearing, filmed: Sequence[TrackSet], aligner: Aligner) -> Hearing:
+    """Pairs of mended videos ambiguous that may be another time's by what the videos show as filmed.
 
     A clock that is mended, or cut, leaves the scan less to compare a video with itself by; what was seen of it is still
     true.
     """
     scan = scan_of(aligner)
     heard = {}
-    for a in verdict.answers:
+    for a in hearing.answers:
         stats = a.scanned.stats
-        if not broken.keys() & set(a.pair) or not a.finite or stats.get("another_time", 1.0) > 0:
+        if hearing.broken.keys().isdisjoint(a.pair) or not a.finite or stats.get("another_time", 1.0) > 0:
             continue
         found = scan.another_time(
             filmed[a.pair[0]], filmed[a.pair[1]], a.matches, Clock(a.refined.offset, a.refined.rate)
         )
         if may_be_another_time(found["returning"], max(found["likeness"], stats["likeness"]), scan.trust):
             heard[a.pair] = a.that_may_be_another_time()
-    return judged([heard.get(a.pair, a) for a in verdict.answers]) if heard else verdict
+    return hearing.told(heard)
 
 
-def _mended_in_pixels(
-    jobs: Sequence[Job],
-    verdict: Verdict,
-    tracks: list[TrackSet],
-    aligner: EpipolarScan,
-    refining: Refiner,
-    judged: Callable[[Sequence[Answer]], Verdict],
-    map: MapLike,
-    broken: dict[int, tuple[Break, ...]],
-) -> Verdict:
-    """The verdict, with clocks that break put right (``tracks`` and ``broken`` in place), or their pairs doubted."""
-    refiner = refining if isinstance(refining, EpipolarRefine) else EpipolarRefine()
-    for _ in range(MOST):
-        found = find_breaks(aligner, refiner, tracks, _matches(verdict), verdict.x, broken)
-        new = [f for f in found if f.broke is not None and not _known(f.broke, broken.get(f.video, ()))]
-        if not new:
-            break
-        surest = max(new, key=lambda f: f.gain)
-        v, broke = surest.video, surest.broke
-        assert broke is not None
-        earlier = broken.get(v, ())
-        tracks[v] = mended(tracks[v], (broke,))
-        broken[v] = (*earlier, on_own_clock(broke, earlier))
-        jobs = [dataclasses.replace(j, a=tracks[j.pair[0]], b=tracks[j.pair[1]]) for j in jobs]
-        fresh = {answer.pair: answer for answer in map(run, [j for j in jobs if v in j.pair])}
-        verdict = judged([fresh.get(a.pair, a) for a in verdict.answers])
-    else:
-        found = find_breaks(aligner, refiner, tracks, _matches(verdict), verdict.x, broken)
-    breaking = {f.video for f in found}
-    return judged([doubted(a) if breaking & set(a.pair) else a for a in verdict.answers]) if breaking else verdict
-
-
-def _matches(verdict: Verdict) -> dict[Pair, Matches]:
-    """The matches of all pairs, the surest first."""
-    surest = sorted(verdict.answers, key=lambda a: (not a.refined.status.ok, -a.scanned.stats.get("evidence", 0.0)))
-    return {a.pair: a.matches for a in surest if len(a.matches)}
-
-
-def _known(found: Break, earlier: Sequence[Break]) -> bool:
-    """Whether a break, told on a mended clock, is one that was mended."""
-    at = on_own_clock(found, earlier).at
-    return any(abs(at - b.at) < SAME_MOMENT for b in earlier)
-
-
-def _without_unsteady(
-    verdict: Verdict,
-    tracks: Sequence[TrackSet],
-    aligner: EpipolarScan,
-    judged: Callable[[Sequence[Answer]], Verdict],
-) -> Verdict:
-    """The verdict, with all pairs of videos doubted whose windows are off against all others alike."""
-    sound = {a.pair: a.matches for a in verdict.answers if a.sound}
-    breaking = set(unsteady(aligner, tracks, sound, verdict.x))
-    if not breaking:
-        return verdict
-    return judged([doubted(a) if breaking & set(a.pair) else a for a in verdict.answers])
-
-
-def _with_off_rates_told(verdict: Verdict, trust: Trust, judged: Callable[[Sequence[Answer]], Verdict]) -> Verdict:
-    """The verdict, with the pairs of videos whose clocks run otherwise than declared flagged, or less sure."""
-    answers = verdict.answers
-    off = off_rates(answers, verdict.reference, trust)
+def _with_off_rates_told(hearing: Hearing, trust: Trust) -> Hearing:
+    """The pairs of videos whose clocks run otherwise than declared flagged, or less sure."""
+    answers = hearing.answers
+    off = off_rates(answers, hearing.verdict.reference, trust)
     for clock in off:
         answers = tuple(clock.told(a) for a in answers)
-    return judged(answers) if off else verdict
+    return hearing.judged(answers) if off else hearing
 
 
-def with_parts_checked(
-    verdict: Verdict, tracks: Sequence[TrackSet], judged: Callable[[Sequence[Answer]], Verdict]
-) -> Verdict:
-    """The verdict, with pairs doubted whose answer does not hold in a part of what both videos share."""
+def with_parts_checked(hearing: Hearing) -> Hearing:
+    """Pairs doubted whose answer does not hold in a part of what both videos share."""
     parts = {}
-    for a in verdict.answers:
-        first, second = (tracks[v] for v in a.pair)
+    for a in hearing.answers:
+        first, second = (hearing.tracks[v] for v in a.pair)
         if a.refined.status.ok and a.finite and first.xyz is not None and second.xyz is not None:
             parts[a.pair] = broken_part(a, first, second)
     broken = {pair: part for pair, part in parts.items() if part is not None}
-    if not broken:
-        return verdict
-    unsure = unvouched(broken, verdict.answers, tracks)
-    return judged([doubted(a) if a.pair in unsure else a for a in verdict.answers])
+    return hearing.doubted(unvouched(broken, hearing.answers, hearing.tracks)) if broken else hearing
 
 
-def with_witnesses_heard(
-    verdict: Verdict,
-    jobs: Sequence[Job],
-    broken: Mapping[int, tuple[Break, ...]],
-    rest: bool,
-    limit: float,
-    judged: Callable[[Sequence[Answer]], Verdict],
-    map: MapLike,
-) -> Verdict:
-    """The verdict, with pairs doubted of which a part of the scene tells another time.
+def with_witnesses_heard(hearing: Hearing, rest: bool, limit: float) -> Hearing:
+    """Pairs doubted of which a part of the scene tells another time.
 
     What is wrong with a video is so in all its pairs: of many, those with the most evidence are asked first, and where
-    one of them is doubted the others of its videos, too.
+    one of them is doubted the others of its videos, too. Of breaks that were mended each side is asked for the time of
+    the other one.
 
     Args:
-        broken: the breaks that were mended, of which each side is asked for the time of the other one.
         rest: whether what an answer does not explain is asked, too.
     """
-    answers = {a.pair: a for a in verdict.answers if a.finite and (a.refined.status.ok or _only_returns(a))}
-    asked = [job for job in jobs if job.pair in answers and job.a.xyz is not None and job.b.xyz is not None]
+    answers = {a.pair: a for a in hearing.answers if a.finite and (a.refined.status.ok or _only_returns(a))}
+    asked = [job for job in hearing.jobs if job.pair in answers and job.a.xyz is not None and job.b.xyz is not None]
     first = surest(answers, asked)
-    doubted = contradicted(answers, first, broken, rest, limit, map)
+    doubted = contradicted(answers, first, hearing.broken, rest, limit, hearing.map)
     videos = {v for pair in doubted for v in pair}
     more = [job for job in asked if job not in first and videos & set(job.pair)]
-    doubted |= contradicted(answers, more, broken, rest, limit, map)
-    if not doubted:
-        return verdict
-    return judged([lagging(a) if a.pair in doubted else a for a in verdict.answers])
+    doubted |= contradicted(answers, more, hearing.broken, rest, limit, hearing.map)
+    return hearing.told({pair: lagging(answers[pair]) for pair in doubted})
 
 
 def _only_returns(answer: Answer) -> bool:
@@ -334,7 +226,7 @@ def _still_broken(fresh: Answer, first: Answer) -> Answer:
     """Matches that were made at one offset agree with it: they do not lift the doubt whether there is only one."""
     if Status.BROKEN_CLOCK not in first.refined.flags:
         return fresh
-    return doubted(fresh)
+    return fresh.doubted()
 
 
 def _without_common_frame(

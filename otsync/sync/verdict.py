@@ -92,6 +92,10 @@ class Answer:
         """The answer with one more flag."""
         return replace(self, refined=replace(self.refined, flags=in_order((*self.refined.flags, flag))))
 
+    def doubted(self) -> Answer:
+        """The answer with the flag of a clock that breaks otherwise than it was mended."""
+        return self.flagged(Status.BROKEN_CLOCK)
+
     def that_may_be_another_time(self) -> Answer:
         """The answer with the scan's doubt whether it is of another time, also where it is fitted anew."""
 

@@ -28,12 +28,12 @@ from ..refine.slot import Refiner
 from ..refine.splines import SplineRefine
 from ..refine.unrefined import Unrefined
 from ..types import Alignment, Break, Clock, Matches, Status, TrackSet
-from .breaks import Seen
 from .graph import Pair
+from .mend.breaks import Seen
+from .mend.windows import EVERY, NEAR, Windows
 from .pairs import Job, run
 from .rematching import at_each, evidence_of
 from .verdict import Answer
-from .windows import EVERY, NEAR, Windows
 
 GROUPS, FEWEST = 6, 5
 """Neighbourhoods that are asked, and matches of one at least."""

@@ -14,7 +14,7 @@ from otsync.io import Scene
 from otsync.io.mend import cut, on_mended_clocks
 from otsync.progress import Deadline, Progress
 from otsync.recordings.stages import Stages
-from otsync.sync.breaks import mended
+from otsync.sync.mend.breaks import mended
 from otsync.types import Clock, Offsets, TrackSet
 from recon.backdrop.fit import StaticFit, with_backdrop
 from recon.footage.bends import bent, bent_tracks, chosen_bends, motion_of, wave

@@ -167,7 +167,7 @@ BREAKS = (
     ),
     Break(
         "stairs-clock-of-the-other",
-        "otsync/sync/breaks.py",
+        "otsync/sync/mend/breaks.py",
         "raw[1].around(when - first, STAIRS)",
         "raw[1].around(when, STAIRS)",
         ("tests/otsync/sync/test_breaks.py",),
@@ -423,7 +423,7 @@ BREAKS = (
     ),
     Break(
         "places-late-sign",
-        "otsync/sync/places.py",
+        "otsync/sync/mend/places.py",
         "t = clock.own(a.times - late)",
         "t = clock.own(a.times + late)",
         PLACES,
@@ -431,7 +431,7 @@ BREAKS = (
     ),
     Break(
         "places-no-gap",
-        "otsync/sync/places.py",
+        "otsync/sync/mend/places.py",
         "gap = max(grows, 0)",
         "gap = 0",
         PLACES,
@@ -439,7 +439,7 @@ BREAKS = (
     ),
     Break(
         "places-step-sign",
-        "otsync/sync/places.py",
+        "otsync/sync/mend/places.py",
         "offset -= float(np.clip(g.sum() / H.sum(), -MARGIN, MARGIN))",
         "offset += float(np.clip(g.sum() / H.sum(), -MARGIN, MARGIN))",
         PLACES,
@@ -447,7 +447,7 @@ BREAKS = (
     ),
     Break(
         "places-own-scatter",
-        "otsync/sync/places.py",
+        "otsync/sync/mend/places.py",
         "return offset, math.hypot(sigma, student * float(np.sqrt(np.mean(np.square(off)))))",
         "return offset, sigma",
         PLACES,
@@ -504,7 +504,7 @@ BREAKS = (
     ),
     Break(
         "windows-gap-asked",
-        "otsync/sync/windows.py",
+        "otsync/sync/mend/windows.py",
         "(near - near[:, [middle]]) * self.whole[:, None]",
         "near - near[:, [middle]]",
         WINDOWS,
@@ -512,7 +512,7 @@ BREAKS = (
     ),
     Break(
         "windows-steady-without-support",
-        "otsync/sync/windows.py",
+        "otsync/sync/mend/windows.py",
         "supported = usual > 0 and self.whole.any() and here[self.whole].min() >= SUPPORTED * usual",
         "supported = True",
         WINDOWS,
@@ -520,7 +520,7 @@ BREAKS = (
     ),
     Break(
         "windows-parts-exchanged",
-        "otsync/sync/windows.py",
+        "otsync/sync/mend/windows.py",
         "own if split.behind else own[::-1]",
         "own[::-1] if split.behind else own",
         WINDOWS,
@@ -528,15 +528,15 @@ BREAKS = (
     ),
     Break(
         "mend-freed-though-fast",
-        "otsync/sync/mending.py",
-        "for pair, readings in told.items() if _even(readings[0], tracks, broken)",
+        "otsync/sync/mend/verb.py",
+        "for pair, readings in told.items() if _even(readings[0], hearing)",
         "for pair, readings in told.items()",
         WINDOWS,
         "a change of speed that was taken for lost frames is trusted",
     ),
     Break(
         "mend-first-reading-only",
-        "otsync/sync/mending.py",
+        "otsync/sync/mend/ways.py",
         "if len(self.told.get(pair, ())) > 1:",
         "if False:",
         WINDOWS,
@@ -769,6 +769,14 @@ BREAKS = (
         "tracks are compared with where a landmark was in its first frame",
     ),
     Break(
+        "match-anchored-first-of-a-moment",
+        "otsync/match/anchored/kernels.py",
+        "for t in range(w * step, min((w + 1) * step, T)):",
+        "for t in range(w * step, w * step + 1):",
+        ANCHORED,
+        "of a moment only the first frame is read: what is seen in another one is gone",
+    ),
+    Break(
         "match-anchored-refused-by-other-names",
         "otsync/match/anchored/solver.py",
         "                    raise refused from None",
@@ -915,7 +923,7 @@ BREAKS = (
     ),
     Break(
         "align-weight-dropped",
-        "otsync/align/likelihood.py",
+        "otsync/align/evidence.py",
         "gain *= weight[:, None]",
         "gain *= weight.mean()",
         (*ALIGN, *UNBALANCED),
@@ -923,7 +931,7 @@ BREAKS = (
     ),
     Break(
         "align-noise-of-unseen",
-        "otsync/align/likelihood.py",
+        "otsync/align/evidence.py",
         "least = np.where(count > 0, residual, np.inf).min(1)[known]",
         "least = residual.min(1)[known]",
         ALIGN,
@@ -1190,7 +1198,7 @@ BREAKS = (
     ),
     Break(
         "breaks-return-freed",
-        "otsync/sync/mending.py",
+        "otsync/sync/mend/ways.py",
         'if windows.steady and not any(stats.get("returns") for stats in scans):',
         "if windows.steady:",
         ("tests/otsync/sync/test_breaks.py",),
@@ -1246,7 +1254,7 @@ BREAKS = (
     ),
     Break(
         "replay-is-lost-frames",
-        "otsync/sync/breaks.py",
+        "otsync/sync/mend/breaks.py",
         "return None if moments.whole is None else (1, moments.whole)",
         "return None",
         ("tests/otsync/sync/test_breaks.py",),
@@ -1254,7 +1262,7 @@ BREAKS = (
     ),
     Break(
         "replay-in-the-other-video",
-        "otsync/sync/breaks.py",
+        "otsync/sync/mend/breaks.py",
         "return (1, turn) if turned > ordered else (0, moments.whole)",
         "return (1, turn)",
         ("tests/otsync/sync/test_breaks.py",),
@@ -1262,7 +1270,7 @@ BREAKS = (
     ),
     Break(
         "replay-gap-of-all",
-        "otsync/sync/breaks.py",
+        "otsync/sync/mend/breaks.py",
         "missing = min(missing, len(t) - when)",
         "missing = max(missing, 1)",
         ("tests/otsync/sync/test_breaks.py",),
@@ -1302,7 +1310,7 @@ BREAKS = (
     ),
     Break(
         "few-seconds-do-not-differ",
-        "otsync/sync/breaks.py",
+        "otsync/sync/mend/breaks.py",
         "return math.hypot(own, off) if off > 0 else UNTOLD * own",
         "return own",
         ("tests/otsync/sync/test_breaks.py",),
@@ -1520,22 +1528,22 @@ BREAKS = (
     Break(
         "cuts-unheard",
         "otsync/sync/verb.py",
-        "        if cut:",
-        "        if False:",
+        "hearing = hearing.doubted(cut_where_it_holds(",
+        "hearing = hearing.doubted(() and cut_where_it_holds(",
         ("tests/otsync/clocks/test_cuts.py",),
         "a clock that is mended elsewhere than its video is cut is trusted",
     ),
     Break(
         "cuts-on-the-mended-clock",
         "otsync/sync/verb.py",
-        "cut_where_it_holds(verdict.answers, original, tracks, broken)",
-        "cut_where_it_holds(verdict.answers, tracks, tracks, broken)",
+        "cut_where_it_holds(hearing.answers, tracks, hearing.tracks",
+        "cut_where_it_holds(hearing.answers, hearing.tracks, hearing.tracks",
         ("tests/otsync/clocks/test_cuts.py",),
         "cuts are sought on clocks that were mended, where no break explains them",
     ),
     Break(
         "cuts-of-what-jumps-for-all",
-        "otsync/sync/mending.py",
+        "otsync/sync/mend/proofs.py",
         "if not runs_on(answer, tracks[a], tracks[b], float(before), float(behind)):",
         "if True:",
         ("tests/otsync/clocks/test_cuts.py",),
@@ -1543,7 +1551,7 @@ BREAKS = (
     ),
     Break(
         "cuts-in-a-gap",
-        "otsync/sync/mending.py",
+        "otsync/sync/mend/proofs.py",
         "np.stack([behind - 1, behind], 1)",
         "np.stack([behind, behind], 1)",
         ("tests/otsync/clocks/test_cuts.py",),
@@ -1639,9 +1647,9 @@ BREAKS = (
     ),
     Break(
         "pixels-doubt-unheard",
-        "otsync/sync/verb.py",
-        "breaking = {f.video for f in found}",
-        "breaking: set[int] = set()",
+        "otsync/sync/mend/pixels.py",
+        "hearing.doubted_videos({f.video for f in found})",
+        "hearing.doubted_videos(set())",
         ("tests/otsync/epipolar/test_breaks.py",),
         "a clock that breaks and could not be mended is trusted",
     ),
@@ -1679,7 +1687,7 @@ BREAKS = (
     ),
     Break(
         "cuts-do-not-decide",
-        "otsync/sync/breaks.py",
+        "otsync/sync/mend/breaks.py",
         "votes = (1.0, 0.0) if cut is None else (0.0, 1.0)",
         "pass",
         ("tests/otsync/clocks/test_cuts.py", "tests/otsync/sync/test_breaks.py"),
@@ -1695,7 +1703,7 @@ BREAKS = (
     ),
     Break(
         "pieces-in-doubt",
-        "otsync/sync/windows.py",
+        "otsync/sync/mend/windows.py",
         "set(a.refined.flags) <= OF_PIECES",
         "True",
         ("tests/otsync/clocks/test_cuts.py",),
@@ -1703,7 +1711,7 @@ BREAKS = (
     ),
     Break(
         "pieces-in-the-order-of-the-file",
-        "otsync/sync/windows.py",
+        "otsync/sync/mend/windows.py",
         "if self.which == 1 and latest - earliest < 2 * (first - second):",
         "if False:",
         ("tests/otsync/clocks/test_cuts.py",),
@@ -2120,7 +2128,7 @@ BREAKS = (
     ),
     Break(
         "returning-within-reach",
-        "otsync/align/likelihood.py",
+        "otsync/align/another_time.py",
         "later = later[unseen(answer + later) | unseen(answer - later)] if len(reach) else later[:0]",
         "later = later[later > 0]",
         ("tests/otsync/align/test_likelihood.py",),

@@ -1,4 +1,4 @@
-"""The coarsest level: partial fused Gromov-Wasserstein between some 175 anchors of each video, by POT."""
+"""The coarsest level: partial fused Gromov-Wasserstein between some 140 anchors of each video, by POT."""
 
 from __future__ import annotations
 

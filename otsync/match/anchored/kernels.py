@@ -40,22 +40,32 @@ def visible_means(xyz, seen, mean, i0, i1):
 
 
 @kernel()
-def to_columns(xyz, seen, index, origin, unit, far, columns, weight, i0, i1):
+def to_columns(xyz, seen, index, origin, unit, far, step, columns, weight, i0, i1):
     """``(xyz - origin) / unit`` of tracks ``index[i0:i1]``, clipped to ±far, time-major; 0, weight 0 where unseen.
 
-    xyz (N,T,3), seen (N,T); columns (3,T,M), weight (T,M) float32.
+    Of every ``step`` frames the mean of those that show a track. xyz (N,T,3), seen (N,T); columns (3,W,M), weight (W,M)
+    float32.
     """
+    T = seen.shape[1]
     for i in range(i0, i1):
         n = index[i]
-        for t in range(seen.shape[1]):
-            if seen[n, t]:
-                for c in range(3):
-                    columns[c, t, i] = min(max((xyz[n, t, c] - origin[c]) / unit, -far), far)
-                weight[t, i] = 1.0
+        for w in range(len(weight)):
+            x = y = z = 0.0
+            count = 0
+            for t in range(w * step, min((w + 1) * step, T)):
+                if seen[n, t]:
+                    x += xyz[n, t, 0]
+                    y += xyz[n, t, 1]
+                    z += xyz[n, t, 2]
+                    count += 1
+            if count > 0:
+                columns[0, w, i] = min(max((x / count - origin[0]) / unit, -far), far)
+                columns[1, w, i] = min(max((y / count - origin[1]) / unit, -far), far)
+                columns[2, w, i] = min(max((z / count - origin[2]) / unit, -far), far)
+                weight[w, i] = 1.0
             else:
-                for c in range(3):
-                    columns[c, t, i] = 0.0
-                weight[t, i] = 0.0
+                columns[0, w, i] = columns[1, w, i] = columns[2, w, i] = 0.0
+                weight[w, i] = 0.0
 
 
 @kernel()

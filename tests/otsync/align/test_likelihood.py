@@ -9,17 +9,10 @@ import numpy as np
 import pytest
 
 from otsync import DTW, LikelihoodScan, Matches, Refused, Status, TrackSet, align
-from otsync.align.likelihood import (
-    Curves,
-    Signal,
-    by_sample,
-    evidence,
-    noise_floor,
-    returning,
-    statistics,
-    velocity_score,
-)
+from otsync.align.another_time import by_sample, returning
+from otsync.align.evidence import Curves, evidence, noise_floor, statistics, velocity_score
 from otsync.align.peaks import separate_peaks, vertex
+from otsync.align.signal import Signal
 from otsync.align.windows import local_curves
 from otsync.bench.hard_cases.graphs import video
 from otsync.clocks.common import common_clock
@@ -271,7 +264,7 @@ def test_a_few_matches_at_a_time_say_what_all_of_them_say(monkeypatch):
         return [slice(k, k + 3) for k in range(0, rows, 3)]
 
     # ``otsync.align`` is a function, too, which hides the package from a path in words
-    scan, windows = (sys.modules[f"otsync.align.{name}"] for name in ("likelihood", "windows"))
+    scan, windows = (sys.modules[f"otsync.align.{name}"] for name in ("evidence", "windows"))
     for module in (scan, windows):
         monkeypatch.setattr(module, "blocks", three_at_a_time)
     monkeypatch.setattr(scan, "DIRECT", 0)  # windows at the peaks alone
@@ -367,7 +360,7 @@ def test_a_few_tracks_that_are_seen_again_tell_nothing_of_the_others():
 
 def test_tracks_of_a_long_clip_that_are_never_seen_again(monkeypatch):
     """By spectra no lag shows a match in both then: nothing returns, and nothing fails."""
-    monkeypatch.setattr(sys.modules["otsync.align.likelihood"], "DIRECT", 0)
+    monkeypatch.setattr(sys.modules["otsync.align.evidence"], "DIRECT", 0)
     world = wiggle(np.random.default_rng(0), 12, 600)
     seen = np.zeros((12, 600), bool)
     seen[:, 280:340] = True

@@ -174,10 +174,10 @@ def test_a_number_is_changed_where_it_is_imported_and_not_where_another_has_its_
     """GAP of breaks and GAP of another module are two limits, even where they are equal."""
     from types import ModuleType
 
-    from otsync.sync import breaks
+    from otsync.sync.mend import breaks
 
     for name, source in (
-        ("otsync.importer", "from otsync.sync.breaks import LIMIT"),
+        ("otsync.importer", "from otsync.sync.mend.breaks import LIMIT"),
         ("otsync.namesake", "LIMIT = 200"),
     ):
         module = ModuleType(name)
@@ -185,10 +185,13 @@ def test_a_number_is_changed_where_it_is_imported_and_not_where_another_has_its_
         sys.modules[name] = module
     try:
         with pytest.MonkeyPatch.context() as patch:
-            sources = {"otsync.importer": "from otsync.sync.breaks import LIMIT", "otsync.namesake": "LIMIT = 200\n"}
+            sources = {
+                "otsync.importer": "from otsync.sync.mend.breaks import LIMIT",
+                "otsync.namesake": "LIMIT = 200\n",
+            }
             real = thresholds.inspect.getsource
             patch.setattr(thresholds.inspect, "getsource", lambda m: sources.get(m.__name__) or real(m))
-            with thresholds.limit_set("sync.breaks.LIMIT", 100):
+            with thresholds.limit_set("sync.mend.breaks.LIMIT", 100):
                 assert breaks.LIMIT == 100 and sys.modules["otsync.importer"].LIMIT == 100
                 assert sys.modules["otsync.namesake"].LIMIT == 200
         assert breaks.LIMIT == sys.modules["otsync.importer"].LIMIT == 200

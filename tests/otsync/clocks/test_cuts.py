@@ -12,11 +12,11 @@ from otsync.align.likelihood import LikelihoodScan
 from otsync.bench.trust.worlds import CLASSES, times_given
 from otsync.clocks.cuts import BLOCK, CLEAR_PATH, Steps, calm, unexplained
 from otsync.refine.splines import SplineRefine
-from otsync.sync.breaks import mended
-from otsync.sync.mending import cut_where_it_holds
+from otsync.sync.mend.breaks import mended
+from otsync.sync.mend.proofs import cut_where_it_holds
+from otsync.sync.mend.windows import Pieces
 from otsync.sync.pairs import Job, run
 from otsync.sync.verdict import Answer
-from otsync.sync.windows import Pieces
 from otsync.types import Alignment, Break, TrackSet
 from tests.otsync.refine.test_common_error import smooth
 

@@ -184,7 +184,7 @@ def test_both_pieces_vouch_for_one_offset_or_none_does():
 @pytest.mark.parametrize("broke", [None, Break(2.0, 0.5)])
 def test_a_break_that_cannot_be_mended_is_flagged(monkeypatch, broke):
     """Nor is one that is found again where it was mended."""
-    monkeypatch.setattr("otsync.sync.verb.find_breaks", lambda *job: [Found(1, 30.0, 60.0, broke)])
+    monkeypatch.setattr("otsync.sync.mend.pixels.find_breaks", lambda *job: [Found(1, 30.0, 60.0, broke)])
     offsets = solved(worlds(np.arange(120.0), 4))
     assert Status.BROKEN_CLOCK in offsets.flags[1] and len(offsets.breaks[1]) == (broke is not None)
 

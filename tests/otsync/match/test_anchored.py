@@ -397,6 +397,27 @@ def test_the_default_goes_by_size():
 # --- compiled loops against numpy ---------------------------------------------------------------------------------
 
 
+@given(st.integers(0, 2**32 - 1), st.sampled_from([(70, 30.0, 2), (150, 30.0, 3), (60, 30.0, 1), (130, 240.0, 4)]))
+def test_a_moment_is_the_mean_of_its_frames_that_show_a_track(seed, clip):
+    """Of a tenth of a second, if the clip has moments enough; a track that is seen once is seen in one moment."""
+    frames, fps, step = clip
+    rng = np.random.default_rng(seed)
+    xyz, seen = rng.normal(size=(7, frames, 3)), rng.random((7, frames)) < 0.4
+    seen[:, 0] = False
+    seen[0], seen[0, frames - 1] = False, True
+    cloud, _ = clouds(*[TrackSet(xyz, seen, fps=fps)] * 2)
+    found = cloud.columns.transpose(2, 1, 0) * cloud.size + cloud.middle
+    for w, first in enumerate(range(0, frames, step)):
+        part = slice(first, first + step)
+        for k, n in enumerate(cloud.index):
+            shown = seen[n, part]
+            assert cloud.weight[w, k] == shown.any()
+            if shown.any():
+                np.testing.assert_allclose(found[k, w], xyz[n, part][shown].mean(0), atol=1e-5)
+        assert cloud.times[w] == pytest.approx((np.arange(frames) / fps)[part].mean())
+    assert len(cloud.times) == w + 1
+
+
 def test_columns_poses_and_groups_equal_numpy():
     rng = np.random.default_rng(4)
     xyz, seen = rng.normal(size=(40, 9, 3)) * 7 + 100, rng.random((40, 9)) < 0.6

@@ -22,11 +22,12 @@ from otsync.refine.gauss_newton import Fit
 from otsync.refine.splines import SplineRefine
 from otsync.simulate import simulate
 from otsync.simulate.effects import Drop, Freeze, In, Repeats, Replay, SlowMotion
-from otsync.sync.breaks import Suspect, culprit, mended, sigma_of_part
-from otsync.sync.mending import _by, confirmed
+from otsync.sync.mend.breaks import Suspect, culprit, mended, sigma_of_part
+from otsync.sync.mend.proofs import confirmed
+from otsync.sync.mend.ways import by_windows
+from otsync.sync.mend.windows import Windows
 from otsync.sync.pairs import Job, run
 from otsync.sync.verb import jump_sigma
-from otsync.sync.windows import Windows
 from otsync.types import Break, Clock, Offsets, Status, TrackSet, mended_frames, mended_times
 
 
@@ -465,7 +466,7 @@ def test_windows_that_are_steady_lift_no_doubt_whether_motion_comes_back(returns
         Clock(answer.refined.offset), np.arange(5.0), np.arange(-3.0, 4.0), np.eye(7)[[3] * 5], np.ones(5, bool)
     )
     assert even.steady
-    (said,) = _by(even, answer, job, {"returns": 0.0}, {"returns": returns})
+    (said,) = by_windows(even, answer, job, {"returns": 0.0}, {"returns": returns})
     assert (Status.BROKEN_CLOCK in said.refined.flags) == bool(returns)
     assert said.scanned.stats["returns"] == returns
 

@@ -115,7 +115,7 @@ def test_where_another_offset_cannot_be_seen_positions_that_do_not_agree_tell(mo
     world = plain(524, preset="hard", first=(In(1, Drop(10 / 30, at=0.9)),))
     found = synchronize(world.tracks)
     assert found.breaks[1] and world.errors(found)[0].max() < 0.2
-    monkeypatch.setattr("otsync.sync.mending.culprit", lambda named, seen: None)
+    monkeypatch.setattr("otsync.sync.mend.verb.culprit", lambda named, seen: None)
     found = synchronize(world.tracks)
     ends, _ = world.errors(found)
     assert ends.max() > 9 and Status.BROKEN_CLOCK in found.flags[1]

@@ -8,7 +8,7 @@ import pytest
 from otsync import Alignment, Matches, SplineRefine, Status, TrackSet, synchronize
 from otsync.bench.trust.worlds import CLASSES, drawn
 from otsync.simulate.effects import Drop, In
-from otsync.sync.places import LEAST_JUMP, MOST_FRAMES, Part, measured, parts_by_place
+from otsync.sync.mend.places import LEAST_JUMP, MOST_FRAMES, Part, measured, parts_by_place
 from otsync.sync.verdict import Answer
 
 N = 40

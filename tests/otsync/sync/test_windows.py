@@ -11,10 +11,10 @@ from otsync import Status, TrackSet, synchronize
 from otsync.align.likelihood import LikelihoodScan
 from otsync.bench.trust.worlds import CLASSES
 from otsync.refine.splines import SplineRefine
-from otsync.sync.mending import _told
+from otsync.sync.mend.ways import readings_of
+from otsync.sync.mend.windows import EVERY, NEAR, STEADY, Windows, matches_of_parts
 from otsync.sync.pairs import Job, run
 from otsync.sync.rematching import at_each
-from otsync.sync.windows import EVERY, NEAR, STEADY, Windows, matches_of_parts
 from otsync.types import Clock
 
 from .test_places import motion
@@ -83,7 +83,7 @@ def test_too_little_in_common_says_nothing():
 def test_a_long_clip_is_read_window_by_window_with_the_same_answer(jump, monkeypatch):
     asked = job(jump, at=50)
     whole = Windows.of(asked, Clock(1.0))
-    monkeypatch.setattr("otsync.sync.windows.LONG", 10)
+    monkeypatch.setattr("otsync.sync.mend.windows.LONG", 10)
     parts = Windows.of(asked, Clock(1.0))
     np.testing.assert_array_equal(parts.whole, whole.whole)
     np.testing.assert_allclose(parts.evidence, whole.evidence, rtol=0.2, atol=0.02 * whole.evidence.max())
@@ -94,7 +94,7 @@ def test_all_of_an_overlap_may_be_one_window(monkeypatch):
     asked = job(noise=0.03)
     (one,) = Windows.of(asked, Clock(1.0), whole=True).evidence
     assert one.argmax() == len(one) // 2 and not Windows.of(asked, Clock(1.0), whole=True).rivals(0.7)
-    monkeypatch.setattr("otsync.sync.windows.LONG_WINDOW", 10)
+    monkeypatch.setattr("otsync.sync.mend.windows.LONG_WINDOW", 10)
     many = Windows.of(asked, Clock(1.0), whole=True)
     np.testing.assert_array_equal(many.evidence, Windows.of(asked, Clock(1.0)).evidence)
 
@@ -152,7 +152,7 @@ def test_a_time_that_is_hardly_ahead_of_another_is_told_nothing_of():
     asked = job()
     (best,) = (run(once) for once in at_each(asked, (1.0,)))
     later = replace(best, refined=replace(best.refined, offset=best.refined.offset + 1.0))
-    assert _told((asked, [best], best)) and not _told((asked, [best, later], best))
+    assert readings_of((asked, [best], best)) and not readings_of((asked, [best, later], best))
 
 
 def test_a_doubt_that_wrong_matches_make_is_lifted():

@@ -16,7 +16,8 @@ from otsync.bench.trust.worlds import CLASSES, plain
 from otsync.refine.slot import Refiner
 from otsync.refine.splines import SplineRefine
 from otsync.simulate.effects import In, PartLate
-from otsync.sync.breaks import mended
+from otsync.sync.hearing import Hearing
+from otsync.sync.mend.breaks import mended
 from otsync.sync.pairs import Job, run
 from otsync.sync.rematching import at_each
 from otsync.sync.verdict import Answer
@@ -205,9 +206,16 @@ def test_where_a_pair_is_doubted_all_pairs_of_its_videos_are_asked(monkeypatch):
 
     verb = import_module("otsync.sync.verb")
     monkeypatch.setattr(verb, "contradicted", contradicted)
-    verdict = SimpleNamespace(answers=tuple(answers.values()))
-    judged = verb.with_witnesses_heard(verdict, jobs, {}, True, 7.0, lambda told: told, map)
-    doubted = {a.pair for a in judged if Status.LAGGING in a.refined.flags}
+    hearing = Hearing(
+        jobs=tuple(jobs),
+        verdict=SimpleNamespace(answers=tuple(answers.values())),
+        tracks=(),
+        broken={},
+        judge=lambda told, tracks: SimpleNamespace(answers=told),
+        map=map,
+    )
+    judged = verb.with_witnesses_heard(hearing, True, 7.0)
+    doubted = {a.pair for a in judged.answers if Status.LAGGING in a.refined.flags}
     assert doubted == {p for p in answers if 5 in p}
     assert len(asked) == len(set(asked)) < len(answers)
 

@@ -15,18 +15,18 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..align.likelihood import evidence
-from ..clocks.common import CommonClock, nominal_fps, within
-from ..clocks.cuts import CALM, Steps
-from ..clocks.splines import sampled
-from ..costs.linear import Cosine
-from ..match.synchronous import MOMENTS as MOST_MOMENTS
-from ..match.synchronous import SynchronousMatching, apart, joined, longest_seen, mutual, placed, rms_extent
-from ..match.verb import match
-from ..types import Clock, Matches, Status, TrackSet
-from .pairs import Job
-from .rematching import at_known_times, evidence_of
-from .verdict import Answer
+from ...align.evidence import evidence
+from ...clocks.common import CommonClock, nominal_fps, within
+from ...clocks.cuts import CALM, Steps
+from ...clocks.splines import sampled
+from ...costs.linear import Cosine
+from ...match.synchronous import MOMENTS as MOST_MOMENTS
+from ...match.synchronous import SynchronousMatching, apart, joined, longest_seen, mutual, placed, rms_extent
+from ...match.verb import match
+from ...types import Clock, Matches, Status, TrackSet
+from ..pairs import Job
+from ..rematching import at_known_times, evidence_of
+from ..verdict import Answer
 
 LENGTH, STEP = 24 / 30, 12 / 30
 """Seconds of a window, and from one to the next."""

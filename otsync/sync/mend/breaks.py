@@ -12,17 +12,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..clocks.common import readable, strongest
-from ..clocks.cuts import Steps
-from ..clocks.lengths import jumping, lasting
-from ..clocks.splines import TrackSplines
-from ..clocks.stillness import AROUND, pause, pause_of_pictures, picture_frames, stood_still
-from ..refine.gauss_newton import Fit, fit_clock
-from ..refine.splines import SplineRefine
-from ..types import Break, Clock, TrackSet, mended_frames
-from .alike import LEAST_BESIDE, LIMIT, MARGIN, Raw, Usual
+from ...clocks.common import readable, strongest
+from ...clocks.cuts import Steps
+from ...clocks.lengths import jumping, lasting
+from ...clocks.splines import TrackSplines
+from ...clocks.stillness import AROUND, pause, pause_of_pictures, picture_frames, stood_still
+from ...refine.gauss_newton import Fit, fit_clock
+from ...refine.splines import SplineRefine
+from ...types import Break, Clock, TrackSet, mended_frames
+from ..alike import LEAST_BESIDE, LIMIT, MARGIN, Raw, Usual
+from ..verdict import Answer
 from .places import Part, measured
-from .verdict import Answer
 
 WINDOW = 14 / 30
 """Half window, s, of the detrending in the fits of the parts."""

@@ -14,12 +14,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.special import stdtrit
 
-from ..clocks.common import readable, strongest
-from ..clocks.splines import TrackSplines
-from ..refine.gauss_newton import GROUPS, ONE_SIGMA, ROBUST, jackknife, neighbours
-from ..types import Clock, TrackSet
-from .alike import LEAST_BESIDE, LIMIT, MARGIN, Raw, Usual
-from .verdict import Answer
+from ...clocks.common import readable, strongest
+from ...clocks.splines import TrackSplines
+from ...refine.gauss_newton import GROUPS, ONE_SIGMA, ROBUST, jackknife, neighbours
+from ...types import Clock, TrackSet
+from ..alike import LEAST_BESIDE, LIMIT, MARGIN, Raw, Usual
+from ..verdict import Answer
 
 REACH = 2.0
 """Seconds by which another offset may differ."""
