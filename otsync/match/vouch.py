@@ -420,13 +420,17 @@ def chirality(a: Float[np.ndarray, "M F 3"], b: Float[np.ndarray, "M G 3"]) -> f
 
 def side(points: Float[np.ndarray, "M F 3"], quads: Int[np.ndarray, "Q 4"]) -> Int[np.ndarray, " Q"]:
     """+1 or -1 where the triple product of a quad's edges keeps its sign over the frames, 0 where it does not."""
-    points = points.astype(float) / binary_scale(points)  # squares neither overflow nor vanish
-    first, *others = (points[quads[:, k]].transpose(2, 0, 1) for k in range(4))
-    edges = [other - first for other in others]
-    u, v, w = (e / np.maximum(np.sqrt(e[0] ** 2 + e[1] ** 2 + e[2] ** 2), np.finfo(float).tiny) for e in edges)
+    first, *others = (points[quads[:, k]].astype(float).transpose(2, 0, 1) for k in range(4))
+    u, v, w = (unit_vectors(other - first) for other in others)
     across = (v[1] * w[2] - v[2] * w[1], v[2] * w[0] - v[0] * w[2], v[0] * w[1] - v[1] * w[0])
     volume = u[0] * across[0] + u[1] * across[1] + u[2] * across[2]
     return (volume > FLAT).all(1).astype(int) - (volume < -FLAT).all(1).astype(int)
+
+
+def unit_vectors(x: Float[np.ndarray, 3 * N]) -> Float[np.ndarray, 3 * N]:
+    """Each of length one; 0 of nothing. Each is brought near one first: no square overflows or vanishes."""
+    x = x / np.maximum(np.abs(x).max(0), np.finfo(float).tiny)
+    return x / np.maximum(np.sqrt(x[0] ** 2 + x[1] ** 2 + x[2] ** 2), np.finfo(float).tiny)
 
 
 def poses(xyz: Float[np.ndarray, "M T 3"], seen: Bool[np.ndarray, "M T"], frames: int) -> Float[np.ndarray, "M F 3"]:

@@ -771,8 +771,8 @@ BREAKS = (
     Break(
         "match-anchored-first-of-a-moment",
         "otsync/match/anchored/kernels.py",
-        "for t in range(w * step, min((w + 1) * step, T)):",
-        "for t in range(w * step, w * step + 1):",
+        "for t in range(first[w], first[w + 1]):",
+        "for t in range(first[w], first[w] + 1):",
         ANCHORED,
         "of a moment only the first frame is read: what is seen in another one is gone",
     ),

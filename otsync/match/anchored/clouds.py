@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from ...clocks.common import nominal_fps
+from ...clocks.common import missing, nominal_fps
 from ...compute.indices import evenly
 from ...costs.linear import binary_scale, unit_features
 from ...types import TrackSet
@@ -18,9 +19,9 @@ FAR = 1e6
 """Positions are clipped to this many scene sizes: squares of what is farther would leave float32."""
 
 TOGETHER, MOMENTS = 0.1, 32
-"""Seconds of which one mean position is read, and into how many such moments a clip is divided at least. The largest
-distance of two points that move is nearly the same at ten moments a second, with less noise, and takes a third of the
-time to find at 30 frames a second."""
+"""Seconds of which one mean position is read, at most, and into how many such moments a clip is divided at least: two
+frames each from 64 frames, three from 96 on, at 30 a second. The largest distance of two points that move is nearly the
+same at ten moments a second, with less noise, and takes a third of the time to find."""
 
 BLOCK = 1024
 """Tracks or frames a block of work."""
@@ -96,13 +97,13 @@ class Cloud:
             weight.T > 0,
             timestamps=self.times,
             frame=source.frame,
-            camera=source.camera,
+            camera=source.camera if source.n_frames == T else None,  # of one that moves there is a pose for each frame
             **means,
         )
         return Cloud(columns, weight, self.times, tracks, np.arange(n), self.middle, self.size)
 
 
-def clouds(a: TrackSet, b: TrackSet) -> tuple[Cloud, Cloud]:
+def clouds(a: TrackSet, b: TrackSet, every_frame: bool = False) -> tuple[Cloud, Cloud]:
     """Both videos about their middles and in one unit, that of the scenes; tracks that are never seen are left out.
 
     Middle and unit are found in float64 before positions become float32, so that a world in metres and the same in
@@ -126,19 +127,22 @@ def clouds(a: TrackSet, b: TrackSet) -> tuple[Cloud, Cloud]:
     size = float(np.mean(sizes)) if sizes else 1.0
     made = []
     for tracks, index, middle, _, _ in found:
-        step = together(tracks)
-        first = np.arange(0, tracks.n_frames, step)
-        times = np.add.reduceat(tracks.times, first) / np.diff(first, append=tracks.n_frames)
-        columns = np.empty((3, len(first), len(index)), np.float32)
+        first = np.arange(tracks.n_frames + 1) if every_frame else moments(tracks)
+        times = np.add.reduceat(tracks.times, first[:-1]) / np.diff(first)
+        columns = np.empty((3, len(times), len(index)), np.float32)
         weight = np.empty(columns.shape[1:], np.float32)
-        run(kernels.to_columns, len(index), tracks.xyz, tracks.seen, index, middle, size, FAR, step, columns, weight)
+        run(kernels.to_columns, len(index), tracks.xyz, tracks.seen, index, middle, size, FAR, first, columns, weight)
         made.append(Cloud(columns, weight, times, tracks, index, middle, size))
     return made[0], made[1]
 
 
-def together(tracks: TrackSet) -> int:
-    """How many frames make one moment."""
-    return max(1, min(round(TOGETHER * nominal_fps(tracks)), tracks.n_frames // MOMENTS))
+def moments(tracks: TrackSet) -> Int[np.ndarray, " T1"]:
+    """The frames that moments begin with, and how many frames there are; none goes on where frames are missing."""
+    step = max(1, min(round(TOGETHER * nominal_fps(tracks)), tracks.n_frames // MOMENTS))
+    behind = np.flatnonzero(missing(tracks.times)) + 1 if step > 1 else np.zeros(0, int)
+    ends = [0, *behind.tolist(), tracks.n_frames]
+    begun = [np.arange(begin, end, step) for begin, end in pairwise(ends)]
+    return np.concatenate([*begun, [tracks.n_frames]])
 
 
 def canonical_order(tracks: TrackSet, index: Int[np.ndarray, " N"], radius: Float[np.ndarray, " N"]) -> np.ndarray:

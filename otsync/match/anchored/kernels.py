@@ -40,19 +40,18 @@ def visible_means(xyz, seen, mean, i0, i1):
 
 
 @kernel()
-def to_columns(xyz, seen, index, origin, unit, far, step, columns, weight, i0, i1):
+def to_columns(xyz, seen, index, origin, unit, far, first, columns, weight, i0, i1):
     """``(xyz - origin) / unit`` of tracks ``index[i0:i1]``, clipped to ±far, time-major; 0, weight 0 where unseen.
 
-    Of every ``step`` frames the mean of those that show a track. xyz (N,T,3), seen (N,T); columns (3,W,M), weight (W,M)
-    float32.
+    Of the frames first[w]:first[w + 1] the mean of those that show a track. xyz (N,T,3), seen (N,T); first (W+1,);
+    columns (3,W,M), weight (W,M) float32.
     """
-    T = seen.shape[1]
     for i in range(i0, i1):
         n = index[i]
         for w in range(len(weight)):
             x = y = z = 0.0
             count = 0
-            for t in range(w * step, min((w + 1) * step, T)):
+            for t in range(first[w], first[w + 1]):
                 if seen[n, t]:
                     x += xyz[n, t, 0]
                     y += xyz[n, t, 1]

@@ -12,7 +12,18 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.sparse import issparse
 
-from otsync import AnchoredFGW, Cosine, FusedGromovWasserstein, Labels, Matches, Status, TrackSet, match, matcher_for
+from otsync import (
+    AnchoredFGW,
+    Camera,
+    Cosine,
+    FusedGromovWasserstein,
+    Labels,
+    Matches,
+    Status,
+    TrackSet,
+    match,
+    matcher_for,
+)
 from otsync.compute.indices import ascending
 from otsync.compute.simd import LANES
 from otsync.match.anchored import kernels
@@ -395,6 +406,45 @@ def test_the_default_goes_by_size():
 
 
 # --- compiled loops against numpy ---------------------------------------------------------------------------------
+
+
+def test_a_camera_that_moves_in_a_long_clip_is_no_hindrance():
+    """Groups of tracks are seen at moments, a moving camera has a pose for each frame."""
+    a, b, truth = matching_world(250, seed=3, frames=100)
+    plain = AnchoredFGW()(a, b)
+    w2c = np.tile(np.eye(4), (100, 1, 1))
+    w2c[:, 2, 3] = 5 + 0.01 * np.arange(100)
+    lens = Camera(np.array([[500.0, 0, 320], [0, 500, 180], [0, 0, 1]]), w2c, 640, 360)
+    moving = AnchoredFGW()(*(replace(t, camera=lens) for t in (a, b)))
+    np.testing.assert_array_equal(moving.pairs, plain.pairs)
+    assert match_quality(plain, truth)["p50"] > 0.8
+
+
+def test_costs_that_look_at_times_see_every_frame():
+    seen = []
+
+    class Looking:
+        weight = 1.0
+        needs_features, needs_xyz = True, False
+
+        def pairs(self, a, b, i, j):
+            seen.append((a.n_frames, b.n_frames))
+            return Cosine().pairs(a, b, i, j)
+
+        def matrix(self, a, b):
+            seen.append((a.n_frames, b.n_frames))
+            return Cosine().matrix(a, b)
+
+    AnchoredFGW(costs=(Looking(),))(*matching_world(250, seed=3, frames=100)[:2])
+    assert set(seen) == {(100, 100)}
+
+
+def test_no_moment_goes_on_where_frames_are_missing():
+    times = np.arange(120) / 30
+    times[50:] += 10.0
+    cloud, _ = clouds(*[TrackSet(np.random.default_rng(0).normal(size=(9, 120, 3)), timestamps=times)] * 2)
+    assert not ((cloud.times > times[49]) & (cloud.times < times[50])).any()
+    assert len(cloud.times) == 17 + 24
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([(70, 30.0, 2), (150, 30.0, 3), (60, 30.0, 1), (130, 240.0, 4)]))
