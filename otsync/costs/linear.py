@@ -174,7 +174,8 @@ class Cost(Protocol):
     """One linear term of the matching objective: an item of the ``costs`` tuple.
 
     The dense solvers read ``matrix``; :class:`otsync.AnchoredFGW`, which never looks at all pairs, reads the matrix of
-    a few means of groups and ``pairs`` of the candidates.
+    a few means of groups and ``pairs`` of the candidates. Groups have all frames of their video, unless all costs are
+    :class:`Factored`.
     """
 
     @property
@@ -193,7 +194,11 @@ class Cost(Protocol):
 
 @runtime_checkable
 class Factored(Protocol):
-    """A cost whose matrix is ``1 - U Vᵀ`` with few columns: compiled loops evaluate it wherever they like."""
+    """A cost whose matrix is ``1 - U Vᵀ`` with few columns: compiled loops evaluate it wherever they like.
+
+    It looks at features and labels alone: groups of tracks that it is asked about may have fewer frames than their
+    video, and no camera.
+    """
 
     def factors(self, a: TrackSet, b: TrackSet) -> tuple[Float[np.ndarray, "Na D"], Float[np.ndarray, "Nb D"]]: ...
 

@@ -73,7 +73,7 @@ class ByWindows:
     within = NEAR * EVERY
 
     def __init__(self, told: Mapping[Pair, list[Answer]]) -> None:
-        self.told = dict(told)
+        self.told = {pair: list(readings) for pair, readings in told.items()}
         self.tried: list[list[Answer]] = []
 
     def doubtful(self, answers: Sequence[Answer], tracks: Sequence[TrackSet]) -> list[Answer]:

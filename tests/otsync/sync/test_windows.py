@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from importlib import import_module
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,11 +13,12 @@ from otsync import Status, TrackSet, synchronize
 from otsync.align.likelihood import LikelihoodScan
 from otsync.bench.trust.worlds import CLASSES
 from otsync.refine.splines import SplineRefine
-from otsync.sync.mend.ways import readings_of
+from otsync.sync.hearing import Hearing
+from otsync.sync.mend.ways import ByWindows, readings_of
 from otsync.sync.mend.windows import EVERY, NEAR, STEADY, Windows, matches_of_parts
 from otsync.sync.pairs import Job, run
 from otsync.sync.rematching import at_each
-from otsync.types import Clock
+from otsync.types import Break, Clock
 
 from .test_places import motion
 
@@ -171,3 +174,36 @@ def test_what_is_steady_in_windows_only_stays_in_doubt(name, seed):
     """A change of speed that is taken for lost frames; people who do the same a little differently."""
     offsets = synchronize(CLASSES[name](seed).tracks)
     assert Status.BROKEN_CLOCK in offsets.flags[1]
+
+
+def test_where_a_reading_is_refused_the_next_one_is_tried():
+    answers = [SimpleNamespace(pair=(0, 1), scanned=SimpleNamespace(parts=np.full((2, 2), k))) for k in (1.0, 2.0)]
+    way = ByWindows({(0, 1): answers})
+    assert way.doubtful((), ()) == answers[:1]
+    assert way.refused([(0, 2), (0, 1)])
+    assert way.doubtful((), ()) == answers[1:]
+    assert not way.refused([(0, 1)])
+
+
+def test_a_mended_clock_that_runs_unevenly_is_told_nothing_of(monkeypatch):
+    """A change of speed that was taken for lost frames is steady in windows: its clock stays in doubt."""
+    verb = import_module("otsync.sync.mend.verb")
+    answer, job = SimpleNamespace(pair=(0, 1)), SimpleNamespace(pair=(0, 1))
+    breaks = {1: (Break(2.0, 0.3), Break(4.0, -0.2))}
+    asked = []
+
+    def steady_beside(fresh, tracks, v, found):
+        asked.append((v, found.at))
+        return len(asked) < 2
+
+    for name, always in (
+        ("asks", True),
+        ("_may_break", True),
+        ("at_peaks", {(0, 1): [answer]}),
+        ("readings_of", [answer]),
+    ):
+        monkeypatch.setattr(verb, name, lambda *given, always=always: always)
+    monkeypatch.setattr(verb, "steady_beside", steady_beside)
+    hearing = Hearing((job,), SimpleNamespace(answers=(answer,)), ((), ()), breaks, lambda *given: None, map)
+    assert verb.mend_by_windows(hearing) == (hearing, set())
+    assert asked == [(1, 2.0), (1, pytest.approx(4.3))]  # on the clock that the first break was mended on
