@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from otsync import synchronize
-from otsync.align.breaks import by_chance, partners
+from otsync import align, match, synchronize
+from otsync.align.breaks import Look, by_chance, partners
 from otsync.align.likelihood import LikelihoodScan
 from otsync.align.peaks import likely
 from otsync.align.returns import beside_returns, like_itself, return_is_liked
@@ -159,6 +159,32 @@ def test_a_lost_stride_is_liked_at_another_return(seed):
         best = int(curves.sum(0).argmax())
         assert lags[best] == 5
         assert return_is_liked(pair, lags, curves, best, 10, 3) == (lost > 0)
+
+
+def test_a_second_that_suits_another_stride_better_breaks_no_clock():
+    a, b = CLASSES["strides"](301).tracks
+    alone = align(a, b, match(a, b), aligner=LikelihoodScan(), throw=False)
+    assert not len(alone.parts) and Status.BROKEN_CLOCK not in alone.flags
+
+
+def test_an_offset_that_most_matches_of_a_part_contradict_gives_way():
+    """Some other offset suits a few of the matches behind a gap very well, and has more evidence in all."""
+    rng, k = np.random.default_rng(5), np.arange(150)
+    shown = smooth(8.0, 1)
+    a, b = shown[:, 100 + k], shown[:, 105 + k + 15 * (k >= 70)]
+    pair = CommonClock(*(x + 0.1 * rng.normal(size=x.shape) for x in (a, b)), 30.0, 0.0)
+    lags, step, floor = np.arange(-60, 61), 10, 0.015
+    curves = local_curves(pair, lags, floor, np.ones(len(a)))
+    windows = np.arange(len(curves))
+    spans = [windows[:8], windows[10:]]
+    tops = [int(curves[span].sum(0).argmax()) for span in spans]
+    assert [int(lags[top]) for top in tops] == [5, 20]
+    by_few = int(np.flatnonzero(lags == -30)[0])
+    curves[spans[1], by_few] = curves[spans[1], tops[1]] + 0.5
+    look = Look(pair, lags, curves, tops[0], floor, step)
+    settled, change, sound = look.settled(spans, [tops[0], by_few])
+    assert sound and settled == tops
+    assert change == pytest.approx(-0.5 * len(spans[1]))
 
 
 def test_strides_of_which_one_is_missing_are_mended_or_doubtful():
