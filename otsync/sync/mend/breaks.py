@@ -151,7 +151,7 @@ def _readings(
     length, frame = abs(jump), 1 / fps[answer.pair[froze]]
     shown = raw[froze]
     stands = stood_still(shown.times, shown.x, start, length)
-    back = _goes_back(raw, first, second, when, limits) if stands is None and length >= BACK else None
+    back = goes_back(raw, first, second, when, limits) if stands is None and length >= BACK else None
     if back is not None:
         k, moment = back
         cut, v = steps[k].cut_near(moment, AROUND), answer.pair[k]
@@ -172,7 +172,7 @@ def _readings(
     ]
 
 
-def _goes_back(
+def goes_back(
     raw: tuple[Raw, Raw], first: float, second: float, when: float, limits: tuple[float, float]
 ) -> tuple[int, float] | None:
     """Which of the two videos, 0 or 1, goes back to what it has shown or not yet shown, and when, on its own clock:

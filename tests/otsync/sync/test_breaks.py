@@ -22,7 +22,8 @@ from otsync.refine.gauss_newton import Fit
 from otsync.refine.splines import SplineRefine
 from otsync.simulate import simulate
 from otsync.simulate.effects import Drop, Freeze, In, Repeats, Replay, SlowMotion
-from otsync.sync.mend.breaks import Suspect, culprit, mended, sigma_of_part
+from otsync.sync.alike import Raw
+from otsync.sync.mend.breaks import Suspect, culprit, goes_back, mended, sigma_of_part
 from otsync.sync.mend.proofs import confirmed
 from otsync.sync.mend.ways import by_windows
 from otsync.sync.mend.windows import Windows
@@ -159,6 +160,23 @@ def test_a_lost_stride_is_liked_at_another_return(seed):
         best = int(curves.sum(0).argmax())
         assert lags[best] == 5
         assert return_is_liked(pair, lags, curves, best, 10, 3) == (lost > 0)
+
+
+@pytest.mark.parametrize("who", [0, 1])
+@pytest.mark.parametrize("seconds", [0.6, 1.5])
+def test_every_frame_of_a_video_that_goes_back_has_a_partner(seconds, who):
+    """One that lost frames leaves some of the other's without any, and does not go back."""
+    times, motion = np.arange(180) / 30, smooth(8.0, 2)
+    for back in (True, False):
+        shown = times - (seconds if back else -seconds) * (times >= 3)
+        moments = np.interp(shown, np.arange(-60, 340) / 30, np.arange(400.0)).round().astype(int)
+        raw = [Raw(times, motion[:, 60:240])] * 2
+        raw[who] = Raw(times, motion[:, moments])
+        # b's clock plus the offset is a's: a that goes back is late, b that does is early
+        second = seconds if back == (who == 0) else -seconds
+        when = 3.0 if who == 0 or not back else 3.0 - seconds / 2
+        found = goes_back((raw[0], raw[1]), 0.0, second, when, (-np.inf, np.inf))
+        assert found == ((who, pytest.approx(3.0, abs=1 / 30)) if back else None)
 
 
 def test_a_second_that_suits_another_stride_better_breaks_no_clock():
