@@ -438,6 +438,12 @@ def velocity_correlation(a: TrackSplines, b: TrackSplines, fit: Fit, window: flo
     return uv / np.sqrt(uu * vv) if uu > 0 and vv > 0 else 0.0
 
 
+def common_span(a: TrackSplines, b: TrackSplines, clock: Clock) -> tuple[float, float]:
+    """Seconds of b's clock between which both videos see something."""
+    own = clock.own(a.times[[0, -1]])
+    return max(float(own[0]), float(b.times[0])), min(float(own[1]), float(b.times[-1]))
+
+
 def overlap_seconds(a: TrackSplines, b: TrackSplines, clock: Clock) -> float:
     """Seconds of a's clock that both videos cover, one frame included."""
     ends = clock.world(b.times[[0, -1]])

@@ -19,7 +19,7 @@ from ..types.checks import positive
 from ..types.trust import Trust
 from .common_error import common_error
 from .common_motion import common_motion
-from .gauss_newton import GROUPS, Fit, fit_clock, neighbours, overlap_seconds, velocity_correlation
+from .gauss_newton import GROUPS, Fit, common_span, fit_clock, neighbours, overlap_seconds, velocity_correlation
 from .seconds import Seconds
 from .slot import JUDGED_BY, Rate, Refiner
 
@@ -167,7 +167,7 @@ class SplineRefine(Refiner):
             | {
                 "matches": float(len(matches)),
                 "effective_matches": min(fit.effective_matches, *(float(len(np.unique(c))) for c in matches.pairs.T)),
-                "moved": abs(fit.clock.offset - alignment.offset),
+                "moved": self._moved(start, fit.clock, curves),
                 "spread": spread,
                 "blur": fit.blur,
                 "common_motion": common_motion(*curves, fit.clock, fit.weights, self.windows[0]),
@@ -228,6 +228,15 @@ class SplineRefine(Refiner):
         """Seconds between two answers; a window without an answer counts as a frame."""
         return curves[0].frame if other is None else abs(other.clock.offset - fit.clock.offset)
 
+    def _moved(self, start: Clock, found: Clock, curves: tuple[TrackSplines, TrackSplines]) -> float:
+        """Seconds between two clocks where they are nearest in the overlap.
+
+        A scan at a wrong rate has its peak where any part of the overlap is right: at one end it is then far from what
+        the fit says of the other.
+        """
+        begin, end = (found.world(t) - start.world(t) for t in common_span(*curves, found))
+        return 0.0 if begin * end <= 0 else min(abs(begin), abs(end))
+
     def _beyond_noise(self, other: Fit | None, fit: Fit, curves: tuple[TrackSplines, TrackSplines]) -> float:
         """s², of how far two answers are apart, more than the noise of the one that knows less explains.
 
@@ -272,9 +281,7 @@ class SplineRefine(Refiner):
         shared: variance of errors that both ends have; unsettled: what the rate may be off by; measured: one sigma of
         the rate where it was fitted.
         """
-        a, b = curves
-        own = fit.clock.own(a.times[[0, -1]])
-        begin, end = max(float(own[0]), float(b.times[0])), min(float(own[1]), float(b.times[-1]))
+        begin, end = common_span(*curves, fit.clock)
         fitted = free is not None and (len(fit.covariance) > 1 or fit.clock.rate != 1.0)
         if fitted:
             assert free is not None

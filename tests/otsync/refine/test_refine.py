@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from otsync import Alignment, Matches, Refused, SplineRefine, Status, TrackSet, Unrefined, align, refine
+from otsync import Alignment, Matches, Refused, SplineRefine, Status, TrackSet, Trust, Unrefined, align, refine
 from otsync.clocks.splines import TrackSplines
 from otsync.compute.indices import blocks
 from otsync.refine import gauss_newton
@@ -203,6 +203,20 @@ def test_a_fitted_rate_is_kept_only_when_significant():
             assert found.offset == pytest.approx(0.3, abs=0.1 / 30)
             fixed = refine(*tracks, m, align(*tracks, m), SplineRefine(rate="fixed"), throw=False)
             assert fixed.rate == 1.0 and Status.RATE_MISMATCH in fixed.flags
+
+
+def test_a_scan_at_a_wrong_rate_is_right_somewhere_in_the_overlap():
+    # 1 % over twenty seconds: the scan's peak is 3 frames from where the clocks stand at the first frame
+    tracks, truth = simulate("softball", preset="mid", frames=600, rates=[1, 1.01], offsets=[0, 0.3], seed=5)
+    m = truth.matches(0, 1)
+    scan = align(*tracks, m)
+    assert abs(scan.offset - 0.3) > Trust().moved
+    found = refine(*tracks, m, scan)
+    assert Status.MOVED not in found.flags and found.stats["moved"] < 1 / 30
+    assert found.rate == pytest.approx(1.01, abs=3e-4) and found.offset == pytest.approx(0.3, abs=0.2 / 30)
+    # a start that is right nowhere in the overlap stays a start that is wrong
+    off = dataclasses.replace(scan, offset=0.3 - 3 / 30)
+    assert refine(*tracks, m, off, throw=False).stats["moved"] > 2.5 / 30
 
 
 def test_a_rate_that_is_not_kept_counts_where_it_may_be_real():
