@@ -7,12 +7,14 @@ frames of each video that are shown worst are held against what its camera would
 far better, its clock is wrong there.
 
 What repeats itself looks alike at two times, and equally well. A scene of few videos takes in the one that is wrong and
-then shows it well; a scene of many takes in some of it, and others are shown worse there, too.
+then shows it well (:mod:`recon.fit.leave_one_out` asks these); a scene of many takes in some of it, and others are
+shown worse there, too.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple, SupportsFloat
 
 import numpy as np
@@ -68,46 +70,62 @@ class Lagged(NamedTuple):
     nothing: np.ndarray
 
 
-def lagged(
-    look: Look,
-    empty: Target,
-    target: Target,
-    time: Time,
-    votes: Sequence[Votes],
-    frame_step: float,
-    map: MapLike = map,
-) -> list[Lagged]:
+@dataclass(frozen=True)
+class OtherTimes:
+    """Frames beside what their camera would see earlier and later.
+
+    Args:
+        look, target: as of :func:`recon.fit.uncertainty.cast`. empty: (video, frame) -> the image that the scene gives
+            without what moves. time: (video, frame) -> seconds of the scene.
+        frame_step: seconds of a frame, the least lag. ahead: lags in seconds; as many are behind.
+    """
+
+    look: Look
+    empty: Target
+    target: Target
+    time: Time
+    frame_step: float
+    ahead: tuple[float, ...] = LAGS
+
+    @property
+    def lags(self) -> np.ndarray:
+        """[L] seconds, 0 among them."""
+        ahead = sorted({max(lag, self.frame_step) for lag in self.ahead})
+        return np.array([*(-lag for lag in reversed(ahead)), 0.0, *ahead])
+
+    def errors(self, key: tuple[int, int], first: float, last: float) -> np.ndarray:
+        """(1+L,) sums of squares of a frame: without what moves, and by lag; nan before ``first`` and after ``last``,
+        seconds of the scene.
+        """
+        at = float(self.time(*key)) + self.lags
+        row = np.full(1 + len(at), np.nan)
+        with torch.no_grad():  # per thread
+            own = self.target(*key)
+            row[0] = _squares(self.empty(*key), own)
+            for n in np.flatnonzero((self.lags == 0) | (at >= first) & (at <= last)).tolist():
+                row[1 + n] = _squares(self.look(*key, float(self.lags[n])), own)
+        return row
+
+    def of(self, frames: Sequence[int], rows: Sequence[np.ndarray]) -> Lagged:
+        """Some frames of a video, whose :meth:`errors` are known."""
+        told = np.array(rows).reshape(-1, 1 + len(self.lags))
+        return Lagged(np.array(frames, int), self.lags, told[:, 1:], told[:, 0])
+
+
+def lagged(times: OtherTimes, votes: Sequence[Votes], map: MapLike = map) -> list[Lagged]:
     """The frames of each video that its scene shows worst, at other times.
 
     Args:
-        look, target, votes, map: as of :func:`recon.fit.uncertainty.cast`.
-        empty: (video, frame) -> the image that the scene gives without what moves.
-        time: (video, frame) -> seconds of the scene. The first and the last frame that voted bound the lags.
-        frame_step: seconds of a frame, the least lag.
+        votes, map: as of :func:`recon.fit.uncertainty.cast`. The first and the last frame that voted bound the lags.
     """
-    ahead = sorted({max(lag, frame_step) for lag in LAGS})
-    lags = np.array([*(-lag for lag in reversed(ahead)), 0.0, *ahead])
-    ends = [float(time(v, own.frames[n])) for v, own in enumerate(votes) if len(own.frames) for n in (0, -1)]
+    ends = [float(times.time(v, own.frames[n])) for v, own in enumerate(votes) if len(own.frames) for n in (0, -1)]
     worst = [own.frames[np.argsort(-_misfit(own), kind="stable")[:FRAMES]].tolist() for own in votes]
-
-    def errors(key: tuple[int, int]) -> np.ndarray:
-        """(1+L,) of a frame: without what moves, and by lag."""
-        at = float(time(*key)) + lags
-        row = np.full(1 + len(lags), np.nan)
-        with torch.no_grad():  # per thread
-            own = target(*key)
-            row[0] = _squares(empty(*key), own)
-            for n in np.flatnonzero((lags == 0) | (at >= min(ends)) & (at <= max(ends))).tolist():
-                row[1 + n] = _squares(look(*key, float(lags[n])), own)
-        return row
-
     found: dict[tuple[int, int], np.ndarray] = {}
 
     def ask(keys: list[tuple[int, int]]) -> list[Lagged]:
-        found.update(zip(keys, map(errors, keys), strict=True))
+        found.update(zip(keys, map(lambda key: times.errors(key, min(ends), max(ends)), keys), strict=True))
         asked = [[k for k in own if (v, k) in found] for v, own in enumerate(worst)]
-        rows = [np.array([found[v, k] for k in own]).reshape(-1, 1 + len(lags)) for v, own in enumerate(asked)]
-        return [Lagged(np.array(own, int), lags, r[:, 1:], r[:, 0]) for own, r in zip(asked, rows, strict=True)]
+        return [times.of(own, [found[v, k] for k in own]) for v, own in enumerate(asked)]
 
     at_first = ask([(v, k) for v, own in enumerate(worst) for k in own[:FIRST]])
     doubted = [v for v, one in enumerate(at_first) if (_ratios(one) < PROMISING).any()]

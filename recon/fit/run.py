@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -14,7 +14,7 @@ from torch import Tensor
 from otsync.compute.threads import MapLike
 from recon.fit.checkpoint import Snapshot
 from recon.fit.densify import Densify
-from recon.fit.lags import FIRST, LAGS, Lagged, lagged
+from recon.fit.lags import FIRST, LAGS, Lagged, OtherTimes, lagged
 from recon.fit.optimize import Adam, Decay, check_rates
 from recon.fit.problem import Problem, assemble, scene_groups
 from recon.fit.uncertainty import FRAMES, Look, Target, Votes, cast
@@ -174,10 +174,25 @@ class Run:
 
     def lagged(self, values: dict[str, Tensor], votes: Sequence[Votes], map: MapLike = map) -> list[Lagged]:
         """How each video's frames are shown at other times: see :func:`recon.fit.lags.lagged`."""
+        return lagged(self.other_times(values), votes, map)
+
+    def other_times(self, values: dict[str, Tensor], ahead: tuple[float, ...] = LAGS) -> OtherTimes:
+        """Frames beside what their cameras would see ``ahead`` and as many seconds before."""
         look, target = self._shown(values)
         still = values | {"opacity_logits": torch.full_like(values["opacity_logits"], UNSEEN)}
-        empty = partial(self.look, still)
-        return lagged(look, empty, target, partial(self.world_time, values), votes, self.scene.frame_step, map)
+        empty, time = partial(self.look, still), partial(self.world_time, values)
+        return OtherTimes(look, empty, target, time, self.scene.frame_step, ahead)
+
+    def anew(
+        self, keys: np.ndarray, steps: int, values: Mapping[str, Tensor], known: Collection[str], faster: float
+    ) -> Run:
+        """A fit of so many steps of one image to some of the images, from the scene that this one began with, that
+        holds the ``known`` groups at their ``values``. The others have ``faster`` times the rates of this one.
+        """
+        rates = {name: faster * rate for name, rate in self.rates.items() if name not in known}
+        fresh = Run(replace(self.problem, keys=keys, batch=1), rates, None, steps)
+        fresh.groups |= {name: values[name].detach().clone() for name in known}
+        return fresh
 
     def _shown(self, values: dict[str, Tensor]) -> tuple[Look, Target]:
         """Frames as the scene gives them, and as they are."""

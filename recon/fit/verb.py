@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 import time
+from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, fields, replace
@@ -28,6 +29,7 @@ from otsync.types import Offsets, Status
 from otsync.types.status import in_order
 from recon.fit.checkpoint import Checkpoint
 from recon.fit.lags import displaced
+from recon.fit.leave_one_out import elsewhere, shown_without_each, steps_worth
 from recon.fit.options import FitOptions
 from recon.fit.parts import broken
 from recon.fit.problem import Problem, assemble, check_groups
@@ -160,7 +162,9 @@ def fit(
             each = stack.enter_context(pool_of(options.batch + 1, "recon.fit")).map
         stack.enter_context(one_thread_each(options.batch))
         shown = stack.enter_context(bar("fit", "step", run.total, initial=run.step))
-        calibrate = Calibration(options.budget, deadline, run.steps_after()) if run.total is None else None
+        calibrate = None
+        if run.total is None:
+            calibrate = Calibration(options.budget, deadline, lambda total: run.steps_after() + steps_worth(run, total))
         try:
             while run.total is None or run.step < run.total:
                 with uninterrupted():
@@ -192,10 +196,12 @@ class Calibration:
 
     Args:
         budget: seconds of the fit; of none, a share of what is left of the ``deadline``. after: steps that the work
-            after the last one is worth.
+            after the last one is worth, by how many there are; more steps are worth no less.
     """
 
-    def __init__(self, budget: float | None, deadline: Deadline | None = None, after: int = 0):
+    def __init__(
+        self, budget: float | None, deadline: Deadline | None = None, after: Callable[[int], int] = lambda total: 0
+    ):
         assert budget is not None or deadline is not None  # only then is the number of steps open
         self.deadline, self.after, self.done = deadline, after, 0
         self.began = self.since = time.perf_counter()
@@ -233,7 +239,8 @@ class Calibration:
             return 2 * step
         each = (now - self.since) / steps
         left = self.seconds - (now - self.began) if self.deadline is None else FIT_SHARE * self.deadline.left
-        total = max(step + 1, step + int(left / each) - self.after)
+        most = step + int(left / each)
+        total = max(step + 1, bisect_right(range(most + 1), most, key=lambda n: n + self.after(n)) - 1)
         return total if self.least else max(2 * step, total)  # rates must have time to decay
 
 
@@ -257,9 +264,16 @@ def _finish(run: Run, seconds: float, map: MapLike) -> Reconstruction:
     told: Told | None = None
     flags = list(p.offsets.flags)
     if "offsets" in run.adam.groups:
+        at_start = values | {"offsets": values["offsets"] - drift}
         votes = run.votes(values, map)
         refined, sigma, raised, told = _witnessed(run, refined, sigma, newton_sigma(votes), history)
-        parts = sorted({*broken(votes, p.scene.frame_step), *displaced(run.lagged(values, votes, map))})
+        parts = sorted(
+            {
+                *broken(votes, p.scene.frame_step),
+                *displaced(run.lagged(values, votes, map)),
+                *elsewhere(shown_without_each(run, at_start, map), sigma, p.reference),
+            }
+        )
         # where the reference's clock breaks all others are off by it
         apart = [v for v in range(len(p.clips)) if v != p.reference] if p.reference in parts else parts
         for v, flag in (*raised, *((v, Status.BROKEN_CLOCK) for v in apart)):

@@ -494,22 +494,23 @@ def test_a_budget_becomes_steps_that_decay_and_densify(capture, scene):
         fit(scene, capture.footage, believed(capture), budget=float("inf"))
 
 
-@pytest.mark.parametrize("after", [0, 400])
+@pytest.mark.parametrize(("after", "each"), [(0, 0), (400, 0), (100, 0.2)])
 @pytest.mark.parametrize("slow", [1.0, 1.5, 2.0])
-def test_a_budget_is_used_though_the_first_steps_are_slow(monkeypatch, slow, after):
+def test_a_budget_is_used_though_the_first_steps_are_slow(monkeypatch, slow, after, each):
     """Steps of 10 ms, of which the first 200 take longer: the fit, and what follows it, end within a twentieth of
     their time.
     """
     now = 0.0
     monkeypatch.setattr(time, "perf_counter", lambda: now)
-    calibrate, guesses, total, step = Calibration(30.0, after=after), set(), None, 0
+    calibrate = Calibration(30.0, after=lambda total: after + int(each * total))
+    guesses, total, step = set(), None, 0
     while total is None or step < total:
         step += 1
         now += 0.01 * (slow if step <= 200 else 1.0)
         guess, total = calibrate(step)
         guesses.add(guess)
         assert total is None or step >= 0.2 * total
-    assert now + 0.01 * after == pytest.approx(30.0, rel=0.05)
+    assert now + 0.01 * (after + each * step) == pytest.approx(30.0, rel=0.05)
     assert None in guesses and len(guesses) <= 3  # none, a guess, what is known
 
 

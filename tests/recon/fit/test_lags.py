@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from recon.fit.lags import FIRST, FRAMES, LAGS, LEAST, Lagged, displaced, lagged
+from recon.fit.lags import FIRST, FRAMES, LAGS, LEAST, Lagged, OtherTimes, displaced, lagged
 from recon.fit.uncertainty import FRAMES as VOTES
 from recon.fit.uncertainty import cast, scattered
 
@@ -58,7 +58,7 @@ def asked(
 
     keys = np.array([(v, k) for v, own in enumerate(shown) for k in range(len(own))]).reshape(-1, 2)
     votes = cast(look, target, keys, len(shown), step)
-    return lagged(look, lambda v, k: cut(behind(v), v, k), target, lambda v, k: k * step, votes, step)
+    return lagged(OtherTimes(look, lambda v, k: cut(behind(v), v, k), target, lambda v, k: k * step, step), votes)
 
 
 EVEN = list(range(LENGTH))
