@@ -1993,8 +1993,8 @@ BREAKS = (
     Break(
         "fit-left-out-single-frames",
         "recon/fit/leave_one_out.py",
-        "around[frames] < own[frames]).mean() > ALIKE)",
-        "around[frames] < own[frames]).mean() > 0)",
+        "(around[frames] < one.errors[frames, one.lags == 0]).mean() > ALIKE",
+        "(around[frames] < one.errors[frames, one.lags == 0]).mean() > 0",
         ("tests/recon/fit/test_leave_one_out.py",),
         "one frame that is shown badly accuses its video",
     ),
