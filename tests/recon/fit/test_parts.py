@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from otsync.types import Offsets, Status
+from recon.fit.leave_one_out import FEW
 from recon.fit.parts import GAP, LEAST, broken, parting, tilt
 from recon.fit.uncertainty import MISFIT, Votes
 from recon.fit.verb import fit
@@ -165,7 +166,8 @@ def begun(seed: int, off: float, steps: int, **world: Any) -> Offsets:
 
 
 def test_a_fit_that_began_ten_frames_off_says_so():
-    assert said(begun(591, 10, 120, cameras=4, frames=30, size=(96, 64))) == [2]
+    """Of so many videos none is left out: the frames that are shown worst tell it."""
+    assert said(begun(591, 10, 60, cameras=FEW + 1, frames=24, size=(96, 64))) == [2]
 
 
 @pytest.mark.slow
