@@ -216,8 +216,12 @@ def sampled(
     if len(times) <= 4 * NEAR * len(t):
         return curves(slice(None)).sample(t)
     out = np.full((len(xyz), len(t), 3), np.nan)
-    for n, k in enumerate(np.searchsorted(times, t)):
-        out[:, n] = curves(slice(max(0, k - NEAR), k + NEAR)).sample(t[n : n + 1])[:, 0]
+    order = np.argsort(t, kind="stable")
+    near = np.searchsorted(times, t[order])
+    # moments whose frames overlap have one curve
+    for some in np.split(np.arange(len(t)), np.flatnonzero(np.diff(near) > NEAR) + 1):
+        frames = slice(max(0, near[some[0]] - NEAR), near[some[-1]] + NEAR)
+        out[:, order[some]] = curves(frames).sample(t[order[some]])
     return out
 
 
