@@ -171,3 +171,27 @@ def test_few_moments_of_a_long_clip_need_no_curve_of_all_of_it(moments):
     whole, near = TrackSplines(t, x).sample(asked), sampled(t, x, np.isfinite(x[..., 0]), asked)
     np.testing.assert_array_equal(np.isnan(near), np.isnan(whole))
     assert np.isnan(whole).any() and np.nanmax(np.abs(near - whole)) < (0.2 * noise if moments == 6 else 1e-12)
+
+
+def test_moments_near_each_other_are_read_from_one_curve(monkeypatch):
+    """In any order, and as each would be by itself; over a gap and beside both ends, too."""
+    rng = np.random.default_rng(4)
+    t = np.arange(30_000) / 30
+    noise = 0.01
+    x = np.sin(t[:, None] * [1.0, 1.7, 2.3]) + noise * rng.normal(size=(3, len(t), 3))
+    x[1, 9000:9030] = np.nan
+    seen = np.isfinite(x[..., 0])
+    asked = rng.permutation(np.r_[t[:4], t[-4:], 300 + np.arange(40) / 30, 700 + rng.uniform(0, 3, 20)])
+    alone = np.concatenate([sampled(t, x, seen, asked[n : n + 1]) for n in range(len(asked))], 1)
+    made = []
+    fit = TrackSplines._fit
+
+    def counted(self: TrackSplines, xyz: np.ndarray, penalty: float) -> tuple[np.ndarray, np.ndarray]:
+        made.append(xyz.shape[1])
+        return fit(self, xyz, penalty)
+
+    monkeypatch.setattr(TrackSplines, "_fit", counted)
+    together = sampled(t, x, seen, asked)
+    assert len(made) == 4 and max(made) < 300
+    np.testing.assert_array_equal(np.isnan(together), np.isnan(alone))
+    assert np.isnan(alone).any() and np.nanmax(np.abs(together - alone)) < 0.2 * noise
