@@ -58,7 +58,8 @@ class Calibrate:
             there = sorted(p.name for p in near.iterdir() if p.is_dir()) if near.is_dir() else []
             close = nearest(self.folder.name, there)
             meant = f" Did you mean {close!r}?" if close else ""
-            raise ValueError(f"{self.folder}: expected a folder of videos; found none.{meant} Check the path.")
+            found = "a file" if self.folder.exists() else "nothing of that name"
+            raise ValueError(f"{self.folder}: expected a folder of videos; found {found}.{meant} Check the path.")
         with claimed(self.out or self.folder / "calibration", "otsync calibrate") as out:
             return self._run(out)
 
@@ -252,6 +253,7 @@ class Film:
     out: tyro.conf.Positional[Path]
     """Folder for phone0.mp4, phone1.mp4, ..., walk.mp4, truth.json (their offsets) and cameras.json (their cameras)."""
     phones: int = 4
+    """How many film at once."""
     gap: float = 80.0
     """Degrees between neighbours."""
     handheld: bool = False
@@ -262,14 +264,19 @@ class Film:
     """Places where a board is held before the phones on their tripods, which film it: board phone0.mp4, ...; 0: none.
     Then: otsync calibrate FOLDER --board 5x7:DICT_4X4_50 --square 0.08"""
     frames: int = 150
+    """Of each phone."""
     fps: float = 30.0
+    """Frames a second."""
     width: int = 640
+    """Pixels."""
     height: int = 360
+    """Pixels."""
     max_offset: float = 20.0
     """Largest offset, in frames."""
     contrast: float = 1.0
     """Of what the walls carry, from 0 to 1."""
     seed: int = 0
+    """Of the room, what moves, where the phones stand and when they begin: the same seed films the same."""
 
     def run(self) -> int:
         from ..files.claim import claimed

@@ -218,7 +218,7 @@ def sampled(
     out = np.full((len(xyz), len(t), 3), np.nan)
     order = np.argsort(t, kind="stable")
     near = np.searchsorted(times, t[order])
-    # moments whose frames overlap have one curve
+    # moments that are near each other have one curve: their frames are mostly the same
     for some in np.split(np.arange(len(t)), np.flatnonzero(np.diff(near) > NEAR) + 1):
         frames = slice(max(0, near[some[0]] - NEAR), near[some[-1]] + NEAR)
         out[:, order[some]] = curves(frames).sample(t[order[some]])

@@ -245,7 +245,7 @@ def lacks_stereo(scene: Scene, stages: Stages) -> str:
     if moving:
         return f"cameras move: {', '.join(moving)}"
     if len(scene.videos) < stages.stereo.min_views:
-        return f"{len(scene.videos)} videos are fewer than the {stages.stereo.min_views} that a visual hull needs"
+        return f"{len(scene.videos)} videos are fewer than the {stages.stereo.min_views} from which depth is measured"
     return ""
 
 

@@ -50,6 +50,7 @@ FRAMES = 8
 """Of the video that was left out, each held against all lags where the first few promise anything."""
 
 FIRST = 3
+"""Of these, those that are asked first."""
 
 PROMISING = 0.95
 """Of the sum of squares of these at their own times, below which the others are asked."""

@@ -46,7 +46,7 @@ class Plan:
     backdrop_steps: int = 1500
     """Steps of the fit of the static part, before anything moves."""
     views: int = 50
-    """Frames of every camera that are compared at the end."""
+    """Frames of every held-out camera that are compared at the end; of two others a quarter as many."""
     device: str = "cpu"
     """cpu, or cuda for a GPU with gsplat: where static part and motion are fitted; the rest is done on the CPU."""
 

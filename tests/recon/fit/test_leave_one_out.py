@@ -126,6 +126,22 @@ def test_the_fit_itself_is_left_as_it_was(capture):
     assert not np.array_equal(first[1].errors, later[1].errors, equal_nan=True)
 
 
+def test_a_drift_that_all_clocks_share_is_taken_out(capture, monkeypatch):
+    """The scene of the start knows nothing of it: the reference stands where it began."""
+    asked = []
+    whole = shown_without_each
+
+    def noted(run: Run, values: dict[str, torch.Tensor], map: Any = map) -> list[Lagged]:
+        asked.append((run.values()["offsets"].detach().clone(), values["offsets"]))
+        return whole(run, values, map)
+
+    monkeypatch.setattr("recon.fit.verb.shown_without_each", noted)
+    start = Offsets.known([f.name for f in capture.footage], np.zeros(2), 30)
+    fit(initial_scene(capture, start), capture.footage, start, steps=6)
+    (fitted, held), reference = asked[0], start.reference
+    assert abs(float(fitted[reference])) > 1e-5 and abs(float(held[reference])) < 1e-9
+
+
 def test_who_is_asked(capture):
     run = run_of(capture)
     assert steps_worth(run, 10**6) > steps_worth(run, 4) > 0
