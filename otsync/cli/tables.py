@@ -18,6 +18,7 @@ from ..compute.threads import pool_of
 from ..progress import counted
 from ..sync.verb import synchronize
 from ..types import Offsets, Status, TrackSet
+from ..types.drawing import HEARD, span
 from ..types.similarity import IDENTITY
 
 if TYPE_CHECKING:
@@ -137,11 +138,18 @@ def table(offsets: Offsets, truth: Any = None) -> str:
         columns += [("true", 9, true), ("error", 8, offsets.frames - true)]
     width = max(5, *map(len, offsets.names))
     head = " ".join(name.rjust(w) for name, w, _ in columns)
-    lines = [f"{'video':{width}}  {head}  status   (frames of the reference)"]
+    heard = [span(*ends) for ends in offsets.steps_heard.tolist()]
+    told = any(h != "–" for h in heard)
+    wide = max(len("steps heard"), *map(len, heard))
+    between = f"  {'steps heard':{wide}}" if told else ""
+    lines = [f"{'video':{width}}  {head}{between}  status   (frames of the reference)"]
     for v, name in enumerate(offsets.names):
         cells = [f"{x[v]:{w}.3f}" if np.isfinite(x[v]) else "–".rjust(w) for _, w, x in columns]
         status = "reference" if v == offsets.reference else offsets.status[v].code
-        lines.append(f"{name:{width}}  {' '.join(cells)}  {status}")
+        between = f"  {heard[v]:{wide}}" if told else ""
+        lines.append(f"{name:{width}}  {' '.join(cells)}{between}  {status}")
+    if told:
+        lines.append(HEARD)
     return "\n".join([*lines, *offsets.clock_notes(), *frame_lines(offsets, width)])
 
 

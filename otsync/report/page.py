@@ -11,7 +11,7 @@ import numpy as np
 
 from ..files.arrays import atomic_write
 from ..types import Offsets, Status, TrackSet, Video
-from ..types.drawing import judged
+from ..types.drawing import HEARD, judged, span
 from ..types.similarity import IDENTITY
 from . import figures
 from .clock import began, measured, stills, timeline
@@ -153,6 +153,9 @@ def cards(head: Sequence[tuple[str, bool]], rows: Sequence[Sequence[str]]) -> st
 
 def _offset_table(offsets: Offsets, truth: Sequence[float] | None) -> str:
     head = [("video", False), ("status", True), ("offset, frames", False), ("offset, s", False), ("rate", False)]
+    heard = [span(*ends) for ends in offsets.steps_heard.tolist()]
+    told = any(h != "–" for h in heard)
+    head += [("steps heard", False)] if told else []
     head += [("true, frames", False), ("error, frames", False)] if truth is not None else []
     rows = []
     for v, name in enumerate(offsets.names):
@@ -165,12 +168,13 @@ def _offset_table(offsets: Offsets, truth: Sequence[float] | None) -> str:
             measured(float(offsets.frames[v]), sigma * fps),
             measured(float(offsets.seconds[v]), sigma),
             number(float(offsets.rates[v]), 6).rstrip("0").rstrip("."),
+            *([heard[v]] if told else []),
         ]
         if truth is not None:
             error = (float(offsets.seconds[v]) - float(truth[v])) * fps
             cells += [number(float(truth[v]) * fps, 3), number(error, 3)]
         rows.append(cells)
-    notes = "".join(f"<li>{escape(note)}" for note in offsets.clock_notes())
+    notes = "".join(f"<li>{escape(note)}" for note in [*offsets.clock_notes(), *([HEARD] if told else [])])
     return cards(head, rows) + (f"<ul>{notes}</ul>" if notes else "")
 
 

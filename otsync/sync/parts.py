@@ -73,7 +73,7 @@ WINDOWS = 40
 
 
 @dataclass(frozen=True, eq=False)
-class _Matched:
+class Matched:
     """Matched tracks of a pair at its answer, from one end of the overlap inwards.
 
     Args:
@@ -106,17 +106,24 @@ class _Matched:
         return self.a.at(t) - self.b.at(self.clock.own(t - late))
 
 
-def broken_part(answer: Answer, a: TrackSet, b: TrackSet) -> tuple[float, float] | None:
-    """The part of a pair's overlap in which its answer does not hold: from when to when on a's clock; None: none."""
+def from_ends(answer: Answer, a: TrackSet, b: TrackSet) -> tuple[Matched, Matched]:
+    """The matched tracks of a pair from the beginning of its overlap, and from its end, up to :data:`REACH` s."""
     pairs = strongest(answer.matches, readable(LIMIT, a, b)).pairs
     raw = Raw.of(a, pairs[:, 0]), Raw.of(b, pairs[:, 1])
     clock = Clock(answer.refined.offset, answer.refined.rate)
     seen = Seen.by(answer, a, b)[0]
     known = raw[1].sampled(clock.own(a.times))
-    for late in (False, True):
-        away = seen.end - a.times if late else a.times - seen.begin
+    sides = []
+    for away in (a.times - seen.begin, seen.end - a.times):
         near = (away >= 0) & (away < min(REACH, seen.end - seen.begin)) & known
-        matched = _Matched(*raw, clock, a.times[near], away[near])
+        sides.append(Matched(*raw, clock, a.times[near], away[near]))
+    return sides[0], sides[1]
+
+
+def broken_part(answer: Answer, a: TrackSet, b: TrackSet) -> tuple[float, float] | None:
+    """The part of a pair's overlap in which its answer does not hold: from when to when on a's clock; None: none."""
+    seen = Seen.by(answer, a, b)[0]
+    for late, matched in zip((False, True), from_ends(answer, a, b), strict=True):
         short = seen.end - seen.begin < SHORT
         if suits_another(matched, AS_WELL if short else SUITS_BETTER) or (short and tells_nothing(matched)):
             begin, length = 0.0, LENGTHS[-1]
@@ -129,12 +136,12 @@ def broken_part(answer: Answer, a: TrackSet, b: TrackSet) -> tuple[float, float]
     return None
 
 
-def suits_another(matched: _Matched, limit: float) -> bool:
+def suits_another(matched: Matched, limit: float) -> bool:
     """Whether another offset suits the end better by more than ``limit``, by the samples that are seen at both; or by
     less, but as surely as nowhere within.
     """
     for length in LENGTHS:
-        better = [o for o in _others(matched, 0.0, length) if o.suits > SUITS]
+        better = [o for o in others(matched, 0.0, length) if o.suits > SUITS]
         if any(o.gain > limit for o in better):
             return True
         surest = max((o.sure for o in better if o.gain > LITTLE), default=0.0)
@@ -143,23 +150,26 @@ def suits_another(matched: _Matched, limit: float) -> bool:
     return False
 
 
-def _surest_within(matched: _Matched, length: float) -> float:
+def _surest_within(matched: Matched, length: float) -> float:
     """Of windows behind the end, the most standard errors that a gain of another offset has; inf where none tells."""
     last = float(matched.away.max(initial=0.0)) - length - MARGIN - BESIDE
     begins = np.arange(2 * length, last, max(length, last / WITHIN))
-    told = [max((o.sure for o in _others(matched, begin, length)), default=np.nan) for begin in begins]
+    told = [max((o.sure for o in others(matched, begin, length)), default=np.nan) for begin in begins]
     return float(np.nanmax(told)) if np.isfinite(told).any() else np.inf
 
 
 class Other(NamedTuple):
-    """Another offset in a window: how much better it suits it, how well, and how many standard errors its gain has."""
+    """Another offset in a window, larger by ``late`` s: how much better it suits it, how well, and how many standard
+    errors its gain has.
+    """
 
     gain: float
     suits: float
     sure: float
+    late: float
 
 
-def _others(matched: _Matched, begin: float, length: float) -> Iterator[Other]:
+def others(matched: Matched, begin: float, length: float) -> Iterator[Other]:
     """Every other offset that enough matches are seen at in a window."""
     if (window := matched.window(begin, length)) is None:
         return
@@ -172,7 +182,7 @@ def _others(matched: _Matched, begin: float, length: float) -> Iterator[Other]:
         told = witnesses >= WITNESSES
         if told.sum() >= LEAST_BESIDE:
             better = float((np.nansum(gain[:, told], 0) / witnesses[told]).mean())
-            yield Other(better, float(np.nanmean(there[:, told])), _sure(gain))
+            yield Other(better, float(np.nanmean(there[:, told])), _sure(gain), float(step))
 
 
 def _sure(gain: Float[np.ndarray, "M A"]) -> float:
@@ -184,13 +194,13 @@ def _sure(gain: Float[np.ndarray, "M A"]) -> float:
     return float(mean.mean() / max(mean.std(ddof=1) / np.sqrt(len(mean)), 1e-12))
 
 
-def tells_nothing(matched: _Matched) -> bool:
+def tells_nothing(matched: Matched) -> bool:
     """Whether at the end too little is seen to ask for any other offset, though there are frames enough."""
     asked = [length for length in LENGTHS if matched.window(0.0, length) is not None]
-    return bool(asked) and all(next(_others(matched, 0.0, length), None) is None for length in asked)
+    return bool(asked) and all(next(others(matched, 0.0, length), None) is None for length in asked)
 
 
-def does_not_agree(matched: _Matched) -> float | None:
+def does_not_agree(matched: Matched) -> float | None:
     """Where far fewer positions agree than usually do within the clip, each predicted from beside it.
 
     Returns:
@@ -212,13 +222,13 @@ def does_not_agree(matched: _Matched) -> float | None:
         return None
     lower = np.maximum(shares[:-1], shares[1:])  # nan where one is not known
     for k in np.flatnonzero(lower < FEWER * usual):
-        gains = (o.gain for begin in begins[k : k + 2] for o in _others(matched, begin, length))
+        gains = (o.gain for begin in begins[k : k + 2] for o in others(matched, begin, length))
         if lower[k] < HOLDS * usual or max(gains, default=0.0) > SUITS_BETTER:
             return float(begins[k])
     return None
 
 
-def _share(matched: _Matched, begin: float, length: float) -> float:
+def _share(matched: Matched, begin: float, length: float) -> float:
     """Of the samples in a window, the share that agrees; nan where fewer than two a frame are seen."""
     if (window := matched.window(begin, length)) is None:
         return np.nan

@@ -36,6 +36,7 @@ from .own_frames import Frames, refuse_common, solver_from, synchronize_own
 from .pairs import Job, Refit, run, run_refit, with_rate
 from .parts import broken_part, unvouched
 from .rematching import contested, rematching
+from .steps import with_steps_heard
 from .verdict import Answer, Verdict, judge, off_rates
 from .witnesses import contradicted, surest
 
@@ -135,7 +136,9 @@ def synchronize(
         lagged = with_lags(hearing.answers, lags, refining.trust.lag)
         if lagged is not None:
             hearing = hearing.judged(lagged)
-        return to_offsets(tracks, hearing.verdict, time.perf_counter() - started, hearing.broken, lags)
+        answers = with_steps_heard(hearing.answers, hearing.tracks, map)
+        verdict = dataclasses.replace(hearing.verdict, answers=answers)
+        return to_offsets(tracks, verdict, time.perf_counter() - started, hearing.broken, lags)
 
 
 def _with_clocks_mended(hearing: Hearing, times: int) -> Hearing:

@@ -71,6 +71,14 @@ def judged(o: Any) -> tuple[int, int]:
     return sum(others), len(others)
 
 
+HEARD = "steps heard: when, on the clock of its reference, a clock that steps by two frames or more would be heard"
+
+
+def span(begin: float, end: float) -> str:
+    """From when to when, s; a dash where it is not known."""
+    return f"{begin:.1f} to {end:.1f} s" if math.isfinite(begin) and math.isfinite(end) else "–"
+
+
 def table(caption: str, head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """A small HTML table; everything in it is escaped."""
 
@@ -104,11 +112,12 @@ def offsets_table(o: Any) -> str:
             "–" if not math.isfinite(o.sigma[v]) else f"{o.sigma[v]:.4f}",
             f"{o.rates[v]:g}",
             o.names[o.component[v]],
+            span(*heard),
             codes(o.flags[v]),
         )
-        for v, name in enumerate(o.names)
+        for (v, name), heard in zip(enumerate(o.names), o.steps_heard.tolist(), strict=True)
     ]
-    head = ("video", "offset, frames", "offset, s", "± sigma, s", "rate", "on the clock of", "flags")
+    head = ("video", "offset, frames", "offset, s", "± sigma, s", "rate", "on the clock of", "steps heard", "flags")
     return table(f"Offsets of {len(o)} videos", head, lines)
 
 

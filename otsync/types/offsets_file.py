@@ -67,6 +67,7 @@ class VideoOffset(Document, frozen=True, kw_only=True):
     offset_seconds: Number
     offset_frames: Number | UnsetType = UNSET
     sigma_seconds: Number
+    steps_heard_seconds: Annotated[list[Number], Meta(min_length=2, max_length=2)] | UnsetType = UNSET
     reference: Name
     status: Text
     flags: list[Text]

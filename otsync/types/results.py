@@ -349,6 +349,24 @@ class Offsets:
                 ends[v] *= share / share.max()
         return ends
 
+    @property
+    def steps_heard(self) -> Float[np.ndarray, "V 2"]:
+        """From when to when, s of its reference's clock, a step of each video's clock by two frames would be heard.
+
+        Before and behind it a clock may have stepped, by frames that were lost or stood still, without a trace that
+        rises above the noise. Of any of the video's pairs that are sure (``heard_begin`` and ``heard_end`` in their
+        statistics, s of the first one's clock); nan where a step would be heard nowhere, where the video is flagged,
+        and where none asked, as of tracks without depth.
+        """
+        heard = np.full((len(self), 2), np.nan)
+        for (i, j), alignment in self.alignments.items():
+            ends = np.array([alignment.stats.get(f"heard_{end}", math.nan) for end in ("begin", "end")])
+            world = self.clock(i).world(ends)
+            for v in (i, j):
+                if self.status[v].ok and self.component[v] == self.component[i] == self.component[j]:
+                    heard[v] = np.fmin(heard[v, 0], world[0]), np.fmax(heard[v, 1], world[1])
+        return heard
+
     def clock_notes(self) -> list[str]:
         """In words what is unusual about the videos' clocks: rates that are not the declared ones, breaks, and one end
         that is known much better than the other.
@@ -417,6 +435,7 @@ class Offsets:
 
     def to_dict(self) -> dict[str, Any]:
         """The content of ``offsets.json``."""
+        heard = self.steps_heard
         videos = [
             {
                 "name": self.names[v],
@@ -425,6 +444,7 @@ class Offsets:
                 "offset_seconds": _number(self.seconds[v]),
                 "offset_frames": _number(self.frames[v]),
                 "sigma_seconds": _number(self.sigma[v]),
+                **({"steps_heard_seconds": heard[v].tolist()} if np.isfinite(heard[v]).all() else {}),
                 "reference": self.names[self.component[v]],
                 "status": self.status[v].code,
                 "flags": [f.code for f in self.flags[v]],

@@ -64,7 +64,7 @@ def test_every_algorithm_has_a_row_or_a_word(slot):
 
 
 def test_the_fields_of_offsets_json():
-    pair = Alignment(0.5, fps=30.0)
+    pair = Alignment(0.5, fps=30.0, stats={"heard_begin": 1.0, "heard_end": 2.0})
     offsets = Offsets.known(["a", "b"], np.array([0.0, 0.5]), fps=30, transforms=[None, None])
     document = Offsets(**{**vars(offsets), "alignments": {(0, 1): pair}}).to_dict()
     fields = {*document, *document["videos"][0], *document["pairs"][0]}

@@ -69,20 +69,34 @@ class World:
         """Per video but the first: error in frames at the beginning and the end of what it shares with the first, the
         larger one; and the largest anywhere. Infinite where there is no true answer, nan without an answer.
         """
-        worst = [np.abs(self._late(offsets, v)).max() for v in range(1, len(self.tracks))]
+        worst = [np.abs(self._late(offsets, v)[0]).max() for v in range(1, len(self.tracks))]
         return self.at_ends(offsets).max(1), np.array(worst)
 
     def at_ends(self, offsets: Offsets) -> np.ndarray:
         """(V-1, 2) the errors of :meth:`errors` at the beginning and at the end, each for itself."""
-        late = [self._late(offsets, v) for v in range(1, len(self.tracks))]
+        late = [self._late(offsets, v)[0] for v in range(1, len(self.tracks))]
         return np.array([[abs(x[0]), abs(x[-1])] for x in late]).reshape(-1, 2)
 
-    def _late(self, offsets: Offsets, v: int) -> np.ndarray:
-        """(S,) frames by which the clock that was found for video v is off, at every frame that is asked, in order."""
+    def where_heard(self, offsets: Offsets) -> np.ndarray:
+        """Per video but the first: the largest error in frames where a step of its clock would be heard
+        (:attr:`Offsets.steps_heard`); or the median error, if that is larger: an answer holds for most frames, or not.
+        """
+        worst = []
+        for v in range(1, len(self.tracks)):
+            late, found = self._late(offsets, v)
+            begin, end = offsets.steps_heard[v]
+            inside = np.abs(late[(found >= begin) & (found <= end)])
+            worst.append(max(float(np.median(np.abs(late))), inside.max(initial=0.0)))
+        return np.array(worst)
+
+    def _late(self, offsets: Offsets, v: int) -> tuple[np.ndarray, np.ndarray]:
+        """(S,) frames by which the clock that was found for video v is off, at every frame that is asked, in order; and
+        (S,) when on the clock of the first that is, s.
+        """
         if not np.isfinite(offsets.seconds[v]) or offsets.component[v] != offsets.component[0]:
-            return np.array([np.nan])
+            return np.array([np.nan]), np.array([np.nan])
         if self.shown is None:
-            return np.array([np.inf])
+            return np.array([np.inf]), np.array([np.nan])
         first, own = self.shown[0], self.shown[v]
         found = offsets.times(v, self.tracks[v].times)
         # what the reference showed when its clock, breaks undone, said so
@@ -92,12 +106,12 @@ class World:
         true = np.interp(found, clock[known][order], first[known][order], left=np.nan, right=np.nan)
         common = np.isfinite(found) & np.isfinite(true)
         if not common.any():
-            return np.array([np.inf])  # nothing that is claimed to be common is
+            return np.array([np.inf]), np.array([np.nan])  # nothing that is claimed to be common is
         asked = common & steady(own, self.tracks[v].times)
         asked &= ~near(found, clock, ~steady(first, self.tracks[0].times))
         if asked.sum() < LEVEL:  # a steep staircase all along (few frames at an end seem even): its middle, everywhere
             asked = common
-        return levelled((true - own)[asked], self.tracks[v].times[asked]) * FPS
+        return levelled((true - own)[asked], self.tracks[v].times[asked]) * FPS, found[asked]
 
 
 def steady(shown: np.ndarray, times: np.ndarray) -> np.ndarray:
@@ -248,6 +262,14 @@ def beside_an_end(seed: int, preset: str = "mid") -> World:
     return plain(seed, preset=preset, frames=150, first=(lost,), within=10)
 
 
+def at_an_end(seed: int, preset: str) -> World:
+    """Two to six frames are lost .2 to .9 s from an end of a video: hardly enough is left to tell by."""
+    rng = np.random.default_rng([seed, 907])
+    away = float(rng.uniform(0.2, 0.9)) * FPS / 150
+    lost = In(int(rng.integers(0, 2)), Drop(int(rng.integers(2, 7)) / FPS, at=float(rng.choice([away, 1 - away]))))
+    return plain(seed, preset=preset, frames=150, first=(lost,), within=10)
+
+
 def performers(seed: int, *, motion: str, sees: Sequence[Sequence[int]]) -> World:
     """Like performers: video v sees those of ``sees[v]`` alone."""
     tracks, truth = drawn(seed, motion=motion, videos=len(sees), alike=True, within=15)
@@ -300,6 +322,9 @@ CLASSES: dict[str, Callable[[int], World]] = {
     "ten frames dropped, hard": partial(plain, preset="hard", first=(In(1, Drop(10 / 30)),)),
     "few frames lost near an end": beside_an_end,
     "few frames lost near an end, hard": partial(beside_an_end, preset="hard"),
+    "frames lost at an end": partial(at_an_end, preset="mid"),
+    "frames lost at an end, hard": partial(at_an_end, preset="hard"),
+    "frames lost at an end, brutal": partial(at_an_end, preset="brutal"),
     "freeze of 15, hard": partial(plain, preset="hard", first=(In(1, Freeze(15)),)),
     "freeze of 15, brutal": partial(plain, preset="brutal", first=(In(1, Freeze(15)),)),
     "a second missing": partial(plain, first=(In(1, Drop(1.0)),), within=15),
@@ -364,3 +389,6 @@ CLASSES: dict[str, Callable[[int], World]] = {
 
 WITHOUT_DEPTH = frozenset(name for name in CLASSES if name.startswith("phones in hands"))
 """Classes of tracks in pixels, which no other method reads than their own."""
+
+AT_THE_END = frozenset({"frames lost at an end, hard", "frames lost at an end, brutal"})
+"""Classes whose clocks step where noise leaves too little to tell: an answer holds where a step would be heard."""

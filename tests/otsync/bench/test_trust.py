@@ -113,7 +113,7 @@ def test_tables_of_made_up_answers():
 
     def row(begin: float, end: float, s: float) -> dict[str, object]:
         ends = {"begin": begin, "end": end, "sigma_begin": s, "sigma_end": s}
-        return base | {"class": "mid", "error": max(begin, end), "sigma": s} | ends
+        return base | {"class": "mid", "error": max(begin, end), "heard": max(begin, end), "sigma": s} | ends
 
     both = np.abs(sigma[:, None] * rng.normal(size=(400, 2)))
     rows = [row(float(b), float(e), float(s)) for (b, e), s in zip(both, sigma, strict=True)]
@@ -131,8 +131,8 @@ def test_tables_of_made_up_answers():
 
 def test_what_is_mended_must_be_named_and_exact():
     base = {"method": "default", "class": "freeze of 15", "rate": 1.0, "sigma": 0.1, "flags": ""}
-    named = base | {"trusted": True, "breaks": "video 1: stands still", "error": 0.1}
-    flagged = base | {"trusted": False, "breaks": "", "error": 15.0}
+    named = base | {"trusted": True, "breaks": "video 1: stands still", "error": 0.1, "heard": 0.1}
+    flagged = base | {"trusted": False, "breaks": "", "error": 15.0, "heard": 15.0}
     checks = {c.name: c for c in acceptance([*[named] * 9, flagged])}
     assert checks["freeze of 15: found and named"].measured == 0.9 and checks["freeze of 15: found and named"].met
     worse = {c.name: c for c in acceptance([*[named] * 8, named | {"error": 0.2}, flagged])}
@@ -141,6 +141,25 @@ def test_what_is_mended_must_be_named_and_exact():
     assert unnamed["freeze of 15: found and named"].measured == 0
     low, high = interval(0, 300)
     assert low == 0 and high == pytest.approx(0.0122, abs=1e-3)
+
+
+def test_steps_that_noise_hides_are_counted_where_they_would_be_heard_and_the_others_everywhere():
+    ends = {"begin": 0.1, "end": 0.1, "sigma_begin": 0.1, "sigma_end": 0.1}
+    base = {"method": "default", "rate": 1.0, "sigma": 0.1, "flags": "", "trusted": True, "breaks": ""} | ends
+    at_the_end = base | {"class": "frames lost at an end, hard", "error": 4.0, "heard": 0.1}
+    right = base | {"class": "freeze of 30", "error": 0.1, "heard": 0.1}
+    everywhere, where_heard = (
+        "confident and wrong, in 500 trusted",
+        "confident and wrong where a step would be heard, in 500",
+    )
+    checks = {c.name: c for c in acceptance([at_the_end, at_the_end, *[right] * 500])}
+    assert checks[everywhere].measured == 0 and checks[where_heard].measured == 0
+    (row, _) = summarise([at_the_end, at_the_end, right])
+    assert row["wrong"] == 2 and row["where heard"] == 0
+    checks = {c.name: c for c in acceptance([right | {"error": 4.0}] * 2 + [right] * 498)}
+    assert checks[everywhere].measured == 2 and not checks["most in one class"].met
+    checks = {c.name: c for c in acceptance([at_the_end | {"heard": 4.0}] * 2 + [right] * 498)}
+    assert checks[everywhere].measured == 0 and not checks[where_heard].met and not checks["  most in one class"].met
 
 
 @pytest.mark.slow

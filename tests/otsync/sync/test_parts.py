@@ -12,7 +12,7 @@ from otsync.bench.trust.worlds import CLASSES, plain
 from otsync.simulate import simulate
 from otsync.simulate.effects import Drop, In
 from otsync.sync.alike import Raw
-from otsync.sync.parts import Other, _Matched, broken_part, does_not_agree, unvouched
+from otsync.sync.parts import Matched, Other, broken_part, does_not_agree, unvouched
 from otsync.sync.verdict import Answer
 from otsync.types import Alignment, Clock, Matches, Status, TrackSet
 
@@ -101,10 +101,12 @@ def test_a_part_within_is_named_where_few_agree_or_fewer_do_and_another_offset_s
         return share if 2 <= len(begins) - 1 <= 3 else 0.9
 
     monkeypatch.setattr("otsync.sync.parts._share", shares)
-    monkeypatch.setattr("otsync.sync.parts._others", lambda matched, begin, length: iter([Other(better, better, 0.0)]))
+    monkeypatch.setattr(
+        "otsync.sync.parts.others", lambda matched, begin, length: iter([Other(better, better, 0.0, 0.1)])
+    )
     raw = Raw.of(a, answer.matches.pairs[:, 0]), Raw.of(b, answer.matches.pairs[:, 1])
     away = a.times - a.times[0]
-    assert does_not_agree(_Matched(*raw, Clock(0.3), a.times, away)) == (begins[2] if named else None)
+    assert does_not_agree(Matched(*raw, Clock(0.3), a.times, away)) == (begins[2] if named else None)
 
 
 def test_where_another_offset_cannot_be_seen_positions_that_do_not_agree_tell(monkeypatch):
@@ -169,11 +171,11 @@ def test_a_gap_in_a_mended_clock_is_not_asked_about(seed):
 @pytest.mark.parametrize(("late", "named"), [(2.3, True), (1.7, False)])
 def test_the_end_of_a_short_overlap_must_know(monkeypatch, late, named):
     """Below two seconds another offset that suits the end as well is a doubt; above, it must suit it clearly better."""
-    monkeypatch.setattr("otsync.sync.parts._others", lambda *job: iter([Other(0.05, 0.5, 0.0)]))
+    monkeypatch.setattr("otsync.sync.parts.others", lambda *job: iter([Other(0.05, 0.5, 0.0, 0.1)]))
     assert (broken_part(*pair(late=late)) is not None) == named
-    monkeypatch.setattr("otsync.sync.parts._others", lambda *job: iter([]))
+    monkeypatch.setattr("otsync.sync.parts.others", lambda *job: iter([]))
     assert (broken_part(*pair(late=late)) is not None) == named  # nothing can be asked for
-    monkeypatch.setattr("otsync.sync.parts._others", lambda *job: iter([Other(-0.05, 0.5, 0.0)]))
+    monkeypatch.setattr("otsync.sync.parts.others", lambda *job: iter([Other(-0.05, 0.5, 0.0, 0.1)]))
     assert broken_part(*pair(late=late)) is None
 
 
@@ -202,7 +204,7 @@ def test_who_is_doubted_where_others_see_the_end():
 @pytest.mark.parametrize(("end", "within", "doubted"), [(2.5, 0.5, True), (2.5, 2.0, False), (1.4, -1.0, False)])
 def test_a_small_gain_at_an_end_must_be_surer_than_any_within(monkeypatch, end, within, doubted):
     def others(matched, begin, length):
-        return iter([Other(0.1, 0.5, end if begin == 0 else within)])
+        return iter([Other(0.1, 0.5, end if begin == 0 else within, 0.1)])
 
-    monkeypatch.setattr("otsync.sync.parts._others", others)
+    monkeypatch.setattr("otsync.sync.parts.others", others)
     assert (broken_part(*pair()) is not None) == doubted
