@@ -19,7 +19,7 @@ from .verdict import Answer
 
 TELLS = 0.1
 """By how much worse any other offset must suit an end that tells a step, in the units of
-:data:`otsync.sync.parts.SUITS_BETTER`. Of 430 worlds that lose 2 to 8 frames .2 to 1.6 s from an end (mid to brutal,
+:data:`otsync.sync.parts.SUITS_BETTER`. Of 420 worlds that lose 2 to 8 frames .2 to 1.6 s from an end (mid to brutal,
 seeds 95000 to 96429), 33 answers were trusted and more than a frame off behind the loss, by up to 7.8: each where no
 step would be heard, by this limit. Of eight mid worlds without a step (95200 to 95207) the ends tell by their last
 .27 s."""
