@@ -6,6 +6,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -46,6 +47,26 @@ Matches = Mapping[tuple[int, int], np.ndarray]
 """Verified matches by pair of pictures."""
 
 
+def _told_on_the_shell() -> Any:
+    """How the shell reads ``--distance``: two names and a number, and what is wrong in words."""
+    from tyro.constructors import PrimitiveConstructorSpec
+
+    def read(texts: list[str]) -> tuple[str, str, float]:
+        first, second, metres = texts
+        try:
+            return first, second, float(metres)
+        except ValueError:
+            raise ValueError(f"expected two videos and the metres between them; found {' '.join(texts)}") from None
+
+    return PrimitiveConstructorSpec(
+        nargs=3,
+        metavar="VIDEO VIDEO METRES",
+        instance_from_str=read,
+        is_instance=lambda given: given is None or isinstance(given, tuple),
+        str_from_instance=lambda given: ["None"] if given is None else [str(x) for x in given],
+    )
+
+
 @dataclass(frozen=True)
 class CalibrateOptions:
     """How cameras are looked for."""
@@ -56,7 +77,7 @@ class CalibrateOptions:
     """Which board clips called board... show: 9x6 (inner corners of a checkerboard) or 5x7:DICT_4X4_50 (ChArUco)."""
     square: float | None = None
     """Metres of a side of the board's squares: cameras that are found by the board are in metres."""
-    distance: tuple[str, str, float] | None = None
+    distance: Annotated[tuple[str, str, float] | None, _told_on_the_shell()] = None
     """Two videos of static cameras, and the metres between them: the scene is in metres."""
     key_frames: int = 24
     """Frames of a clip whose camera moves that the mapping uses; of many clips fewer each, but of walk clips."""

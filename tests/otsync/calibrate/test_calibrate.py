@@ -131,6 +131,13 @@ def test_a_distance_between_nobody_is_refused(world):
         calibrate_clips(world[0], replace(OPTIONS, distance=("phone0", "me", 2.0)))
 
 
+def test_a_distance_without_metres_is_refused_in_words(tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        main(["calibrate", "--distance", "a", "b", "c", str(tmp_path)])
+    said = " ".join(capsys.readouterr().err.replace("│", " ").split())
+    assert "expected two videos and the metres between them; found a b c" in said and "class" not in said
+
+
 def test_bad_options_are_refused_by_name():
     for field, value in (("key_frames", 1), ("width", 10), ("seed", -1), ("distance", ("a", "b", 0.0))):
         with pytest.raises(ValueError, match="--" + field.replace("_", "-")):
