@@ -390,5 +390,5 @@ CLASSES: dict[str, Callable[[int], World]] = {
 WITHOUT_DEPTH = frozenset(name for name in CLASSES if name.startswith("phones in hands"))
 """Classes of tracks in pixels, which no other method reads than their own."""
 
-AT_THE_END = frozenset({"frames lost at an end, hard", "frames lost at an end, brutal"})
-"""Classes whose clocks step where noise leaves too little to tell: an answer holds where a step would be heard."""
+AT_THE_END = frozenset(name for name in CLASSES if name.startswith("frames lost at an end"))
+"""Classes whose clocks step where too little is left to tell: an answer holds where a step would be heard."""
